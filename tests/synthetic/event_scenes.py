@@ -13,7 +13,7 @@ from drivax.synthetic.roads.curves import Pose, straight, turn
 from drivax.synthetic.roads.network import Control, Draft, Line, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, Scripted
+from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, ScriptedUser
 
 FIRST, STEPS = 60, 151
 CURRENT = FIRST + 10
@@ -103,7 +103,7 @@ def junction(turning):
 def parked_row():
     """Parked cars every 9 m, 2.7 m to the right of ego's path."""
     poses = [Pose(60.0 + 9.0 * k, -2.7, 0.0) for k in range(30)]
-    return [Scripted.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
+    return [ScriptedUser.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
 
 
 def suitable(kind, rng):

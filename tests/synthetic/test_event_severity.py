@@ -21,7 +21,7 @@ from drivax.synthetic.events import (
 )
 from drivax.synthetic.events.adversary import required_deceleration, vehicles_that_cross, waiting_room
 from drivax.synthetic.events.leading import cut_in_gap, required_by_leader
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 from .event_scenes import FIRST, STEPS, junction, road, scene
 
@@ -111,7 +111,7 @@ def test_only_vehicles_that_would_hit_a_crossing_actor_cross_it():
     y = np.clip(-2.0 + 1.5 * (t - 8.0), -2.0, 6.0)
     xy = np.stack([np.full(STEPS, 160.0), y], axis=-1)
     speed = np.gradient(y, 0.1)
-    pedestrian = Scripted(
+    pedestrian = ScriptedUser(
         AgentKind.PEDESTRIAN, (0.5, 0.6, 1.7), xy, np.full(STEPS, math.pi / 2), speed, t >= 0.0
     )
     assert vehicles_that_cross(EgoView(roles, motion, FIRST), pedestrian) == (1,)

@@ -12,7 +12,7 @@ from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.events import SCRIPTS, SEVERITY_MPS2, EgoView, EventKind, draw_severity, stage
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.placement import Density, draw_drivers
-from drivax.synthetic.traffic.roles import Override, Roles, Scripted, Staging, Tailgate
+from drivax.synthetic.traffic.roles import Override, Roles, ScriptedUser, Staging, Tailgate
 from drivax.synthetic.traffic.simulation import Traffic
 
 from .event_scenes import FIRST, STEPS, junction, road, scene, suitable
@@ -30,7 +30,7 @@ def predicted(motion, staged):
     x = motion.xy[row, np.minimum(np.arange(STEPS), override.first_step), 0] + v * t - a * t**2 / 2
     xy = np.stack([x, motion.xy[row, :, 1]], axis=-1)
     size = tuple(motion.size_m[row].tolist())
-    return Scripted(AgentKind.VEHICLE, size, xy, motion.heading[row], v - a * t, motion.valid[row])
+    return ScriptedUser(AgentKind.VEHICLE, size, xy, motion.heading[row], v - a * t, motion.valid[row])
 
 
 def march(motion, actor, begin, deceleration, start, speed):

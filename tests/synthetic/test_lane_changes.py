@@ -7,7 +7,7 @@ import pytest
 
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.lane_changes import LaneChains, LaneChanges, Situation
+from drivax.synthetic.traffic.lane_changes import LaneChains, LaneChanges, VehicleState
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
@@ -32,7 +32,7 @@ def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
     worlds = Worlds([network], [len(at)])
     tables = PathTables(worlds, paths, table)
     at, speed = np.array(at, float), np.array(speed, float)
-    fastest = tables.at(at, np.arange(len(at)))[:, 3]
+    fastest = tables.interpolate(at, np.arange(len(at)))[:, 3]
     preferred = np.full(len(at), np.nan)
     for i, way in enumerate(ways):
         ahead = [j for j in range(len(at)) if j != i and ways[j] == way and at[j] > at[i]]
@@ -41,7 +41,7 @@ def decisions(ways, at, speed, politeness=0.0, network=None, movers=(1,)):
         preferred[i] = law(speed[i], gap, 0.0 if j is None else speed[j])
     free = np.isin(np.arange(len(at)), movers)
     changes = LaneChanges(worlds, table, [NOTHING])
-    now = Situation(at, speed, np.ones(len(at), bool), free, fastest, preferred)
+    now = VehicleState(at, speed, np.ones(len(at), bool), free, fastest, preferred)
     return changes.decide(now, tables)
 
 
@@ -106,7 +106,7 @@ def test_only_one_vehicle_takes_a_contested_gap():
 
 def test_chains_span_sections_and_end_at_forks():
     network, columns = road(lanes=2, sections=3)
-    chains = LaneChains.of(network)
+    chains = LaneChains.from_network(network)
     assert [chains.offset_m[k] for k in columns[0]] == pytest.approx([0.0, 200.0, 400.0])
     assert len({int(chains.chain[k]) for k in columns[0]}) == 1
     assert chains.chain[columns[1][0]] != chains.chain[columns[0][0]]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
+from drivax.synthetic.traffic.leaders import Leaders
 from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.simulation import Leaders
 
 from .traffic_scenes import drivers, road
 
@@ -18,7 +18,7 @@ def leaders(ways, at, table, active=None, **roads):
     worlds = Worlds([network], [len(ways)])
     tables = PathTables(worlds, [lane_path(network, way, Sway()) for way in ways], table)
     there = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(worlds, table).ahead(tables, np.array(at, float), there)
+    return Leaders(worlds, table).find(tables, np.array(at, float), there)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -9,11 +9,17 @@ import pytest
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Line, RoadKind, RoadNetwork
-from drivax.synthetic.traffic.lateral import around, change_onto, displace_path, quintic_step
+from drivax.synthetic.traffic.lateral import (
+    DetourPositions,
+    detour_path,
+    displace_path,
+    lane_change_path,
+    quintic_step,
+)
 from drivax.synthetic.traffic.obstacles import Boxes, StaticObstacles, extents
 from drivax.synthetic.traffic.path_arrays import Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 from drivax.synthetic.traffic.simulation import boxes_at
 
 from .oracles import box_corners, distance_to_polyline, shared_area
@@ -30,7 +36,7 @@ def street(high=6.0):
 
 
 def parked(x, y, steps, speed=None):
-    one = Scripted.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
+    one = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
     return one if speed is None else dataclasses.replace(one, speed=np.full(steps, speed))
 
 
@@ -115,7 +121,7 @@ def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
     path = lane_path(street(), (0,), Sway())
     boxes = boxes_at((parked(x, y, 1),), 0)
     standing = StaticObstacles(Worlds([street()], [1]), [boxes], [extents(path, boxes)[0]], np.array([1.9]))
-    assert standing.meets(0, 22.0, 1.2, 45.0) == meets
+    assert standing.is_blocked(0, 22.0, 1.2, 45.0) == meets
 
 
 def test_cars_next_to_the_lane_change_nothing():
@@ -130,7 +136,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     times = np.arange(steps) / 10
     # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
     y = np.clip(-5.0 + 1.5 * np.maximum(times - 4.0, 0.0), -5.0, 0.0)
-    pedestrian = Scripted(
+    pedestrian = ScriptedUser(
         kind=AgentKind.PEDESTRIAN,
         size_m=(0.6, 0.6, 1.75),
         xy=np.stack([np.full(steps, 120.0), y], axis=-1),
@@ -159,7 +165,7 @@ def test_quintic_starts_with_value_and_slope_and_ends_level():
 def test_displaced_path_keeps_its_offset():
     network, _ = road(200.0)
     path = lane_path(network, (0,), Sway())
-    shifted = around(path, (40.0, 60.0, 90.0, 115.0), 2.0)
+    shifted = detour_path(path, DetourPositions(40.0, 60.0, 90.0, 115.0), 2.0)
     y = np.interp([20.0, 75.0, 150.0], shifted.curve.xy[:, 0], shifted.curve.xy[:, 1])
     assert y == pytest.approx([0.0, 2.0, 0.0], abs=1e-6)
     # Longer by what the detour costs, and what lies beyond is still where it was in the world.
@@ -178,7 +184,7 @@ def test_displaced_path_keeps_its_offset():
 def test_lane_change_starts_at_the_vehicle():
     network, columns = road(300.0, lanes=2)
     here, there = (lane_path(network, (column[0],), Sway((0.2,), (0.05,), (0.3,))) for column in columns)
-    path, at = change_onto(there, here, 80.3, 50.0)
+    path, at = lane_change_path(there, here, 80.3, 50.0)
     xy = [np.interp(at, path.step_m * np.arange(len(path.curve.xy)), path.curve.xy[:, k]) for k in (0, 1)]
     old = [np.interp(80.3, here.step_m * np.arange(len(here.curve.xy)), here.curve.xy[:, k]) for k in (0, 1)]
     assert np.hypot(*(np.array(xy) - old)) < 0.02

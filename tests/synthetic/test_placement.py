@@ -9,7 +9,7 @@ from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.families import CurvedRoad
 from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, join_drivers, place_vehicles
-from drivax.synthetic.traffic.roles import Scripted
+from drivax.synthetic.traffic.roles import ScriptedUser
 
 from .traffic_scenes import drivers, road
 
@@ -34,7 +34,7 @@ def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     network, _ = road(600.0, lanes=2)
     lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
     network = dataclasses.replace(network, lanes=lanes)
-    stands = Scripted.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
+    stands = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
     density = Density(spacing_m=(4.0, 6.0), vehicles=200, leader_share=0.0)
     found = [
         place

@@ -14,7 +14,7 @@ from drivax.synthetic.expert.candidates import (
     Shift,
     arrivals,
     find_conflicts,
-    shifted_path,
+    shift_path,
     stop_lines,
 )
 from drivax.synthetic.expert.violations import user_boxes
@@ -28,7 +28,7 @@ from .staged_scenes import CAR, TIMES, crossed, road, scene, user
 
 def way_of(roles, shift=None, reach=60.0):
     pose = Pose(30.0, 0.0, 0.0)
-    return shifted_path(roles.paths[0], roles.drivers, pose, (30.0, reach), shift or Shift())
+    return shift_path(roles.paths[0], roles.drivers, pose, 30.0, reach, shift or Shift())
 
 
 @pytest.mark.parametrize("seed", range(3))

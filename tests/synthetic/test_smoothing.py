@@ -51,7 +51,7 @@ def test_smoothing_solves_the_quadratic_programme(high):
             smoothing._ACCELERATION * np.sum(a**2)
             + smoothing._JERK * np.sum(jerk(a) ** 2)
             + smoothing._SPEED * np.sum((v - speed[1:]) ** 2)
-            + smoothing._PLACE * np.sum((s - at[1:]) ** 2)
+            + smoothing._POSITION * np.sum((s - at[1:]) ** 2)
         )
 
     difference = (np.eye(steps) - np.eye(steps, k=-1)) / 0.1

@@ -25,7 +25,7 @@ def test_free_path_has_no_cost():
     plan = run(occupancy(), 12.0)
     assert np.allclose(plan.speed, 12.0)
     assert plan.cost == pytest.approx(0.0, abs=1e-3)
-    at, speed = plan.fine(STEPS + 1)
+    at, speed = plan.resample(STEPS + 1)
     assert np.allclose(at, 1.2 * np.arange(STEPS + 1))
     assert np.allclose(speed, 12.0)
 
@@ -75,7 +75,7 @@ def test_search_stops_before_a_wall_until_it_opens():
     occupied = occupancy(steps=80)
     occupied.hard[:50, 60:64] = True  # at 30 m until 5 s
     plan = run(occupied, 12.0)
-    at, speed = plan.fine(81)
+    at, speed = plan.resample(81)
     assert not plan.touches
     assert at[49] < 30.0 < at[80]
     assert speed[45] < 6.0
@@ -99,7 +99,7 @@ def test_bends_bound_the_speed():
     places = occupied.hard.shape[1]
     bound = np.where(np.arange(places) * 0.5 > 40.0, 6.0, 30.0)
     plan = search(occupied, np.full(places, 12.0), bound, 12.0)
-    at, speed = plan.fine(81)
+    at, speed = plan.resample(81)
     assert speed[at > 41.0].max() <= 6.2
 
 

@@ -15,7 +15,15 @@ from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
 from drivax.synthetic.traffic.placement import Density, draw_drivers, draw_path, place_vehicles
 from drivax.synthetic.traffic.role_assignment import assign_roles
-from drivax.synthetic.traffic.roles import EgoPlan, Override, Pedestrian, Roles, Scripted, Staging, Tailgate
+from drivax.synthetic.traffic.roles import (
+    EgoPlan,
+    Override,
+    Pedestrian,
+    Roles,
+    ScriptedUser,
+    Staging,
+    Tailgate,
+)
 from drivax.synthetic.traffic.simulation import Run, Traffic, run_all, simulate
 
 from . import traffic_scenes
@@ -238,8 +246,8 @@ def test_cars_stop_for_pedestrians_on_a_crossing():
 def test_repeated_runs_are_equal_and_users_keep_their_order():
     network, _ = road(400.0)
     steps = 50
-    stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
-    comes = Scripted.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
+    stands = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
+    comes = ScriptedUser.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     pedestrians = (Pedestrian(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
     scene = roles(
         network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(stands,)
@@ -312,9 +320,9 @@ def staged_run(seed, world):
         ego = EgoPlan(53, motion.xy[0, 53:], motion.heading[0, 53:], motion.speed[0, 53:] / 2)
     if world % 3 == 0:
         steps, pose = len(traffic.times_s), Pose(*cast.paths[1].curve.xy[-80], 0.0)
-        comes = Scripted.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), pose, steps)
+        comes = ScriptedUser.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), pose, steps)
         comes.valid[:20] = False
-        stands = Scripted.standing(
+        stands = ScriptedUser.standing(
             AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(*cast.paths[0].curve.xy[300], 0.0), steps
         )
         brakes = Override(1, 66, 90, -5.0)

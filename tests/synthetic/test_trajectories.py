@@ -8,7 +8,7 @@ from drivax.synthetic.expert.candidates import (
     Shift,
     candidate_boxes,
     candidate_corners,
-    shifted_path,
+    shift_path,
 )
 from drivax.synthetic.roads.curves import Pose, join_curves, resample, straight, turn
 
@@ -28,7 +28,7 @@ def bend():
 @pytest.mark.parametrize("pose", [Pose(30.0, 0.0, 0.0), Pose(31.3, 0.8, 0.06), Pose(29.0, -1.1, -0.1)])
 def test_candidate_starts_at_ego_with_tangent_headings(shift, pose):
     roles, _ = scene(road(turn=bend()), 8.0)
-    way = shifted_path(roles.paths[0], roles.drivers, pose, (30.0, 110.0), shift)
+    way = shift_path(roles.paths[0], roles.drivers, pose, 30.0, 110.0, shift)
     assert np.hypot(*(way.xy[0] - [pose.x, pose.y])) < 0.03
     assert way.heading[0] == pytest.approx(pose.heading, abs=0.01)
     chords = np.diff(way.xy, axis=0)
@@ -41,7 +41,7 @@ def test_candidate_starts_at_ego_with_tangent_headings(shift, pose):
 def test_shifted_candidate_has_its_offset_and_returns():
     roles, _ = scene(road(turn=bend()), 8.0)
     shift = Shift(3.0, 5.0, 25.0, 40.0, 60.0)
-    way = shifted_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), (30.0, 110.0), shift)
+    way = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, shift)
     gap = distance_to_polyline(way.xy, roles.paths[0].curve.xy)
     assert np.allclose(gap[(way.base_m > 26) & (way.base_m < 39)], 3.0, atol=0.02)
     assert gap[(way.base_m < 5) | (way.base_m > 60)].max() < 0.02
@@ -53,7 +53,7 @@ def test_shifted_candidate_has_its_offset_and_returns():
 
 def test_bends_bound_the_speed():
     roles, _ = scene(road(turn=bend()), 8.0)
-    way = shifted_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), (30.0, 110.0), Shift())
+    way = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, Shift())
     curvature = np.abs(np.gradient(way.heading, SPACING_M)).max()
     assert way.limit_mps.min() == pytest.approx(min((4.2 / curvature) ** 0.5, 0.8 / curvature), rel=0.05)
     driver = roles.drivers.lateral_mps2[0]

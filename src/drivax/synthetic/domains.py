@@ -35,9 +35,9 @@ class Domain:
     def families(self) -> tuple[tuple[RoadFamily, float], ...]:
         """Families of this domain with their probabilities."""
         shares = dict(self.shares)
-        chosen = [(family, shares[family.name]) for family in FAMILIES if family.name in shares]
-        total = sum(share for _, share in chosen)
-        return tuple((family, share / total) for family, share in chosen)
+        frequencies = [(family, shares[family.name]) for family in FAMILIES if family.name in shares]
+        total = sum(share for _, share in frequencies)
+        return tuple((family, share / total) for family, share in frequencies)
 
     def draw_family(self, rng: np.random.Generator) -> RoadFamily:
         """Draw a family."""

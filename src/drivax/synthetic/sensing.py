@@ -16,12 +16,12 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 
-#: Below this speed, m/s, noise decreases to a share at standstill.
+#: Speed below which noise decreases, m/s, and its share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
-#: Errors are clipped at this many standard deviations: noise must not make users overlap.
-_MOST_SIGMA = 3.0
+#: Clip of errors in standard deviations: noise must not make users overlap.
+_MAX_SIGMA = 3.0
 #: Lines of sight per batch.
-_LOOKS = 512
+_BATCH_SIZE = 512
 
 
 def _refuse_negative(room: str, settings: Any) -> None:
@@ -60,7 +60,7 @@ class NoiseConfig:
         along_m, across_m: Position along and across the heading.
         heading_rad: Heading.
         speed_mps: Speed along the heading.
-        position_correlation, heading_correlation, speed_correlation: Of an error with that 0.1 s earlier.
+        position_correlation, heading_correlation, speed_correlation: Correlations of an error with that 0.1 s earlier.
     """
 
     level: float = 1.0
@@ -83,7 +83,7 @@ class NoiseConfig:
 _Boxes = Float64[np.ndarray, "user time 6"]
 _PerUser = Float64[np.ndarray, " user"]
 _Visible = Bool[np.ndarray, "user time"]
-_Looks = Int64[np.ndarray, " look"]
+_Rays = Int64[np.ndarray, " ray"]
 _Pairs = Int64[np.ndarray, " pair"]
 
 
@@ -130,8 +130,8 @@ def visible(
     return seen
 
 
-def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) -> tuple[_Pairs, _Pairs]:
-    """Pairs of a line of sight and a user whose circumscribed circle it intersects."""
+def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> tuple[_Pairs, _Pairs]:
+    """Return pairs of a line of sight and a user whose circumscribed circle it intersects."""
     offset = box[..., :2] - box[:1, :, :2]
     x, y = (np.ascontiguousarray(offset[..., k]) for k in (0, 1))
     ray_x, ray_y = x[target, step], y[target, step]
@@ -145,8 +145,8 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Looks, step: _Looks) ->
     near_rows = np.flatnonzero(near)
     pairs = []
     # Batches keep the tables in the processor's cache.
-    for first in range(0, len(target), _LOOKS):
-        batch = slice(first, first + _LOOKS)
+    for first in range(0, len(target), _BATCH_SIZE):
+        batch = slice(first, first + _BATCH_SIZE)
         position, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
         to_x, to_y = x[near_rows].take(position, axis=1), y[near_rows].take(position, axis=1)
         ahead = to_x * ax + to_y * ay
@@ -170,7 +170,7 @@ def _cuts(
     heights_m: tuple[float, Float64[np.ndarray, " pair"]], box: Float64[np.ndarray, "pair 6"],
     top_m: Float64[np.ndarray, " pair"],
 ) -> Bool[np.ndarray, "pair point"]:  # fmt: skip
-    """Whether rays from an eye to points, at two heights, pass through upright boxes (slab test)."""
+    """Mask of rays from an eye to points, at two heights, that pass through upright boxes (slab test)."""
     enters, leaves = passage(eye[:, None], points, box[:, None])
     high, low = heights_m[0], heights_m[1][:, None]
     lowest = np.minimum(high + (low - high) * enters, high + (low - high) * leaves)
@@ -179,7 +179,7 @@ def _cuts(
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
     """Return the largest distance by which :func:`noisy` can move a corner of a box, m."""
-    maximum = _MOST_SIGMA * config.level
+    maximum = _MAX_SIGMA * config.level
     turn = maximum * config.heading_rad
     along = maximum * config.along_m + turn * width_m / 2
     return float(np.hypot(along, maximum * config.across_m + turn * length_m / 2))
@@ -218,10 +218,10 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
 def _jitter(
     shape: tuple[int, ...], correlation: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, "track time"]:
-    """Unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""
+    """Draw unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""
     noise = np.ascontiguousarray(rng.normal(size=shape).T)
     noise[1:] *= np.sqrt(1.0 - correlation**2)
     # scipy.signal computes the same, but takes longer to import than to generate several scenarios.
     for before, now in pairwise(noise if correlation else ()):
         now += correlation * before
-    return np.clip(np.ascontiguousarray(noise.T), -_MOST_SIGMA, _MOST_SIGMA)
+    return np.clip(np.ascontiguousarray(noise.T), -_MAX_SIGMA, _MAX_SIGMA)

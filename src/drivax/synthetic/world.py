@@ -42,24 +42,24 @@ from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles,
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Run, Traffic, run_all
 
-#: Raised when the same seed gives another world; part of every scenario id.
+#: Increased when the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, latest delay, stride.
 _EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
-#: Ego may react to an event this many steps before it begins.
-_FORESEEN = 8
-#: Lights are recorded within this distance of ego's log, m: a scenario's map reaches a little further.
+#: Steps before an event from which ego may react to it.
+_LEAD_STEPS = 8
+#: Distance from ego's log within which lights are recorded, m: slightly less than the range of a scenario's map.
 _LIGHTS_M = 95.0
-#: Most draws of a scenario, on one map, and with one kind of event.
+#: Largest number of draws of a scenario, on one map, and with one kind of event.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
-#: Causes of rejection that are no violation: the requested event cannot happen, or has no effect.
+#: Causes of rejection other than violations: the requested event cannot happen, or has no effect.
 UNSUITED = ("no_occasion", "no_threat")
-#: Events that are tried with the same roles.
+#: Number of stagings with the same roles.
 _STAGINGS = 3
-#: Number of recorded users, nearest to ego first.
+#: Largest number of recorded users without ego, those nearest to it.
 _RECORDED = 76
 
 
@@ -133,7 +133,7 @@ def generate_recording(
 
 
 def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS) -> GeneratedRecording:
-    """:func:`generate_many` for one index."""
+    """Generate one recording: :func:`generate_many` for one index."""
     return next(generate_many(seed, [index], config, steps))
 
 
@@ -142,9 +142,9 @@ def generate_many(
 ) -> Iterator[GeneratedRecording]:
     """Generate recordings of at least 91 steps with their families and rejected attempts.
 
-    Their traffic is simulated together, which is faster; each is the same as alone. The kind of event is drawn first,
-    so that kinds whose draws fail more often are not rarer. A rare scenario has roads of its own, and is redrawn on
-    other roads if these give no occasion for its event.
+    Their traffic is simulated together, which is faster and changes no recording. The kind of event is drawn first, so
+    kinds that fail more often are not rarer. A rare scenario has its own roads, which are redrawn if its event cannot
+    happen on them.
 
     Raises:
         UsageError: Seed or index are negative, or no draw gives a clean expert.
@@ -156,6 +156,7 @@ def generate_many(
 def _generate(
     seed: int, index: int, config: WorldConfig, domain: Domain, steps: int
 ) -> Generator[Run, Motion, GeneratedRecording]:
+    """Draw until an attempt gives a recording."""
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     events, severity = _draw_events(config, np.random.default_rng([seed, 0, index]))
@@ -186,7 +187,7 @@ def _generate(
 
 
 def _draw_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
-    """Draw the order in which kinds of event are tried (or none), and the deceleration the event demands of ego."""
+    """Draw the kinds of event in the order of attempts (or none), and the severity of the event."""
     kinds = [kind for kind in EventKind if kind]
     rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
     return ([kinds[k] for k in order] if rare else [EventKind.NONE]), draw_severity(rng)
@@ -209,7 +210,7 @@ def _draw_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Roa
 
 @dataclass(frozen=True)
 class _Draw:
-    """Roads, destinations of which ego passes one, and the event (or none) with the deceleration it demands of ego."""
+    """Arguments of an attempt: roads, candidate destinations of ego, the event (or none) and its severity."""
 
     network: RoadNetwork
     destinations: tuple[Destination, ...]
@@ -252,7 +253,7 @@ def _attempt(
         staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
             break
-        aware = staged.first_step - _FORESEEN
+        aware = staged.first_step - _LEAD_STEPS
         motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware)
         if not cause and endangers_ego(view, motion, staged):
             return _add_perception(_to_recording(roles, motion, _WARM_UP, staged, draw.steps), config, rng)
@@ -263,8 +264,8 @@ def _attempt(
 def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
-    seen = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
+    is_visible = sight(tracks, ego, config.sensor)
+    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=is_visible)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:

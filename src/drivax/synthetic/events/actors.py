@@ -12,7 +12,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.ego_view import Track
 from drivax.synthetic.roads import curves
 from drivax.synthetic.roads.curves import Curve
-from drivax.synthetic.traffic.roles import Motion, Scripted
+from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 
 #: A number for each time; length, width and height, m.
 Times = Float64[np.ndarray, " time"]
@@ -21,7 +21,7 @@ CAR_M = (4.6, 1.85, 1.55)
 
 
 def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
-    """Distance and speed of a change between constant speeds that starts at time 0 (distances before are negative)."""
+    """Return distance and speed of a change between constant speeds from time 0 on (negative distances before)."""
     lasts = abs(last_mps - first_mps) / rate_mps2
     rate = math.copysign(rate_mps2, last_mps - first_mps)
     during = np.clip(times_s, 0.0, lasts)
@@ -31,7 +31,7 @@ def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: T
 
 
 def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
-    """Time to cover a distance from rest: constant acceleration, then constant speed."""
+    """Return the time to cover a distance from rest: constant acceleration, then constant speed."""
     ramp = speed_mps**2 / (2 * gain_mps2)
     if distance_m <= ramp:
         return math.sqrt(2 * max(distance_m, 0.0) / gain_mps2)
@@ -41,7 +41,7 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
 def gait(
     distance_m: float, speed_mps: float, rates_mps2: tuple[float, float], times_s: Times
 ) -> tuple[Times, Times] | None:
-    """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
+    """Return distance and speed of a walk from rest at time 0 to rest, or None if it is too short to reach its speed.
 
     ``rates_mps2`` are acceleration and deceleration.
     """
@@ -50,16 +50,16 @@ def gait(
     if distance_m < stopping + speed_mps**2 / (2 * gain):
         return None
     slows = travel_s(distance_m - stopping, speed_mps, gain)
-    gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
+    travelled_m, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
     extra, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
-    return gone + extra, np.where(times_s < slows, up, down)
+    return travelled_m + extra, np.where(times_s < slows, up, down)
 
 
 def along_track(
     track: Track, station: Times, left_m: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:  # fmt: skip
-    """Actor at stations and lateral offsets of ego's path, headed along its motion."""
+) -> ScriptedUser:  # fmt: skip
+    """Build an actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
     return scripted_motion(xy, heading, kind, size_m, valid)
@@ -68,8 +68,8 @@ def along_track(
 def scripted_motion(
     xy: Float64[np.ndarray, "time 2"], heading: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
-) -> Scripted:  # fmt: skip
-    """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
+) -> ScriptedUser:  # fmt: skip
+    """Build an actor headed along its motion; at rest it keeps its last heading, ``heading`` if it never moves."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
     drives = speed > 0.3
@@ -78,31 +78,31 @@ def scripted_motion(
         index = np.maximum.accumulate(np.where(drives, np.arange(len(xy)), -1))
         index = np.where(index < 0, int(np.argmax(drives)), index)
         heading = angle[index]
-    return Scripted(kind, size_m, xy, heading, speed, valid)
+    return ScriptedUser(kind, size_m, xy, heading, speed, valid)
 
 
-def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> Scripted:
-    """Actor that drives along a curve and is valid while it is on it."""
+def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> ScriptedUser:
+    """Build an actor that drives along a curve and is valid while it is on it."""
     xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
     valid = (distance_m >= size_m[0] / 2) & (distance_m <= curve.arc_m[-1] - size_m[0] / 2)
-    return Scripted(kind, size_m, xy, heading, speed, valid)
+    return ScriptedUser(kind, size_m, xy, heading, speed, valid)
 
 
-def user_of(motion: Motion, row: int) -> Scripted:
-    """Trajectory of a user of the traffic."""
+def user_trajectory(motion: Motion, row: int) -> ScriptedUser:
+    """Return the trajectory of a user of the traffic."""
     length, width, height = map(float, motion.size_m[row])
     track = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
-    return Scripted(AgentKind(int(motion.kind[row])), (length, width, height), *track)
+    return ScriptedUser(AgentKind(int(motion.kind[row])), (length, width, height), *track)
 
 
-def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
-    """Vehicle of the traffic that brakes from a step to a halt on its path."""
-    user = user_of(motion, row)
+def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> ScriptedUser:
+    """Return a vehicle of the traffic that brakes from a step to a halt on its path."""
+    user = user_trajectory(motion, row)
     arc = Curve(user.xy, user.heading).arc_m
     times = DT_S * (np.arange(len(arc)) - step)
-    gone, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
-    position = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
+    travelled_m, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
+    position = np.where(times < 0, arc, np.minimum(arc[step] + travelled_m, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
     heading = np.interp(position, arc[grows], np.unwrap(user.heading)[grows])
     speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))

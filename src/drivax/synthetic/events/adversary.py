@@ -19,25 +19,25 @@ from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind
-from drivax.synthetic.events.actors import user_of
+from drivax.synthetic.events.actors import user_trajectory
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.events.kinds import StagedEvent
 from drivax.synthetic.roads.curves import STEP_M
-from drivax.synthetic.traffic.roles import Motion, Scripted
+from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 
-#: Largest time to collision of an event, s: as proposed, and as simulated; and by how much ego's box is smaller in
-#: both, m. The margins exclude events that perception noise could undo.
-NEAR_S, SURELY_S, _SMALLER_M = 1.0, 0.8, 0.3
-#: Ego's speed counts as constant where it changes by less than this share.
-_STEADY = 0.12
-#: Actors appear no nearer to ego than this, m.
-_VIEW_M = 40.0
-#: Longitudinal and lateral distance between a new actor and other agents, m: of vehicles, and of other actors.
-_APART_M, _APART_ON_FOOT_M = (1.5, 0.3), (0.2, 0.05)
+#: Largest time to collision of a proposed and of a simulated event, s, and reduction of ego's box for both, m: events
+#: that perception noise could undo are excluded.
+_PROPOSED_TTC_S, _SIMULATED_TTC_S, _BOX_MARGIN_M = 1.0, 0.8, 0.3
+#: Relative change of ego's speed below which it counts as constant.
+_STEADY_SHARE = 0.12
+#: Least distance from ego at which an actor may appear, m.
+_APPEARANCE_M = 40.0
+#: Longitudinal and lateral distance of a new actor from other agents, m: of a vehicle, and of another actor.
+_VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
 #: Largest distance between the centres of vehicles that share a lane, m.
-_IN_LANE_M = 6.5
-#: Margins by which the box of a crossing vehicle is longer and wider, m; and the largest distance of centres, m.
-_CROSSED_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
+_SAME_LANE_M = 6.5
+#: Margins added to the length and width of a crossing vehicle, and largest distance of centres, m.
+_CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
 #: Time gap of the vehicle behind an actor that appears, s.
 _BEHIND_S = 0.8
 
@@ -45,18 +45,18 @@ _BEHIND_S = 0.8
 def required_deceleration(
     speed_mps: float, room_m: Float64[np.ndarray, " k"], time_s: Float64[np.ndarray, " k"]
 ) -> float:
-    """Constant deceleration with which ego has moved at most ``room_m`` at each time; 0 where it may keep its speed."""
+    """Return the constant deceleration with which ego moves at most ``room_m`` by each time, 0 without need."""
     if np.any(room_m <= 0.0):
         return math.inf
-    some = (time_s > 0) & (speed_mps * time_s > room_m)
-    room, time = room_m[some], time_s[some]
+    relevant = (time_s > 0) & (speed_mps * time_s > room_m)
+    room, time = room_m[relevant], time_s[relevant]
     rolling = 2 * (speed_mps * time - room) / time**2
     stopping = speed_mps**2 / (2 * room)
     return float(np.max(np.where(room >= speed_mps * time / 2, rolling, stopping), initial=0.0))
 
 
 def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> float:
-    """Distance to a place that is blocked until a time, so that it requires this deceleration."""
+    """Return the distance at which a place that is blocked until a time requires this deceleration."""
     if deceleration_mps2 * time_s <= speed_mps:
         return speed_mps * time_s - deceleration_mps2 * time_s**2 / 2
     return speed_mps**2 / (2 * deceleration_mps2)
@@ -65,18 +65,18 @@ def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> f
 def boxes(
     xy: Float64[np.ndarray, "*n 2"], heading: Float64[np.ndarray, "*n"], size_m: Any
 ) -> Float64[np.ndarray, "*n 6"]:
-    """Boxes in the layout of :mod:`drivax.geometry.boxes`; sizes are broadcast."""
+    """Return boxes in the layout of :mod:`drivax.geometry.boxes`; sizes are broadcast."""
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     return np.concatenate([xy, direction, np.broadcast_to(size_m, xy.shape)], axis=-1)
 
 
-def actor_boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
-    """Boxes of an actor at all steps."""
+def actor_boxes(actor: ScriptedUser) -> Float64[np.ndarray, "time 6"]:
+    """Return the boxes of an actor at all steps."""
     return boxes(actor.xy, actor.heading, actor.size_m[:2])
 
 
-def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
-    """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
+def first_blocked_station(view: EgoView, adversary: ScriptedUser, step: int) -> Float64[np.ndarray, " time"]:
+    """Return the first station at which ego would touch the actor, at each step from ``step`` on, m (inf: none)."""
     track, last = view.track, view.last_step
     box = actor_boxes(adversary)[step : last + 1]
     begin = int(track.at[step] / STEP_M)
@@ -92,36 +92,36 @@ def first_blocked_station(view: EgoView, adversary: Scripted, step: int) -> Floa
     return result
 
 
-def severity(view: EgoView, adversary: Scripted, step: int) -> float:
-    """Constant deceleration from a given step on with which ego just avoids the actor, m/s2."""
+def severity(view: EgoView, adversary: ScriptedUser, step: int) -> float:
+    """Return the constant deceleration from a step on with which ego just avoids the actor, m/s2."""
     room = first_blocked_station(view, adversary, step) - view.track.at[step]
-    return required_by_samples(float(view.motion.speed[0, step]), room)
+    return required_on_samples(float(view.motion.speed[0, step]), room)
 
 
-def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) -> float:
-    """:func:`required_deceleration` of the room until the first blocked sample of the path, at each step from now on.
+def required_on_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) -> float:
+    """Return :func:`required_deceleration` for the distance to the first blocked sample of the path at each step.
 
-    Corrects for sampling: the first blocked sample lies half a step of the path too far on average, and an actor
-    that has left the path at a step has blocked it for half of that step.
+    Corrects for sampling: the first blocked sample is on average half a sample too far, and an actor that leaves the
+    path during a step blocks it for half of that step.
     """
-    time, taken = DT_S * np.arange(len(room_m)), np.isfinite(room_m)
-    leaves = np.flatnonzero(taken[:-1] & ~taken[1:])
+    time, blocked = DT_S * np.arange(len(room_m)), np.isfinite(room_m)
+    leaves = np.flatnonzero(blocked[:-1] & ~blocked[1:])
     time = np.concatenate([time, time[leaves] + DT_S / 2])
     room = np.concatenate([room_m, room_m[leaves]]) - STEP_M / 2
     return required_deceleration(speed_mps, np.maximum(room, 0.0), time)
 
 
 def least_ttc(
-    view: EgoView, actor: Scripted, ego: tuple[float, float, float], hold_from: int, since: int
+    view: EgoView, actor: ScriptedUser, ego: tuple[float, float, float], first_step: int, from_step: int
 ) -> float:
-    """Least time to collision with an actor ahead from ``since`` on, s (at most 5).
+    """Return the least time to collision with an actor ahead from ``from_step`` on, s (at most 5).
 
-    ``ego`` is its station, lateral offset and speed at ``hold_from``; it keeps the latter two from then on.
+    ``ego`` is its station, lateral offset and speed at ``first_step``; offset and speed stay constant.
     """
     station, left, speed = ego
-    steps = np.arange(max(since, hold_from), view.last_step + 1)
-    xy, heading = view.track.pose(station + speed * DT_S * (steps - hold_from), left)
-    own, other = boxes(xy, heading, view.ego_size_m[:2] - _SMALLER_M), actor_boxes(actor)[steps]
+    steps = np.arange(max(from_step, first_step), view.last_step + 1)
+    xy, heading = view.track.pose(station + speed * DT_S * (steps - first_step), left)
+    own, other = boxes(xy, heading, view.ego_size_m[:2] - _BOX_MARGIN_M), actor_boxes(actor)[steps]
     toward = own[:, 2:4]
     time = time_to_overlap(own, speed * toward, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
     time = np.where(overlap(own, other), 0.0, time)
@@ -139,36 +139,36 @@ def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
     begin = staged.first_step
     (station,), (left,) = view.track.project(motion.xy[:1, begin])
     ego = station, left, float(motion.speed[0, begin])
-    return least_ttc(view, user_of(motion, staged.actors[0]), ego, begin, begin) < SURELY_S
+    return least_ttc(view, user_trajectory(motion, staged.actors[0]), ego, begin, begin) < _SIMULATED_TTC_S
 
 
-def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
+def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
     """Whether an ego at constant speed comes close to collision: from the event's first step, and from the current one.
 
     Where ego's speed changes in between (a turn, a queue) only the first counts.
     """
     current, speed = view.first_step + CURRENT_STEP, view.motion.speed[0]
 
-    def close(hold_from: int) -> bool:
-        ego = view.track.at[hold_from], 0.0, float(speed[hold_from])
-        return least_ttc(view, adversary, ego, hold_from, step) < NEAR_S
+    def close(first_step: int) -> bool:
+        ego = view.track.at[first_step], 0.0, float(speed[first_step])
+        return least_ttc(view, adversary, ego, first_step, step) < _PROPOSED_TTC_S
 
-    steady = abs(speed[step] - speed[current]) < _STEADY * speed[current]
+    steady = abs(speed[step] - speed[current]) < _STEADY_SHARE * speed[current]
     return close(step) and (not steady or close(current))
 
 
-def vehicles_in_lane(view: EgoView, extra: Scripted, until: int) -> tuple[int, ...]:
-    """Rows of vehicles in the lane of a new actor, near it and with its heading, up to a step."""
+def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
+    """Return the rows of vehicles in the lane of a new actor, near it and with its heading, up to a step."""
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
     gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
     same = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
-    met = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _IN_LANE_M**2) & same
-    return tuple(rows[met.any(axis=1)].tolist())
+    meets = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & same
+    return tuple(rows[meets.any(axis=1)].tolist())
 
 
-def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
-    """Rows of vehicles that would collide with an actor that crosses their path."""
+def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
+    """Return the rows of vehicles that would collide with an actor across their path."""
     motion, last = view.motion, view.last_step
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     moves = moves[moves <= last]
@@ -176,20 +176,25 @@ def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     headings = motion.heading[rows][:, moves]
     crosses = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
     row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
-    size = motion.size_m[rows[row], :2] + _CROSSED_M
+    size = motion.size_m[rows[row], :2] + _CROSSING_MARGIN_M
     other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
-def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...]) -> Scripted | None:
-    """Let a new actor appear when it has no collision ahead; None where it has, or where ego would see it appear.
+def enter_when_clear(
+    view: EgoView, extra: ScriptedUser, until: int, removed: tuple[int, ...]
+) -> ScriptedUser | None:
+    """Delay the appearance of a new actor until it has no collision ahead.
 
-    Other agents see it and keep behind it: only agents ahead of it and pedestrians count, until ego may meet it at step
-    ``until``; vehicles of the rows ``removed`` are left out.
+    Other agents keep behind it, so only agents ahead of it and pedestrians count, up to step ``until``. The rows
+    ``removed`` do not take part.
+
+    Returns:
+        The actor, or None if it has a collision or ego would see it appear.
     """
     motion, last = view.motion, until + 1
-    along, across = _APART_M if extra.kind == AgentKind.VEHICLE else _APART_ON_FOOT_M
+    along, across = _VEHICLE_MARGIN_M if extra.kind == AgentKind.VEHICLE else _OTHER_MARGIN_M
     box = actor_boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
     users = slice(1, None)
     other = boxes(motion.xy[users, :last], motion.heading[users, :last], motion.size_m[users, None, :2])
@@ -207,9 +212,10 @@ def enter_when_clear(view: EgoView, extra: Scripted, until: int, removed: tuple[
         appears = max(appears, int(meets.max()) + 5)
     if appears >= last or not extra.valid[appears]:
         return None
-    seen = appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
+    distance = np.hypot(*(extra.xy[appears] - motion.xy[0, appears]))
+    is_visible = appears > view.first_step and distance < _APPEARANCE_M
     scene = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if seen or not _is_clear(*scene):
+    if is_visible or not _is_clear(*scene):
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 

@@ -37,14 +37,19 @@ SCRIPTS: dict[EventKind, EventScript] = {
     EventKind.REVERSING_CAR: ReversingCar(),
     EventKind.TAILGATER: LeadBrakes(tailgater=True),
 }
-#: Proposals per event, how many of them with the requested severity, and how many with each other one.
+#: Proposals per event, the first of them with the requested severity, and proposals per further severity.
 _DRAWS, _AS_REQUESTED, _PER_SEVERITY = 40, 20, 5
-#: Exponent of the uniform number behind a severity; below 1 hard events are more frequent.
-_HARD = 0.7
-#: Kinds that rarely succeed unless ego is sent to a suitable place.
-_PLACED = {EventKind.RED_LIGHT_RUNNER, EventKind.TURN_CONFLICT, EventKind.LATE_MERGE, EventKind.TAILGATER}
-#: Largest difference between a proposal's severity and the one that it really requires, m/s2.
-_NEAR_MPS2 = 0.6
+#: Exponent of the uniform variable in the draw of a severity: values below 1 favour hard events.
+_HARD_EXPONENT = 0.7
+#: Kinds that rarely succeed without a suitable destination of ego.
+_NEEDS_DESTINATION = {
+    EventKind.RED_LIGHT_RUNNER,
+    EventKind.TURN_CONFLICT,
+    EventKind.LATE_MERGE,
+    EventKind.TAILGATER,
+}
+#: Largest difference between a proposal's severity and the deceleration that it requires, m/s2.
+_TOLERANCE_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
@@ -55,9 +60,9 @@ def possible(kind: EventKind, network: RoadNetwork) -> bool:
 def destinations_for(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Destination, ...]:
     """Return candidate places for ego to pass, so that an event can be staged; empty: anywhere.
 
-    ``again``: staging has failed before, so that kinds that can happen anywhere get places, too.
+    ``again`` gives destinations to kinds that can happen anywhere, too, after staging has failed.
     """
-    return SCRIPTS[kind].destinations(network) if again or kind in _PLACED else ()
+    return SCRIPTS[kind].destinations(network) if again or kind in _NEEDS_DESTINATION else ()
 
 
 def draw_severity(rng: np.random.Generator) -> float:
@@ -66,15 +71,15 @@ def draw_severity(rng: np.random.Generator) -> float:
     Hard events are drawn more often, since they are harder to stage: staged events fill all thirds of the range.
     """
     low, high = SEVERITY_MPS2
-    return low + (high - low) * float(rng.random() ** _HARD)
+    return low + (high - low) * float(rng.random() ** _HARD_EXPONENT)
 
 
 def stage(
     kind: EventKind, view: EgoView, severity_mps2: float, rng: np.random.Generator
 ) -> StagedEvent | None:
-    """Stage an event of a kind in a scenario without it, or return None where no proposal passes.
+    """Stage an event of a kind in a scenario without it, or return None if no proposal passes.
 
-    Where the requested severity cannot be staged, others are drawn.
+    Other severities are drawn if the requested one cannot be staged.
     """
     for draw in range(_DRAWS):
         if draw >= _AS_REQUESTED and draw % _PER_SEVERITY == 0:
@@ -90,11 +95,11 @@ def stage(
 
 
 def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
-    """The deceleration that a proposal requires of ego, and its staging; None where the proposal fails a check."""
+    """Return the deceleration that a proposal requires of ego, and its staging, or None if it fails a check."""
     begin, adversary = proposal.first_step, proposal.adversary
     required = severity(view, adversary, begin + NOTICED)
     low, high = SEVERITY_MPS2
-    if not low <= required <= high or abs(required - proposal.severity_mps2) > _NEAR_MPS2:
+    if not low <= required <= high or abs(required - proposal.severity_mps2) > _TOLERANCE_MPS2:
         return None
     blocked = np.isfinite(first_blocked_station(view, adversary, begin))
     entered = begin + int(np.argmax(blocked))

@@ -1,8 +1,8 @@
 """Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
-Recorded data sets are mined for interactions, since most driving is on empty roads. Here a reference driver that
-follows its leader and stops at red lights, but ignores all other agents, is rolled out from several steps of the same
-traffic. Where it collides, good driving takes more than car following.
+Recorded data sets are mined for interactions, since most driving is on empty roads. This module rolls out a reference
+driver from several steps of the same traffic: it follows its leader and stops at red lights, but ignores all other
+agents. A collision shows that good driving takes more than car following.
 """
 
 from __future__ import annotations
@@ -80,35 +80,35 @@ def critical_steps(
 
 
 def _project_others(path: Path, motion: Motion) -> _Others:
-    """Extents of all other agents in the coordinates of ego's path."""
+    """Return the extents of all other agents in the coordinates of ego's path."""
     shape = motion.valid[1:].shape
-    every = Boxes(
+    users = Boxes(
         motion.xy[1:].reshape(-1, 2),
         motion.heading[1:].ravel(),
         motion.speed[1:].ravel(),
         np.repeat(motion.size_m[1:, :2], shape[1], axis=0),
     )
-    extent, index = extents(path, every, _NEAR_M)
+    extent, index = extents(path, users, _NEAR_M)
     valid = motion.valid[1:].ravel()[index]
     sample = np.clip((extent.near_m + extent.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
-    along = every.speed[index] * np.cos(every.heading[index] - path.curve.heading[sample])
+    along = users.speed[index] * np.cos(users.heading[index] - path.curve.heading[sample])
 
     def table(values: Float64[np.ndarray, " k"], empty: float) -> Float64[np.ndarray, "user time"]:
-        result = np.full(len(every.xy), empty)
+        result = np.full(len(users.xy), empty)
         result[index] = np.where(valid, values, empty)
         return result.reshape(shape)
 
     sides = (extent.near_m, extent.far_m, extent.right_m, extent.left_m)
     extent_m = np.stack([table(side, np.inf) for side in sides])
     near = np.isfinite(extent_m[0]).any(axis=1)
-    box = boxes(every.xy, every.heading, every.size_m).reshape(*shape, 6)
+    box = boxes(users.xy, users.heading, users.size_m).reshape(*shape, 6)
     return _Others(extent_m[:, near], table(along, 0.0)[near], box[near])
 
 
 def _leader(
     others: _Others, extent: _Extent, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
 ) -> tuple[_Floats, _Floats]:
-    """Gap to the next agent ahead on the path, and its speed; ``extent`` is that of the others at these steps."""
+    """Return the gap to the next agent ahead on the path, and its speed, from the others' extents at these steps."""
     if not len(others.box):
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far, right, left = extent
@@ -122,13 +122,13 @@ def _leader(
 def _stop_line_m(
     network: RoadNetwork, path: Path, colour: Int8[np.ndarray, "start lane"], front: _Floats
 ) -> _Floats:
-    """Distance to the next stop line with a red or yellow light."""
+    """Return the distance to the next stop line with a red or yellow light."""
     result = np.full(len(front), np.inf)
     for span in path.spans:
         if network.lanes[span.lane].control == Control.SIGNAL:
-            away = span.begin_m - front
+            distance = span.begin_m - front
             shut = (colour[:, span.lane] == Colour.RED) | (colour[:, span.lane] == Colour.YELLOW)
-            result = np.minimum(result, np.where(shut & (away > 0), away, np.inf))
+            result = np.minimum(result, np.where(shut & (distance > 0), distance, np.inf))
     return result
 
 
@@ -136,7 +136,7 @@ def _hits(
     others: _Others, extent: _Extent, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:  # fmt: skip
-    """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
+    """Whether an agent overlaps ego and did not come from behind; agents that did are added to ``behind``."""
     half, side = size_m / 2
     near, far, right, left = extent
     maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)

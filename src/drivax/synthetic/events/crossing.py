@@ -12,7 +12,7 @@ from drivax.synthetic.events.actors import CAR_M, Times, along_curve
 from drivax.synthetic.events.adversary import (
     comes_close,
     first_blocked_station,
-    required_by_samples,
+    required_on_samples,
     vehicles_in_lane,
 )
 from drivax.synthetic.events.destinations import Destination
@@ -21,21 +21,21 @@ from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 #: Length of an actor's path before and beyond the junction, m.
 _FROM_M, _BEYOND_M = 180.0, 60.0
-#: An actor that needs more than this to stop at the line will not stop, m/s2: ego can tell from then on.
+#: Required braking at the stop line beyond which an actor visibly does not stop, m/s2.
 _BRAKING_MPS2 = 5.0
 #: Braking before bends and lateral acceleration in them, m/s2.
 _SLOWING_MPS2, _LATERAL_MPS2 = 2.0, 3.0
-#: Smaller changes of heading count as straight, rad; larger cosines of headings count as the same road.
+#: Largest change of heading of a straight connector, rad, and least cosine of headings on the same road.
 _TURN_RAD, _ALONG = math.radians(45.0), 0.7
 
 
 @dataclass(frozen=True)
 class _ActorPath:
-    """Path of an actor: a curve, and the distance along it at which the junction begins."""
+    """Path of an actor; the junction begins ``line_m`` along the curve."""
 
     curve: Curve
     line_m: float
@@ -65,9 +65,9 @@ class _ActorPath:
         speed = np.sqrt(np.minimum.accumulate(down - ramp) + ramp)
         clock = np.concatenate([[0.0], np.cumsum(np.diff(arc) * 2 / (speed[1:] + speed[:-1]))])
         zero = float(np.interp(self.line_m - CAR_M[0] / 2, arc, clock))
-        before = np.minimum(times_s + zero, 0.0) * speed[0]
-        beyond = np.maximum(times_s + zero - clock[-1], 0.0) * speed[-1]
-        return np.interp(times_s + zero, clock, arc) + before + beyond
+        before_m = np.minimum(times_s + zero, 0.0) * speed[0]
+        after_m = np.maximum(times_s + zero - clock[-1], 0.0) * speed[-1]
+        return np.interp(times_s + zero, clock, arc) + before_m + after_m
 
 
 def _chain(
@@ -75,17 +75,15 @@ def _chain(
 ) -> list[int]:
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
-    total, lane = 0.0, first
-    while total < length_m and (
-        links := lanes[lane].successors if direction > 0 else lanes[lane].predecessors
-    ):
-        lane = int(rng.choice(links))
-        result.append(lane)
-        total += lanes[lane].length_m
+    total, lane = 0.0, lanes[first]
+    while total < length_m and (links := lane.successors if direction > 0 else lane.predecessors):
+        result.append(int(rng.choice(links)))
+        lane = lanes[result[-1]]
+        total += lane.length_m
     return result
 
 
-def _straight_on(lane: Lane) -> bool:
+def _is_straight(lane: Lane) -> bool:
     return abs(float(lane.curve.heading[-1] - lane.curve.heading[0])) < _TURN_RAD
 
 
@@ -117,7 +115,11 @@ class CrossTraffic(EventScript):
         """See :class:`EventScript`."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
         connectors = sorted(
-            {other for mine in view.connectors for other in self._lower_priority_conflicts(network, mine)}
+            {
+                other
+                for connector in view.connectors
+                for other in self._lower_priority_conflicts(network, connector)
+            }
         )
         if not connectors:
             return None
@@ -137,39 +139,40 @@ class CrossTraffic(EventScript):
         staging = Staging(extras=(adversary,), removed=removed)
         return Proposal(staging, required, adversary, entry - decides, last)
 
-    def _lower_priority_conflicts(self, network: RoadNetwork, mine: int) -> list[int]:
+    def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
-        lane = network.lanes[mine]
-        if not _straight_on(lane):
+        lane = network.lanes[connector]
+        if not _is_straight(lane):
             return []
-        others = np.flatnonzero(network.conflicts[mine]).tolist()
-        return [other for other in others if self._suits(lane, network.lanes[other], mine)]
+        others = np.flatnonzero(network.conflicts[connector]).tolist()
+        return [other for other in others if self._crosses(lane, network.lanes[other], connector)]
 
-    def _suits(self, mine: Lane, other: Lane, index: int) -> bool:
+    def _crosses(self, lane: Lane, other: Lane, index: int) -> bool:
+        """Whether another lane is the connector of an actor that crosses ego's connector ``lane`` (``index``)."""
         if not other.predecessors or not other.connector:
             return False
-        along = math.cos(float(other.curve.heading[0] - mine.curve.heading[0]))
+        along = math.cos(float(other.curve.heading[0] - lane.curve.heading[0]))
         if self.turning:
-            left = not _straight_on(other) and float(other.curve.heading[-1]) > float(other.curve.heading[0])
+            left = not _is_straight(other) and float(other.curve.heading[-1]) > float(other.curve.heading[0])
             return left and along < -_ALONG and index in other.yields_to
-        lit = other.control == mine.control == Control.SIGNAL
-        return lit and _straight_on(other) and abs(along) < _ALONG
+        signalised = other.control == lane.control == Control.SIGNAL
+        return signalised and _is_straight(other) and abs(along) < _ALONG
 
     def _schedule(
         self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
-    ) -> tuple[int, Scripted, float] | None:
-        """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
+    ) -> tuple[int, ScriptedUser, float] | None:
+        """Find the entry step of the actor for about this deceleration; also return its motion and severity."""
         (fastest, decides), steps = pace, np.arange(view.steps)
         first = view.first_step + EARLIEST + decides
         last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
-        def entering(entry: int) -> Scripted:
+        def entering(entry: int) -> ScriptedUser:
             distance = path.distances(fastest, DT_S * (steps - entry))
             return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 
         if first > last:
             return None
-        # The blocked stations are the same for all entry steps, shifted in time.
+        # Blocked stations of other entry steps are those of the first one, shifted in time.
         blocked = first_blocked_station(view, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
@@ -177,14 +180,14 @@ class CrossTraffic(EventScript):
             speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
                 room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
-                requires[entry] = required_by_samples(speed, room)
+                requires[entry] = required_on_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
         enters = np.arange(last + 1) - decides + int(np.argmax(np.isfinite(blocked)))
         in_time = enters < view.first_step + FULL_SWING
         fits = np.flatnonzero((requires > low) & (requires < high) & in_time)
         for entry in fits[np.argsort(np.abs(requires[fits] - requested), kind="stable")[:6]].tolist():
-            # An ego that keeps its speed may pass before the actor arrives.
+            # Ego at constant speed may pass before the actor arrives.
             adversary = entering(entry)
             if comes_close(view, adversary, entry - decides) and self._fits_lights(view, lane, entry):
                 return entry, adversary, float(requires[entry])

@@ -76,7 +76,7 @@ def open_road(
 def draw_route(
     network: RoadNetwork, destinations: Sequence[Destination], rng: np.random.Generator
 ) -> DestinationRoute | None:
-    """Draw a route past one of several destinations; None where none can be reached."""
+    """Draw a route past one of several destinations, or return None if none can be reached."""
     order = rng.permutation(len(destinations)).tolist()
     routes = (route_past(network, destinations[index], rng) for index in order)
     return next((route for route in routes if route is not None), None)
@@ -85,7 +85,7 @@ def draw_route(
 def route_past(
     network: RoadNetwork, destination: Destination, rng: np.random.Generator
 ) -> DestinationRoute | None:
-    """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
+    """Draw a route past a destination to the end of the map, or return None if a light or sign delays ego."""
     time, position = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
     lane, lanes = destination.lane, [destination.lane]
     while position < time * _pace(network, lane):

@@ -27,7 +27,10 @@ _SLOWEST_MPS = 4.0
 
 @dataclass(frozen=True)
 class Track:
-    """Ego's trace and the rest of its path as samples half a metre apart, and its station (distance along it), m."""
+    """Ego's trace and the rest of its path, sampled every half metre.
+
+    ``at`` is ego's station (distance along the track) at each step, m.
+    """
 
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
@@ -66,7 +69,7 @@ class Track:
 
 
 def ego_track(motion: Motion) -> Track:
-    """Return the track of row 0: its trace, the rest of its path, then straight on."""
+    """Return the track of row 0: its trace, the rest of its path, and a straight continuation."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
     arc = Curve(xy, heading).arc_m
     distinct = np.concatenate([[True], np.diff(arc) > 1e-3])
@@ -81,8 +84,8 @@ def ego_track(motion: Motion) -> Track:
         shift = 2 * math.pi * np.round((headings[-1] - turn[:1]) / (2 * math.pi))
         headings = np.concatenate([headings, turn + shift])
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
-    out = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
-    points = np.concatenate([points, [points[-1] + 300.0 * out]])
+    ahead = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
+    points = np.concatenate([points, [points[-1] + 300.0 * ahead]])
     headings, along = (np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0))
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
     return Track(interpolate(station, along, points), np.interp(station, along, headings), arc)
@@ -121,7 +124,7 @@ class EgoView:
         return float(self.track.at[step]), float(self.motion.speed[0, step])
 
     def draw_step(self, rng: np.random.Generator) -> int | None:
-        """Draw a step at which an event may begin and ego is not slow; None without one."""
+        """Draw a step at which an event may begin and ego is not slow, or return None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
         steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
         return int(rng.choice(steps)) if len(steps) else None
@@ -149,7 +152,7 @@ class EgoView:
         return int(lane[candidates][np.argmin(gap[candidates])])
 
     def neighbour(self, station: float, side: int) -> int:
-        """Neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
+        """Return the neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
         lane = self.lane_at(station)
         if lane < 0:
             return -1
@@ -170,16 +173,16 @@ class EgoView:
     def edge_m(self, station: float, side: int) -> float:
         """Distance of the nearest road edge from ego's path at a station, to the left (1) or right (-1), m."""
         origin, heading = self.track.place(station)
-        out = side * np.array([-np.sin(heading), np.cos(heading)])
+        outward = side * np.array([-np.sin(heading), np.cos(heading)])
         best = math.inf
         for edge in self.roles.network.edges:
             a = edge.xy - origin
             b = np.roll(a, -1, axis=0)
-            # Crossings of the edge's sides with the ray, in the frame (out, along).
-            ay, by = a @ [-out[1], out[0]], b @ [-out[1], out[0]]
+            # Intersections of the edge's sides with the ray, in the frame (outward, along).
+            ay, by = a @ [-outward[1], outward[0]], b @ [-outward[1], outward[0]]
             across = (ay > 0) != (by > 0)
             if across.any():
-                ax, bx = (a @ out)[across], (b @ out)[across]
+                ax, bx = (a @ outward)[across], (b @ outward)[across]
                 position = ax + (bx - ax) * ay[across] / (ay[across] - by[across])
                 best = min(best, float(np.min(position[position > 0.0], initial=math.inf)))
         return best
@@ -217,7 +220,7 @@ class EgoView:
         return station, on
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
-        """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
+        """Return the scenario with a new leader, whose rear bumper is at stations from a step on; IDM slows ego."""
         law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
         ahead = np.gradient(rear_m, DT_S)
         stations, speeds = at.copy(), speed.copy()
@@ -227,11 +230,11 @@ class EgoView:
             a = idm_acceleration(v, np.maximum(speed.max(keepdims=True), 1.0), gap, ahead[t : t + 1], law)
             after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
             distance = (float(v[0]) + after) / 2 * DT_S
-            # Ego is never ahead of where it was without the leader: bends, lights and other agents still hold it.
+            # Ego never overtakes its motion without the leader, since bends, lights and other agents still hold it.
             stations[t + 1] = min(stations[t] + distance, at[t + 1])
-            speeds[t + 1] = min(
-                after, (stations[t + 1] - stations[t]) / DT_S if stations[t + 1] == at[t + 1] else after
-            )
+            if stations[t + 1] == at[t + 1]:
+                after = min(after, (stations[t + 1] - stations[t]) / DT_S)
+            speeds[t + 1] = after
         xy, heading = self.track.pose(stations)
         ego = {"xy": xy, "heading": heading, "speed": speeds}
         rows = {k: np.concatenate([own[None], getattr(self.motion, k)[1:]]) for k, own in ego.items()}

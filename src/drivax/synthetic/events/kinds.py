@@ -11,7 +11,7 @@ import numpy as np
 from drivax.synthetic.events.destinations import Destination, open_road
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 #: Range of required decelerations of staged events, m/s2.
 SEVERITY_MPS2 = (1.5, 6.0)
@@ -68,7 +68,7 @@ class Proposal:
 
     staging: Staging
     severity_mps2: float
-    adversary: Scripted
+    adversary: ScriptedUser
     first_step: int
     last_step: int
     vehicle: int | None = None
@@ -89,4 +89,4 @@ class EventScript(ABC):
 
     @abstractmethod
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """Propose an event of about this severity, or None where this draw fails."""
+        """Propose an event of about this severity, or return None if this draw fails."""

@@ -17,7 +17,7 @@ from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
-#: Lowest speed limit of the road, m/s: on slower roads a braking leader requires little of ego.
+#: Lowest speed limit of the road, m/s; on slower roads a braking leader requires little of ego.
 _LEAST_MPS = 10.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
@@ -32,7 +32,7 @@ _EVERY_M = 8.0
 
 
 def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
-    """Deceleration that a leader braking to a halt requires of ego from the same moment on.
+    """Return the deceleration that a leader braking to a halt requires of ego from the same moment on.
 
     Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
     the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
@@ -46,7 +46,7 @@ def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, brakin
 def draw_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Draw the leader's deceleration and the severity, uniform over what hard braking can require; None: too little."""
+    """Draw the leader's deceleration and the severity, uniform over what hard braking requires; None if too little."""
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
@@ -59,7 +59,7 @@ def draw_braking(
 def cut_in_gap(
     ego_mps: float, actor_mps: float, last_mps: float, braking_mps2: float, severity_mps2: float
 ) -> float | None:
-    """Bumper-to-bumper gap at which an actor that slows ahead requires this deceleration of ego.
+    """Return the bumper-to-bumper gap at which an actor that slows ahead requires this deceleration of ego.
 
     In a frame that moves at the actor's final speed v_f ego loses u = v - v_f within the gap and the actor's own
     distance: u^2 / (2 a) = g + w^2 / (2 b) with w = v_a - v_f; None where ego would reach v_f first.
@@ -99,27 +99,27 @@ class LeadBrakes(EventScript):
         if step is None:
             return None
         motion, (own, speed) = view.motion, view.at_step(step)
-        station, on = view.on_path(step)
+        station, on_path = view.on_path(step)
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
         if self.tailgater:
-            behind = np.where(on & (station < own), own - station, np.inf)
+            behind = np.where(on_path & (station < own), own - station, np.inf)
             follower = int(np.argmin(behind))
             if not behind[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
                 return None
             followers, tailgates = (follower,), (Tailgate(follower, tailgating),)
         length = motion.size_m[: motion.vehicles, 0]
-        gap = np.where(on & (station > own), station - own - (length + length[0]) / 2, np.inf)
+        gap = np.where(on_path & (station > own), station - own - (length + length[0]) / 2, np.inf)
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
-        draw = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = view.last_step if draw is None else step + _stop_steps(speed, draw[1])
-        if draw is None or last > view.last_step:
+        draft = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = view.last_step if draft is None else step + _stop_steps(speed, draft[1])
+        if draft is None or last > view.last_step:
             return None
-        staging = Staging(overrides=(Override(leader, step, last, -draw[0]),), tailgates=tailgates)
-        adversary = brake_to_halt(motion, leader, step, draw[0])
+        staging = Staging(overrides=(Override(leader, step, last, -draft[0]),), tailgates=tailgates)
+        adversary = brake_to_halt(motion, leader, step, draft[0])
         required = severity(view, adversary, step + NOTICED)
         return Proposal(staging, required, adversary, step, last, leader, followers)
 
@@ -141,7 +141,7 @@ class StalledVehicle(EventScript):
 
 
 def _stop_steps(speed_mps: float, severity_mps2: float) -> int:
-    """Steps for which a leader stands still: ego's time to reach it at constant speed, v / (2 a), plus a margin."""
+    """Return the steps that a leader stands: ego's time to reach it at constant speed, v / (2 a), and a margin."""
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
@@ -151,8 +151,11 @@ def _propose_leader(
 ) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to an ego in free traffic. With ``departure`` it drives on later, and that staging is
-    added; otherwise it stays. Return None near junctions, and if even hard braking would require too little of ego.
+    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; without
+    it stays.
+
+    Returns:
+        The proposal; None near junctions, or if even hard braking would require too little of ego.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -165,12 +168,12 @@ def _propose_leader(
         float(behind.motion.speed[0, step]),
         float(cruising[step] - behind.track.at[step]) - lengths,
     )
-    draw = draw_braking(speed, gap, ego_mps, rng)
-    if draw is None:
+    draft = draw_braking(speed, gap, ego_mps, rng)
+    if draft is None:
         return None
     times = DT_S * (np.arange(view.steps) - step)
-    braked_m, _ = speed_change(ego_mps, 0.0, draw[0], times)
-    last = view.last_step if departure is None else step + _stop_steps(speed, draw[1])
+    braked_m, _ = speed_change(ego_mps, 0.0, draft[0], times)
+    last = view.last_step if departure is None else step + _stop_steps(speed, draft[1])
     resumed_m, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + braked_m + resumed_m)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
@@ -238,8 +241,8 @@ class CutIn(EventScript):
             return None
         start = own + gap + (view.ego_size_m[0] + CAR_M[0]) / 2
         times = DT_S * (np.arange(view.steps) - step)
-        gone, _ = speed_change(before, after, braking, times)
-        station = start + gone
+        travelled_m, _ = speed_change(before, after, braking, times)
+        station = start + travelled_m
         finish = float(np.interp(lasts, times, station))
         adjacent = self._adjacent_lane(view, station, start, finish, side)
         if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
@@ -269,7 +272,7 @@ class CutIn(EventScript):
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
+        """Return the lateral offset of the actor's lane, and a mask of its steps; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
         for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():

@@ -14,7 +14,7 @@ from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoVie
 from drivax.synthetic.events.kinds import EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
 _PEDESTRIAN_M, _BICYCLE_M, _OBJECT_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
 #: Highest limit of streets with such events, m/s.
@@ -32,13 +32,13 @@ class _StreetScript(EventScript):
 
 
 def _is_open_street(view: EgoView, station: float) -> bool:
-    """Whether a station is on an ordinary street, away from junctions and crosswalks."""
+    """Whether a station is on a street away from junctions and crosswalks."""
     lanes = view.roles.network.lanes
     return view.plain_road(station) and lanes[view.lane_at(station)].limit_mps <= _STREET_MPS
 
 
 def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
-    """Station of a lasting obstacle that requires a deceleration, and the time until ego would reach it, s."""
+    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to reach it, s."""
     own, speed = view.at_step(step)
     room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
     return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
@@ -47,14 +47,16 @@ def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: f
 def _entry(
     view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
 ) -> tuple[Times, Times] | None:
-    """Distance and speed of an obstacle that moves into ego's lane, braking harder where the distance is short."""
+    """Return distance and speed of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
     gain, loss = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
     return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
 
 
-def _crossing_actor(view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size) -> Scripted:
-    """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
+def _crossing_actor(
+    view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size
+) -> ScriptedUser:
+    """Build an actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
     return scripted_motion(xy, toward, kind, size, np.ones(view.steps, bool))
@@ -74,9 +76,8 @@ class Jaywalker(_StreetScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         pace = float(rng.uniform(*self.speed_mps))
-        origin = (self._emerge_from_behind_parked if self.hidden else self._from_kerb)(
-            view, severity_mps2, pace, rng
-        )
+        draw_origin = self._start_behind_parked if self.hidden else self._start_at_kerb
+        origin = draw_origin(view, severity_mps2, pace, rng)
         if origin is None:
             return None
         step, station, offset = origin
@@ -84,41 +85,42 @@ class Jaywalker(_StreetScript):
             return None
         # The walk ends beyond the other side of the road.
         side = -int(math.copysign(1, offset))
-        over = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
+        walk_m = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
-        profile = gait(over, pace, (_START_MPS2, 2.0), times)
+        profile = gait(walk_m, pace, (_START_MPS2, 2.0), times)
         if profile is None:
             return None
         adversary = _crossing_actor(
             view, station, offset + side * profile[0], AgentKind.PEDESTRIAN, _PEDESTRIAN_M
         )
-        last = min(step + round(travel_s(over, pace, _START_MPS2) / DT_S), view.last_step)
+        last = min(step + round(travel_s(walk_m, pace, _START_MPS2) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
     def _required_room(
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
     ) -> float | None:
-        """Room from ego's front to the pedestrian's line at the first step; None where ego would pass first."""
+        """Return the distance from ego's front to the pedestrian's line at the first step; None if ego passes first."""
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
         room = speed * NOTICED_S + waiting_room(speed, requested, leaves - NOTICED_S)
         return room if room > speed * enters + 0.5 else None
 
-    def _from_kerb(
+    def _start_at_kerb(
         self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
+        """Draw a step and find station and lateral offset of a pedestrian at the kerb."""
         step = view.draw_step(rng)
         side = -1 if rng.random() < 0.7 else 1
-        back = float(rng.uniform(0.1, 0.7))
+        margin_m = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
         own, speed = view.at_step(step)
         front = own + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
         station, offset = front + speed, 0.0
-        # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
+        # Station and distance of the kerb depend on each other, so iterate twice.
         for _ in range(2):
-            offset = view.edge_m(station, side) + back
+            offset = view.edge_m(station, side) + margin_m
             if not offset < 10.0:
                 return None
             room = self._required_room(view, offset, speed, pace, requested)
@@ -127,9 +129,10 @@ class Jaywalker(_StreetScript):
             station = front + room
         return step, station, side * offset
 
-    def _emerge_from_behind_parked(
+    def _start_behind_parked(
         self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
+        """Find a step, station and lateral offset of a pedestrian behind a parked car."""
         if not view.roles.parked:
             return None
         station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
@@ -164,11 +167,11 @@ class LaneBlocked(EventScript):
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         pace, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
-        out = float(rng.uniform(0.1, 0.7))
+        clearance_m = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
         station, arrival_s = _blocked_station(view, step, severity_mps2, _OBJECT_M[0])
-        offset = view.edge_m(station, side) + out
+        offset = view.edge_m(station, side) + clearance_m
         half = (view.ego_size_m[1] + _OBJECT_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
@@ -190,21 +193,21 @@ class ReversingCar(_StreetScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, pace = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
-        into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
+        overlap_m, margin_m = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
         station, arrival_s = _blocked_station(view, step, severity_mps2, CAR_M[1])
         # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
-        rear = view.edge_m(station, -1) + back
+        rear = view.edge_m(station, -1) + margin_m
         if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
             return None
-        profile = _entry(view, step, rear + into, pace, (self.gain_mps2, 2.5))
+        profile = _entry(view, step, rear + overlap_m, pace, (self.gain_mps2, 2.5))
         clears = view.ego_size_m[1] / 2
         if profile is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
             return None
         xy, heading = view.track.pose(np.full(view.steps, station), profile[0] - (rear + CAR_M[0] / 2))
         valid = np.ones(view.steps, bool)
-        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
+        adversary = ScriptedUser(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
@@ -251,7 +254,7 @@ class WrongWayCyclist(_StreetScript):
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 
-def _inverse_smooth_step(share: float) -> float:
-    """Inverse of the smooth step: the share of its duration at which it reaches a share."""
+def _inverse_smooth_step(value: float) -> float:
+    """Return the argument at which the smooth step has a value."""
     t = np.linspace(0.0, 1.0, 201)
-    return float(np.interp(share, smooth_step(t), t))
+    return float(np.interp(value, smooth_step(t), t))

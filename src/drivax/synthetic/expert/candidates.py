@@ -30,7 +30,7 @@ HARD_M = (0.35, 0.2)
 NEAR_M, NEAR_VULNERABLE_M = (1.2, 0.5), (2.0, 1.2)
 #: Stride of the coarse pass over path samples.
 _STRIDE = 4
-#: Ego avoids passing a light that turns red sooner than this, s.
+#: Remaining yellow time below which ego avoids passing a light, s.
 _LATE_YELLOW_S = 1.0
 #: Smallest time gap to users with priority where ego gives way, s.
 _YIELD_S = 2.0
@@ -49,12 +49,12 @@ _Size = Float64[np.ndarray, " 3"]
 
 @dataclass(frozen=True)
 class Shift:
-    """Lateral offset to the left with quintic transitions, from begin to there and from back to end, m ahead of ego."""
+    """Lateral offset to the left with quintic transitions out and back; positions are distances ahead of ego."""
 
     aside_m: float = 0.0
     begin_m: float = 0.0
-    there_m: float = 1.0
-    back_m: float = 2.0
+    out_end_m: float = 1.0
+    back_begin_m: float = 2.0
     end_m: float = 3.0
 
 
@@ -81,50 +81,41 @@ class CandidatePath:
         return curve.xy, curve.heading
 
 
-def shifted_path(
-    path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift
+def shift_path(
+    path: Path, drivers: Drivers, pose: Pose, near_m: float, reach_m: float, shift: Shift
 ) -> CandidatePath:
-    """Return ego's path with a shift, or without; it starts at ego and ends where the path does, or earlier.
+    """Return the rest of ego's path with a shift, at most ``reach_m`` long.
 
-    ``span_m`` is the approximate position of ego on the path, and the reach of the result, m.
+    ``near_m`` is the approximate position of ego on the path.
     """
-    begin, left, direction = project_on_path(path, np.array([pose.x, pose.y]), span_m[0])
-    ahead = np.arange(0.0, min(span_m[1], path.length_m - begin - 1e-6), SPACING_M)
+    begin, left, direction = project_on_path(path, np.array([pose.x, pose.y]), near_m)
+    ahead = np.arange(0.0, min(reach_m, path.length_m - begin - 1e-6), SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     base = interpolate_curve(path.curve, grid, begin + ahead)
     lateral = quintic_step(ahead, (0.0, left, math.tan(wrap(pose.heading - direction))), _RETURN_M)
-    there, back = shift.there_m - shift.begin_m, shift.end_m - shift.back_m
-    lateral += shift.aside_m * quintic_step(ahead, (shift.back_m, 1.0, 0.0), back)
-    lateral -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), there)
+    out_m, back_m = shift.out_end_m - shift.begin_m, shift.end_m - shift.back_begin_m
+    lateral += shift.aside_m * quintic_step(ahead, (shift.back_begin_m, 1.0, 0.0), back_m)
+    lateral -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), out_m)
     normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
     stretch = np.maximum(1.0 - lateral * np.interp(begin + ahead, grid, path.curvature), 0.2)
     relative_heading = np.arctan2(np.gradient(lateral, SPACING_M), stretch)
     curve = Curve(base.xy + lateral[:, None] * normal, base.heading + relative_heading)
     arc = curve.arc_m
     position = np.arange(0.0, float(arc[-1]), SPACING_M)
-    return _with_speeds(
-        path,
-        drivers,
-        interpolate_curve(curve, arc, position),
-        (begin, np.interp(position, arc, ahead)),
-        shift,
-    )
+    curve, base = interpolate_curve(curve, arc, position), np.interp(position, arc, ahead)
+    limit = np.interp(begin + base, grid, path.limit_mps)
+    preferred, bound = _speeds(curve, limit, drivers)
+    return CandidatePath(curve.xy, curve.heading, base, preferred, bound, shift)
 
 
-def _with_speeds(
-    path: Path, drivers: Drivers, curve: Curve, base_m: tuple[float, _Points], shift: Shift
-) -> CandidatePath:
-    """Add the speeds; ``base_m`` is ego's position and the samples' distances along the path."""
-    curvature = mean_curvature(curve, SPACING_M)
-    grid = path.step_m * np.arange(len(path.curve.xy))
-    limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
-    none = np.full((len(limit), 1), -1)
+def _speeds(curve: Curve, limit_mps: _Points, drivers: Drivers) -> tuple[_Points, _Points]:
+    """Return the preferred speeds of ego along a curve, and the largest ones in bends."""
+    curvature, no_lanes = mean_curvature(curve, SPACING_M), np.full((len(limit_mps), 1), -1)
+    path = Path(curve, SPACING_M, curvature, limit_mps, (), no_lanes, np.zeros((len(limit_mps), 1)))
     driver = drivers.speed_factor[0], drivers.lateral_mps2[0], drivers.slowing_mps2[0]
-    driven = Path(curve, SPACING_M, curvature, limit, (), none, np.zeros((len(limit), 1)))
-    fastest = speed_profile(driven, *map(float, driver))
     bend = np.maximum(np.abs(curvature), 1e-6)
     bound = np.minimum(np.sqrt(_LATERAL_MPS2 / bend), _YAW_RATE_RPS / bend)
-    return CandidatePath(curve.xy, curve.heading, base_m[1], fastest, bound, shift)
+    return speed_profile(path, *map(float, driver)), bound
 
 
 def candidate_boxes(candidate: CandidatePath, size_m: _Size) -> _PathBoxes:
@@ -137,27 +128,27 @@ def candidate_boxes(candidate: CandidatePath, size_m: _Size) -> _PathBoxes:
 def candidate_corners(candidate: CandidatePath, size_m: _Size) -> Float64[np.ndarray, "corner 2"]:
     """Return corners of ego's box every metre of the stretch where a candidate leaves the original path."""
     base, shift = candidate.base_m, candidate.shift
-    away = (base >= shift.begin_m - 2.0) & (base <= shift.end_m + 2.0)
-    return corners(candidate_boxes(candidate, size_m)[away][::2]).reshape(-1, 2)
+    is_shifted = (base >= shift.begin_m - 2.0) & (base <= shift.end_m + 2.0)
+    return corners(candidate_boxes(candidate, size_m)[is_shifted][::2]).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class Conflicts:
-    """Overlaps of ego's box along its path with other users; ``hard`` where they touch, else they are only close."""
+    """Conflicts of ego's box along its path with other users: contacts (``hard``), or small gaps."""
 
     user: Int64[np.ndarray, " conflict"]
     step: Int64[np.ndarray, " conflict"]
     point: Int64[np.ndarray, " conflict"]
     hard: Bool[np.ndarray, " conflict"]
 
-    def only(self, keep: Bool[np.ndarray, " conflict"]) -> Conflicts:
-        """Return a subset."""
+    def select(self, keep: Bool[np.ndarray, " conflict"]) -> Conflicts:
+        """Return a subset of the conflicts."""
         return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
 
 
 @dataclass(frozen=True)
 class StopLine:
-    """A line that ego's centre must not pass at some steps (closed) and should not at others (late).
+    """A line that ego's centre must not pass at ``closed`` steps and should not pass at ``late`` ones.
 
     ``base_m`` is its distance ahead of ego along the path.
     """
@@ -203,10 +194,10 @@ def _box_conflicts(
     row = np.repeat(row, _STRIDE)
     inside = (point >= 0) & (point < len(ego))
     row, point = row[inside], point[inside]
-    other, mine = others[user[row], step[row]], ego[point]
-    close = overlap(_grow_boxes(mine, margin_m[user[row]]), other)
-    row, point, other, mine = row[close], point[close], other[close], mine[close]
-    hard = overlap(_grow_boxes(mine, np.array(HARD_M)), other)
+    other, ego_box = others[user[row], step[row]], ego[point]
+    close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
+    row, point, other, ego_box = row[close], point[close], other[close], ego_box[close]
+    hard = overlap(_grow_boxes(ego_box, np.array(HARD_M)), other)
     return Conflicts(user[row], step[row], point, hard)
 
 
@@ -250,8 +241,8 @@ def stop_lines(
             late |= (colour[:, span.lane] == Colour.YELLOW) & (to_red[:, span.lane] < _LATE_YELLOW_S)
         if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             closed |= passed <= line
-        for first in lane.yields_to:
-            late |= arrivals.get(first, np.zeros(len(times_s), bool))
+        for rival in lane.yields_to:
+            late |= arrivals.get(rival, np.zeros(len(times_s), bool))
         if closed.any() or late.any():
             result.append(StopLine(line - _SHORT_M - from_m, closed, late))
     return result
@@ -261,8 +252,8 @@ def arrivals(
     network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
     valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
 ) -> dict[int, _Steps]:  # fmt: skip
-    """Steps at which a vehicle other than ego is on, or about to enter, each connector to which another yields."""
-    watched = {first for lane in network.lanes for first in lane.yields_to}
+    """Return the steps at which a vehicle other than ego is on a connector with priority, or about to enter it."""
+    watched = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):
         for span in paths[vehicle].spans:
@@ -270,7 +261,7 @@ def arrivals(
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
                 on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
-                early = round(_YIELD_S / 0.1)
-                coming = np.convolve(on_lane[::-1], np.ones(early + 1), mode="full")[: len(on_lane)][::-1] > 0
+                window = np.ones(round(_YIELD_S / 0.1) + 1)
+                coming = np.convolve(on_lane[::-1], window, mode="full")[: len(on_lane)][::-1] > 0
                 result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
     return result

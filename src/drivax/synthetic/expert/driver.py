@@ -17,8 +17,8 @@ from drivax.synthetic.traffic.simulation import Run, Traffic
 
 #: Hardest braking of an accepted expert, m/s2: nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
-#: Causes that no plan can fix, and one that a plan rarely fixes unless an event is staged.
-_HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
+#: Causes that no plan can fix, and a cause that a plan rarely fixes unless an event is staged.
+_UNFIXABLE, _HARDLY_MOVES = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
 
 def draw_expert(rng: np.random.Generator) -> Drivers:
@@ -63,8 +63,9 @@ def expert_lanes(
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
     """Adjacent lanes of a lane that is long enough for a change."""
     current = network.lanes[lane]
-    neighbour = [other for other in (current.left, current.right) if other >= 0]
-    return [] if current.connector or not 70.0 < current.length_m < 100.0 else neighbour
+    if current.connector or not 70.0 < current.length_m < 100.0:
+        return []
+    return [lane for lane in (current.left, current.right) if lane >= 0]
 
 
 def expert_path(
@@ -79,13 +80,13 @@ def drive_ego(
 ) -> Generator[Run, Motion, tuple[Motion, str]]:
     """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
-    Others react to a plan, so each plan is simulated and checked, and replaced where it fails.
+    Others react to a plan, so each plan is simulated, checked, and replaced if it fails.
 
     Args:
         traffic: All users, and the times of all steps on the clock of the lights.
         staging: The staged event.
         first_step: First step of the recording and, at the earliest, of a plan.
-        aware_step: Step from which ego reacts to the event, if that is early enough.
+        aware_step: Step from which ego reacts to the event; earlier where that is too late.
         unplanned: The motion without a plan, if known.
 
     Yields:
@@ -95,39 +96,39 @@ def drive_ego(
         The motion, and the cause of its rejection (empty: accepted).
     """
     roles, times_s = traffic.roles, traffic.times_s
-    hardest, hopeless = HARDEST_MPS2, (*_HOPELESS, _STUCK)
+    hardest, unfixable = HARDEST_MPS2, (*_UNFIXABLE, _HARDLY_MOVES)
     if is_staged(staging):
-        hardest, hopeless = HARDEST_IN_EVENT_MPS2, _HOPELESS
+        hardest, unfixable = HARDEST_IN_EVENT_MPS2, _UNFIXABLE
 
-    def find(motion: Motion) -> Violation:
+    def check_motion(motion: Motion) -> Violation:
         return find_violation(roles, motion, times_s, first_step, staging, hardest)
 
-    def pleasant(motion: Motion) -> bool:
+    def is_comfortable(motion: Motion) -> bool:
         return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
 
     motion = unplanned or (yield Run(traffic, staging))
-    violation = find(motion)
-    if (not violation.cause and pleasant(motion)) or violation.cause in hopeless:
+    violation = check_motion(motion)
+    if (not violation.cause and is_comfortable(motion)) or violation.cause in unfixable:
         return motion, violation.cause
     # A safe but uncomfortable motion is the fallback.
-    rough = None if violation.cause else motion
+    fallback = None if violation.cause else motion
     unreactive: frozenset[int] = frozenset()
-    for begin in _beginnings(roles, motion, violation, first_step, aware_step):
+    for begin in _first_steps(roles, motion, violation, first_step, aware_step):
         plan = plan_ego(roles, motion, times_s, begin, unreactive)
         motion = yield Run(traffic, staging, plan)
-        violation = find(motion)
+        violation = check_motion(motion)
         unreactive |= set(violation.users)
-        if not violation.cause and (rough is None or pleasant(motion)):
+        if not violation.cause and (fallback is None or is_comfortable(motion)):
             return motion, ""
-        if violation.cause in ("", *hopeless):
+        if violation.cause in ("", *unfixable):
             break
-    return (motion, violation.cause) if rough is None else (rough, "")
+    return (motion, violation.cause) if fallback is None else (fallback, "")
 
 
-def _beginnings(
+def _first_steps(
     roles: Roles, motion: Motion, violation: Violation, first_step: int, aware_step: int
 ) -> tuple[int, int, int]:
-    """Return the first steps of three plans, ever earlier; only the last may precede ego's last stop at a sign."""
+    """Return the first steps of three plans, each earlier; only the last may precede ego's last stop at a sign."""
     late = max(first_step, aware_step)
     stood = last_stop(roles, motion, first_step)
     if violation.cause == "ego_collides":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -19,7 +20,7 @@ from drivax.synthetic.expert.candidates import (
     arrivals,
     candidate_corners,
     find_conflicts,
-    shifted_path,
+    shift_path,
     stop_lines,
 )
 from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smooth_speeds
@@ -30,29 +31,44 @@ from drivax.synthetic.traffic.lateral import project_on_path
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
-#: Bounds of acceleration (m/s2) and jerk (m/s3), tried in this order.
-_BOUNDS = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
-#: Cost below which the original path needs no alternatives.
+#: Bounds of acceleration (m/s2) and jerk (m/s3), the most comfortable first.
+_BOUNDS_BY_COMFORT = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
+#: Cost of the original path below which no alternatives are computed.
 _GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
-_LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
+_SHIFT_COST, _OFFSET_COST, _WRONG_WAY_COST = 8.0, 2.0, 6.0
 #: Cost of passing a line when the light is about to turn red or ego must give way.
-_LATE = 30.0
+_LATE_COST = 30.0
 #: Factor on proximity costs for pedestrians and cyclists.
-_VULNERABLE = 12.0
-#: Steps by which motion is extrapolated.
-_BEYOND_STEPS = 20
-#: Lateral gap to what ego passes, m, and lateral acceleration of the shift, m/s2: preferred and tightest.
-_ROOM_M, _STEP_MPS2 = (0.8, 0.4), (1.6, 3.8)
+_VULNERABLE_FACTOR = 12.0
+#: Steps by which motion is extrapolated beyond the recording.
+_EXTRA_STEPS = 20
+#: Lateral gap to a user that ego passes, m, and lateral acceleration of the shift, m/s2: preferred and tightest.
+_PASSING_GAPS_M, _SHIFT_MPS2 = (0.8, 0.4), (1.6, 3.8)
 #: Distance over which the remaining offset between ego and its path fades, m.
 _FADE_M = 10.0
 #: Largest shift, m.
-_FURTHEST_M = 4.5
-#: Exceeding a bound by this (m, m/s or m/s2) is rounding.
+_MAX_SHIFT_M = 4.5
+#: Excess over a bound that counts as rounding, m, m/s or m/s2.
 _TOLERANCE = 0.03
 
 _Series = Float64[np.ndarray, " time"]
-_Hit = tuple[int, int, int]
+
+
+class _Hit(NamedTuple):
+    """Conflict with a user: its row, the step, and the sample of ego's path."""
+
+    user: int
+    step: int
+    point: int
+
+
+class _Extent(NamedTuple):
+    """Range of a user along ego's path, and its lateral extent on the side on which ego passes it, m."""
+
+    begin: float
+    end: float
+    lateral: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +102,7 @@ class _State:
         """Return ego's path with a lateral shift, as far as ego can travel."""
         top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
         reach_m = top * DT_S * self.others.shape[1] + 15.0
-        return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, reach_m), shift)
+        return shift_path(self.path, self.roles.drivers, self.pose, self.from_m, reach_m, shift)
 
 
 @dataclass(frozen=True)
@@ -107,20 +123,21 @@ def plan_ego(
     ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
     """
     state = _state(roles, motion, times_s, first_step, unreactive)
-    candidate, drive = _best_candidate(state)
+    candidate, profile = _best_candidate(state)
     steps = motion.xy.shape[1] - first_step
-    xy, heading = candidate.pose(drive.at_m[:steps])
+    xy, heading = candidate.pose(profile.at_m[:steps])
     # The path starts within millimetres of ego; the difference fades over the first metres.
-    fade = np.clip(1.0 - drive.at_m[:steps] / _FADE_M, 0.0, 1.0)
+    fade = np.clip(1.0 - profile.at_m[:steps] / _FADE_M, 0.0, 1.0)
     xy += fade[:, None] * (motion.xy[0, first_step] - xy[0])
     heading += fade * wrap(state.pose.heading - heading[0])
     heading = heading[0] + np.concatenate([[0.0], np.cumsum(wrap(np.diff(heading)))])
-    return EgoPlan(first_step, xy, heading, drive.speed[:steps])
+    return EgoPlan(first_step, xy, heading, profile.speed[:steps])
 
 
 def _state(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, unreactive: frozenset[int]
 ) -> _State:
+    """Derive the planning input from the last run."""
     x, y = motion.xy[0, first_step]
     pose = Pose(float(x), float(y), float(motion.heading[0, first_step]))
     paths = motion.paths or roles.paths
@@ -150,32 +167,32 @@ def _state(
 
 
 def _repeat_last_step(values: np.ndarray) -> np.ndarray:
-    """Repeat the last value."""
-    return np.append(values, np.repeat(values[-1:], _BEYOND_STEPS))
+    """Extend a series by copies of its last value."""
+    return np.append(values, np.repeat(values[-1:], _EXTRA_STEPS))
 
 
 def _extrapolate(
     motion: Motion, first_step: int
 ) -> tuple[Float64[np.ndarray, "user time 6"], Bool[np.ndarray, "user time"]]:
-    """Boxes of the other road users from ``first_step`` on, extrapolated beyond the end at constant velocity."""
+    """Return the boxes of other users from ``first_step`` on, extrapolated at constant velocity beyond the end."""
     box, valid = user_boxes(motion)[1:, first_step:], motion.valid[1:, first_step:]
-    longer = np.repeat(box[:, -1:], _BEYOND_STEPS, axis=1)
-    travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _BEYOND_STEPS + 1)
-    longer[..., :2] += travelled[..., None] * longer[..., 2:4]
-    extra = np.repeat(valid[:, -1:], _BEYOND_STEPS, axis=1)
-    return np.concatenate([box, longer], axis=1), np.concatenate([valid, extra], axis=1)
+    extension = np.repeat(box[:, -1:], _EXTRA_STEPS, axis=1)
+    travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _EXTRA_STEPS + 1)
+    extension[..., :2] += travelled[..., None] * extension[..., 2:4]
+    extra = np.repeat(valid[:, -1:], _EXTRA_STEPS, axis=1)
+    return np.concatenate([box, extension], axis=1), np.concatenate([valid, extra], axis=1)
 
 
 def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
-    """Stop lines ahead, during the plan and after it."""
+    """Return the stop lines ahead, during the plan and after it."""
     steps, half = len(times_s), motion.size_m[: motion.vehicles, 0] / 2
     roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
     coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
-    first = {lane: _repeat_last_step(taken) for lane, taken in coming.items()}
-    longer = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _BEYOND_STEPS + 1))
+    coming = {lane: _repeat_last_step(steps) for lane, steps in coming.items()}
+    clock = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _EXTRA_STEPS + 1))
     ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
-    return stop_lines(roles.network, state.path, ego, longer, passed, first)
+    return stop_lines(roles.network, state.path, ego, clock, passed, coming)
 
 
 def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
@@ -209,17 +226,18 @@ def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     along = box[:, 2] * np.cos(candidate.heading[point]) + box[:, 3] * np.sin(candidate.heading[point])
     behind = candidate.base_m[point] < state.passed_m[step]
     follows[users] = behind & (along > 0.7) & ~state.unreactive[users]
-    return conflicts.only(~follows[conflicts.user])
+    return conflicts.select(~follows[conflicts.user])
 
 
 def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
+    """Search the best speeds along a candidate and add the costs of its shift."""
     occupancy = _occupancy(state, candidate, conflicts)
     speeds = search(occupancy, candidate.preferred_mps, candidate.limit_mps, state.speed)
     cost = speeds.cost
     if candidate.shift.aside_m:
         wrong = against_traffic(state.roles.network, candidate.xy[::4], candidate.heading[::4])
         wrong_m, lateral = float(wrong.sum() * 4 * SPACING_M), abs(candidate.shift.aside_m)
-        cost += _LEAVING + _ASIDE * lateral + _AGAINST * wrong_m / max(state.speed, 4.0)
+        cost += _SHIFT_COST + _OFFSET_COST * lateral + _WRONG_WAY_COST * wrong_m / max(state.speed, 4.0)
     return _Option(candidate, occupancy, speeds, cost)
 
 
@@ -227,15 +245,15 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     """Return the occupancy of a candidate by others, stop lines, and the end of the map."""
     shape = (state.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
-    weight = np.where(state.vulnerable[conflicts.user], _VULNERABLE, 1.0)
+    weight = np.where(state.vulnerable[conflicts.user], _VULNERABLE_FACTOR, 1.0)
     np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
-    thick = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
+    thickness = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
     for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
             index = int(np.searchsorted(candidate.base_m, line.base_m))
-            hard[line.closed, index : index + thick] = True
-            near[line.late, index : index + thick] = _LATE
+            hard[line.closed, index : index + thickness] = True
+            near[line.late, index : index + thickness] = _LATE_COST
     room = state.path.length_m - state.from_m - state.size_m[0] / 2 - 0.5
     hard[:, candidate.base_m > room] = True
     return Occupancy(SPACING_M, hard, near)
@@ -243,7 +261,7 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 def _smooth(state: _State, option: _Option) -> SpeedProfile:
     """Smooth an option's speeds within the tightest feasible bounds."""
-    position, speed = option.speeds.fine(state.others.shape[1])
+    position, speed = option.speeds.resample(state.others.shape[1])
     speed[0] = state.speed
     hard = option.occupancy.hard[1:]
     index = np.arange(hard.shape[1])
@@ -251,19 +269,19 @@ def _smooth(state: _State, option: _Option) -> SpeedProfile:
     below = np.where(hard & (index < own[:, None]), index, -1).max(axis=1)
     above = np.where(hard & (index > own[:, None]), index, len(index)).min(axis=1)
     # Steps at which even the best speeds touch something are unbounded.
-    lost = hard[np.arange(len(hard)), own]
-    low = np.where((below >= 0) & ~lost, (below + 1) * SPACING_M, -np.inf)
-    high = np.where(lost, np.inf, (above - 1) * SPACING_M)
-    around = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
-    top = np.maximum(option.candidate.limit_mps[around].min(axis=1), speed[1:])
-    drive = None
-    for acceleration, jerk in _BOUNDS:
+    has_contact = hard[np.arange(len(hard)), own]
+    low = np.where((below >= 0) & ~has_contact, (below + 1) * SPACING_M, -np.inf)
+    high = np.where(has_contact, np.inf, (above - 1) * SPACING_M)
+    window = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
+    top = np.maximum(option.candidate.limit_mps[window].min(axis=1), speed[1:])
+    profile = None
+    for acceleration, jerk in _BOUNDS_BY_COMFORT:
         bounds = Bounds(low, np.maximum(high, low), top, acceleration, jerk)
-        drive = smooth_speeds(position, speed, state.acceleration, bounds)
-        if drive.excess <= _TOLERANCE:
+        profile = smooth_speeds(position, speed, state.acceleration, bounds)
+        if profile.excess <= _TOLERANCE:
             break
-    assert drive is not None
-    return drive
+    assert profile is not None
+    return profile
 
 
 def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
@@ -274,7 +292,7 @@ def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflic
     rings = tuple(edge.xy for edge in state.roles.network.edges)
     result = []
     for side in (1.0, -1.0):
-        for margins in zip(_ROOM_M, _STEP_MPS2, strict=True):
+        for margins in zip(_PASSING_GAPS_M, _SHIFT_MPS2, strict=True):
             shift = _shift(state, candidate, conflicts, hit, side, margins)
             if shift is None:
                 continue
@@ -289,7 +307,7 @@ def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflic
 
 
 def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
-    """Return user, step and path sample of the first collision at the preferred speeds."""
+    """Return the first collision at the preferred speeds, if there is one."""
     position, speed, places = 0.0, state.speed, []
     for _ in range(state.others.shape[1]):
         places.append(position)
@@ -301,7 +319,7 @@ def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     if not touch.any():
         return None
     first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
-    return int(conflicts.user[first]), int(conflicts.step[first]), int(conflicts.point[first])
+    return _Hit(int(conflicts.user[first]), int(conflicts.step[first]), int(conflicts.point[first]))
 
 
 def _shift(
@@ -310,35 +328,36 @@ def _shift(
 ) -> Shift | None:  # fmt: skip
     """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
     room_m, step_mps2 = margins
-    begin, end, edge = _extent(state, candidate, hit, side)
+    begin, end, lateral = _extent(state, candidate, hit, side)
     half_l, half_w = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
-    seen = {hit[0]}
+    passed = {hit.user}
     standing = [
         user
         for user in np.unique(conflicts.user[conflicts.hard]).tolist()
         if np.ptp(state.others[user, state.valid[user], :2], axis=0).max() < 0.5
     ]
     for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
-        mine = conflicts.hard & (conflicts.user == user)
-        index = int(conflicts.point[mine].min())
-        if user not in seen and begin < index * SPACING_M < end + 20.0:
-            extra = _extent(state, candidate, (user, int(conflicts.step[mine].min()), index), side)
-            end, edge = max(end, extra[1]), max(edge, extra[2])
-            seen.add(user)
-    lateral = edge + half_w + room_m
-    if not 0.15 < lateral < _FURTHEST_M:
+        user_conflicts = conflicts.hard & (conflicts.user == user)
+        index = int(conflicts.point[user_conflicts].min())
+        if user not in passed and begin < index * SPACING_M < end + 20.0:
+            hit_user = _Hit(user, int(conflicts.step[user_conflicts].min()), index)
+            extent = _extent(state, candidate, hit_user, side)
+            end, lateral = max(end, extent.end), max(lateral, extent.lateral)
+            passed.add(user)
+    lateral = lateral + half_w + room_m
+    if not 0.15 < lateral < _MAX_SHIFT_M:
         return None
-    speed = max(state.speed, float(candidate.preferred_mps[hit[2]]) * 0.7)
+    speed = max(state.speed, float(candidate.preferred_mps[hit.point]) * 0.7)
     length = max(speed * float(np.sqrt(5.77 * lateral / step_mps2)), 3.0 * lateral, 8.0)
-    gentle = max(length, speed * float(np.sqrt(5.77 * lateral / _STEP_MPS2[0])))
-    out = max(0.0, begin - half_l - length)
-    there = out + length
-    back = max(end + half_l, there)
-    return Shift(side * lateral, out, there, back, back + gentle)
+    gentle = max(length, speed * float(np.sqrt(5.77 * lateral / _SHIFT_MPS2[0])))
+    out_begin = max(0.0, begin - half_l - length)
+    out_end = out_begin + length
+    back_begin = max(end + half_l, out_end)
+    return Shift(side * lateral, out_begin, out_end, back_begin, back_begin + gentle)
 
 
-def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> tuple[float, float, float]:
-    """Return a user's longitudinal range and its lateral extent on one side of the path at the conflict."""
+def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> _Extent:
+    """Return the extent of a user at a conflict, on the left (1) or right (-1) side."""
     user, step, point = hit
     box = state.others[user, step]
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))
@@ -349,8 +368,8 @@ def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> 
     moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
     position = point * SPACING_M
     ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
-    return (
-        position + float(along.min()) - behind,
-        position + float(along.max()) + ahead,
-        float((side * left).max()),
+    return _Extent(
+        begin=position + float(along.min()) - behind,
+        end=position + float(along.max()) + ahead,
+        lateral=float((side * left).max()),
     )

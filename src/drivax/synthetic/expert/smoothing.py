@@ -16,11 +16,11 @@ from jaxtyping import Float64
 from drivax.scenario.schema import DT_S
 
 #: Weights of squared acceleration, jerk, and deviation from the coarse speed and position.
-_ACCELERATION, _JERK, _SPEED, _PLACE = 0.3, 0.6, 0.4, 0.03
+_ACCELERATION, _JERK, _SPEED, _POSITION = 0.3, 0.6, 0.4, 0.03
 _PENALTY = 3e5
 #: Steps from one knot of acceleration to the next.
 _KNOT_STEPS = 3
-_NEWTON_STEPS, _BISECTIONS, _SMALLEST = 40, 12, 1e-4
+_NEWTON_STEPS, _BISECTIONS, _MIN_CHANGE = 40, 12, 1e-4
 
 _Series = Float64[np.ndarray, " time"]
 _Later = Float64[np.ndarray, " later"]
@@ -31,7 +31,7 @@ _Matrix = Float64[np.ndarray, "m n"]
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of positions (low and high) and top speed at each step but the first, of acceleration, and of jerk."""
+    """Bounds of position and speed at each step but the first, and of acceleration and jerk at all steps."""
 
     low_m: _Later
     high_m: _Later
@@ -51,23 +51,23 @@ class SpeedProfile:
 
 @cache
 def _matrices(steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Map accelerations at knots to stacked distances, speeds, accelerations and jerks.
+    """Return the map from accelerations at knots to stacked distances, speeds, accelerations and jerks.
 
-    Acceleration is constant within a step and linear between knots. Also returns the matrix of the objective.
+    Acceleration is constant within a step and linear between knots. The second matrix is that of the objective.
     """
     n, m = np.arange(steps)[:, None], np.arange(steps)
     knots = np.arange(0, steps + _KNOT_STEPS - 1, _KNOT_STEPS)
-    own = np.stack([np.interp(np.arange(steps), knots, row) for row in np.eye(len(knots))], axis=-1)
+    interpolation = np.stack([np.interp(np.arange(steps), knots, row) for row in np.eye(len(knots))], axis=-1)
     past = (n >= m).astype(float)
     jerk = (np.eye(steps) - np.eye(steps, k=-1)) / DT_S
-    whole = np.concatenate([past * (n - m + 0.5) * DT_S**2, past * DT_S, np.eye(steps), jerk])
-    rows = np.einsum("ij,jk->ik", whole, own)
-    weight = np.repeat([_PLACE, _SPEED, _ACCELERATION, _JERK], steps)
-    return rows, _squares(rows, weight)
+    blocks = np.concatenate([past * (n - m + 0.5) * DT_S**2, past * DT_S, np.eye(steps), jerk])
+    rows = np.einsum("ij,jk->ik", blocks, interpolation)
+    weight = np.repeat([_POSITION, _SPEED, _ACCELERATION, _JERK], steps)
+    return rows, _gram_matrix(rows, weight)
 
 
-def _squares(rows: _Matrix, weight: _Rows) -> Float64[np.ndarray, "n n"]:
-    """``R' diag(w) R``, whose bits do not depend on the number of threads as those of BLAS do."""
+def _gram_matrix(rows: _Matrix, weight: _Rows) -> Float64[np.ndarray, "n n"]:
+    """Return ``R' diag(w) R``; unlike with BLAS its bits do not depend on the number of threads."""
     return np.einsum("ki,kj->ij", rows * weight[:, None], rows)
 
 
@@ -86,11 +86,11 @@ def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bound
     before = np.zeros(steps)
     before[0] = acceleration_mps2 / DT_S
     linear_terms = np.concatenate(
-        [_PLACE * (at_m[1:] - free), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * before]
+        [_POSITION * (at_m[1:] - free), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * before]
     )
     target = _matmul(rows.T, linear_terms)
     low_a, high_a = (np.full(steps, a) for a in bounds.acceleration_mps2)
-    # Jerk counts a tenth, so that all bounds are exceeded by similar amounts.
+    # A tenth of the weight for jerk keeps the excesses over all bounds similar.
     scale = np.repeat([1.0, 0.1], [3 * steps, steps])
     limit = np.full(steps, bounds.jerk_mps3)
     high = np.concatenate([bounds.high_m - free, bounds.top_mps - speed[0], high_a, before + limit])
@@ -99,7 +99,7 @@ def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bound
     knots = _minimise(base, target, bounded, low * scale, high * scale)
     value = _matmul(bounded, knots)
     excess = float(np.maximum(np.maximum(value - high * scale, low * scale - value), 0.0).max())
-    return _profile(float(speed[0]), _matmul(rows[2 * steps : 3 * steps], knots), excess)
+    return _integrate(float(speed[0]), _matmul(rows[2 * steps : 3 * steps], knots), excess)
 
 
 def _minimise(
@@ -112,11 +112,11 @@ def _minimise(
         bound = np.clip(value, low, high)
         violated = value != bound
         active = rows[violated]
-        penalty = _squares(active, np.full(len(active), _PENALTY))
+        penalty = _gram_matrix(active, np.full(len(active), _PENALTY))
         step = np.linalg.solve(base + penalty, target + _PENALTY * _matmul(active.T, bound[violated]))
         step -= a
         change = _matmul(rows, step)
-        if np.abs(change).max() < _SMALLEST:
+        if np.abs(change).max() < _MIN_CHANGE:
             break
         slope = float(np.sum(step * (_matmul(base, a) - target)))
         curvature = float(np.sum(step * _matmul(base, step)))
@@ -129,16 +129,16 @@ def _minimise(
 def _step_length(
     value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], rise: tuple[float, float]
 ) -> float:
-    """Share of a Newton step that minimises the objective: its derivative vanishes, by bisection.
+    """Find the share of a Newton step that minimises the objective, by bisection of the derivative.
 
     ``rise`` is the first and second derivative of the objective without penalties.
     """
     low, high = limits
 
     def derivative(share: float) -> float:
-        there = value + share * change
-        beyond = there - np.clip(there, low, high)
-        return rise[0] + share * rise[1] + _PENALTY * float(np.sum(beyond * change))
+        shifted = value + share * change
+        excess = shifted - np.clip(shifted, low, high)
+        return rise[0] + share * rise[1] + _PENALTY * float(np.sum(excess * change))
 
     if derivative(1.0) <= 1e-6 * abs(rise[0]):
         return 1.0
@@ -149,10 +149,10 @@ def _step_length(
     return (below + above) / 2
 
 
-def _profile(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> SpeedProfile:
+def _integrate(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> SpeedProfile:
     """Integrate accelerations; speeds below 3 cm/s become 0."""
     after = speed + np.cumsum(a) * DT_S
     after = np.where(after < 0.03, 0.0, after)
-    whole = np.concatenate([[speed], after])
-    travelled = np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) * DT_S / 2)])
-    return SpeedProfile(travelled, whole, excess)
+    speeds = np.concatenate([[speed], after])
+    travelled = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) * DT_S / 2)])
+    return SpeedProfile(travelled, speeds, excess)

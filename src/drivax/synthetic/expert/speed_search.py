@@ -1,6 +1,6 @@
 """Speed search along a path by dynamic programming over position, speed and time.
 
-Steps of 0.5 s, and grids of speeds and positions on which every step ends exactly: with speeds ``i dv`` a step covers
+Steps take 0.5 s and end on grid points of speed and position: between speeds ``i dv`` and ``j dv`` a step covers
 ``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, position).
 """
 
@@ -18,15 +18,15 @@ COARSE = 5
 _STEP_S = COARSE * DT_S
 #: Largest spacing of speeds, m/s: accelerations are at most 1.5 m/s2 apart.
 _SPEED_STEP_MPS = 0.75
-#: Lowest and highest acceleration, m/s2, and the one below which braking costs more.
-_HARDEST_MPS2, _FASTEST_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
-#: Costs per second: of (m/s2)^2, and of (m/s)^2 below and above the preferred speed, and above the limit of bends.
+#: Lowest and highest acceleration, and the one below which braking costs more, m/s2.
+_MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
+#: Costs per second of (m/s2)^2, and of (m/s)^2 below and above the preferred speed and above the limit of bends.
 _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
 #: Costs of hard braking, of a short time gap, and of a small distance at 5 m/s.
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
-#: Preferred gap to what is ahead: 1 m and this time, s.
+#: Preferred time gap to users ahead, added to 1 m, s.
 _HEADWAY_S = 1.1
-#: Cost of contact, times at least 0.02: larger than any other sum.
+#: Cost of contact; even 0.02 of it exceeds any sum of other costs.
 TOUCH = 1e5
 
 
@@ -44,14 +44,14 @@ class Occupancy:
 
 @dataclass(frozen=True)
 class SpeedPlan:
-    """Speeds at the coarse steps, their cost, and whether something is touched."""
+    """Speeds at the coarse steps, their cost, and whether ego touches an obstacle."""
 
     speed: Float64[np.ndarray, " coarse"]
     cost: float
     touches: bool
 
-    def fine(self, steps: int) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]]:
-        """Distance and speed at every step of the recording."""
+    def resample(self, steps: int) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]]:
+        """Return distance and speed at every step of the recording."""
         position = np.arange(steps) / COARSE
         speed = np.interp(position, np.arange(len(self.speed)), self.speed)
         travelled = np.cumsum((speed[1:] + speed[:-1]) * DT_S / 2)
@@ -69,14 +69,14 @@ class _Grid:
 
 
 def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]:
-    """The grid and the index of the present speed on it."""
+    """Return the grid and the index of the present speed on it."""
     index = int(np.ceil(speed_mps / _SPEED_STEP_MPS - 0.3)) if speed_mps > 0.2 else 0
     step = speed_mps / index if index else _SPEED_STEP_MPS
     speeds = max(index, int(np.ceil(top_mps / step))) + 1
     spacing = step * _STEP_S / 2
     places = max(2, min(int(reach_m / spacing), 2 * speeds * 40))
     unit = step / _STEP_S
-    change = np.arange(int(np.ceil(_HARDEST_MPS2 / unit)), int(_FASTEST_MPS2 / unit) + 1)
+    change = np.arange(int(np.ceil(_MIN_ACCELERATION_MPS2 / unit)), int(_MAX_ACCELERATION_MPS2 / unit) + 1)
     v, s = np.arange(speeds), np.arange(places)
     before = v - change[:, None]
     source = s - (before + v)[..., None]
@@ -93,7 +93,7 @@ def search(
     occupancy: Occupancy, preferred_mps: Float64[np.ndarray, " place"],
     limit_mps: Float64[np.ndarray, " place"], speed_mps: float,
 ) -> SpeedPlan:  # fmt: skip
-    """Return the cheapest speeds from the present one, with preferred and largest speeds at the places of a path."""
+    """Return the cheapest speeds from the present one on, for preferred and largest speeds along a path."""
     steps = -(-(len(occupancy.hard) - 1) // COARSE)
     reach = occupancy.spacing_m * (occupancy.hard.shape[1] - 1)
     top = max(float(preferred_mps.max()), speed_mps)
@@ -103,21 +103,21 @@ def search(
     preferred = np.interp(grid.place, occupancy.spacing_m * np.arange(len(preferred_mps)), preferred_mps)
     bound = np.interp(grid.place, occupancy.spacing_m * np.arange(len(limit_mps)), limit_mps)
     difference = grid.speed[:, None] - preferred
-    over = np.maximum(grid.speed[:, None] - bound, 0.0)
-    always = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * over**2
-    always = (always * _STEP_S).astype(np.float32)
-    taken = _OccupiedStates(occupancy, grid)
+    overspeed = np.maximum(grid.speed[:, None] - bound, 0.0)
+    state_cost = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * overspeed**2
+    state_cost = (state_cost * _STEP_S).astype(np.float32)
+    states = _OccupiedStates(occupancy, grid)
     layers = np.full((steps + 1, speeds * places + 1), np.inf, np.float32)
     layers[0, start * places] = 0.0
     for k in range(1, steps + 1):
         reached = layers[k - 1].take(grid.source)
         reached += grid.effort[:, None, None]
-        layers[k, :-1] = (reached.min(axis=0) + always + taken.cost(k * COARSE)).ravel()
-    return _trace_back(grid, layers, taken)
+        layers[k, :-1] = (reached.min(axis=0) + state_cost + states.cost(k * COARSE)).ravel()
+    return _trace_back(grid, layers, states)
 
 
 def _trace_back(
-    grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _OccupiedStates
+    grid: _Grid, layers: Float32[np.ndarray, "coarse state"], states: _OccupiedStates
 ) -> SpeedPlan:
     """Trace back from the cheapest final state."""
     places = len(grid.place)
@@ -127,7 +127,7 @@ def _trace_back(
     for k in range(len(layers) - 1, 0, -1):
         v, s = divmod(state, places)
         speed.append(float(grid.speed[v]))
-        touches |= taken.touches(k * COARSE, v, s)
+        touches |= states.touches(k * COARSE, v, s)
         source = grid.source[:, v, s]
         state = int(source[np.argmin(layers[k - 1][source] + grid.effort)])
     speed.append(float(grid.speed[state // places]))
@@ -143,7 +143,7 @@ class _OccupiedStates:
         places = occupancy.hard.shape[1]
         moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
         self._index = np.clip(np.rint(moved / occupancy.spacing_m).astype(int), 0, places - 1)
-        # The last step is continued.
+        # The occupancy of the last step persists.
         price = TOUCH * occupancy.hard + (_CLOSE * DT_S) * occupancy.near
         price = np.concatenate([price, np.repeat(price[-1:], COARSE + half, axis=0)]).astype(np.float32)
         self._price, self._places = price.ravel(), places
@@ -151,27 +151,27 @@ class _OccupiedStates:
         self._ahead = _free_ahead(occupancy)
         self._column = np.clip(np.rint(grid.place / occupancy.spacing_m).astype(int), 0, places - 1)
         pace = np.minimum(grid.speed[:, None] / 5.0, 2.0)
-        # Contact costs at standstill, too.
+        # Contact is not free at standstill.
         self._pace, self._following = pace + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(pace, 1.0)
         self._preferred_gap = _HEADWAY_S * grid.speed[:, None] + 0.5
 
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
         """Cost of all states around a step."""
         first = (step - COARSE // 2) * self._places
-        around = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
+        contact = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
         close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
-        return around * self._pace + close * self._following
+        return contact * self._pace + close * self._following
 
     def touches(self, step: int, v: int, s: int) -> bool:
-        """Whether something is touched around a step."""
+        """Whether ego touches an obstacle around a step."""
         half = COARSE // 2
         rows = np.minimum(step + np.arange(-half, half + 1), len(self._occupancy.hard) - 1)
         return bool(self._occupancy.hard[rows, self._index[:, v, s]].any())
 
 
 def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
-    """Distance from each place to the next hard one ahead, m (1 km: none)."""
+    """Return the distance from each place to the next hard one ahead, m (1 km: none)."""
     places = occupancy.hard.shape[1]
     index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]

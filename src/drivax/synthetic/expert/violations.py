@@ -24,14 +24,14 @@ from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 EGO_SKIN_M = 0.1
 #: Least distance that ego must travel, m.
 _LEAST_M = 10.0
-#: A stop at a line: below this speed, within this distance, within this time before passing.
-_STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
-#: Distance against traffic within 1 s from which on the metric ``wrong_way`` counts it, m.
+#: Largest speed and distance of a stop at a line, m/s and m, and largest time between the stop and passing, s.
+_STANDING_MPS, _BEFORE_LINE_M, _STOP_WINDOW_S = 0.5, 3.0, 3.0
+#: Distance against traffic within 1 s from which the metric ``wrong_way`` counts it, m.
 _WRONG_WAY_M = 2.0
-#: Ego is off its route beyond this distance from the route's lanes, m; the metric uses 2.
+#: Distance from the route's lanes beyond which ego is off its route, m; the metric uses 2.
 _OFF_ROUTE_M = 1.9
-#: Lanes of both directions whose distances differ by less than this leave the direction open, m.
-_DOUBT_M = 0.5
+#: Difference of the distances to lanes of both directions below which the direction is open, m.
+_AMBIGUITY_M = 0.5
 #: Lowest and highest value of each quantity of comfort (nuPlan).
 LIMITS: dict[str, tuple[float, float]] = {
     "longitudinal_mps2": (-4.05, 2.40),
@@ -52,7 +52,12 @@ _Points = Float64[np.ndarray, "time 2"]
 
 @dataclass(frozen=True)
 class Violation:
-    """Reason to reject a scenario (empty: none), and for collisions the users that ego touches and the first step."""
+    """Reason to reject a scenario.
+
+    Attributes:
+        cause: Name of the violation (empty: none).
+        users, step: Users that ego collides with, and the first step of a collision.
+    """
 
     cause: str = ""
     users: tuple[int, ...] = ()
@@ -100,7 +105,7 @@ def find_violation(
 
 
 def is_staged(staging: Staging) -> bool:
-    """Whether anything is staged."""
+    """Whether a staging changes anything."""
     return any(vars(staging).values())
 
 
@@ -114,7 +119,7 @@ def _tested_pairs(motion: Motion) -> _UserPairs:
 def first_overlap_step(
     box: Float64[np.ndarray, "user time 6"], valid: Bool[np.ndarray, "user time"], tested: _UserPairs
 ) -> Int64[np.ndarray, "user user"]:
-    """Return the step at which tested pairs first overlap (the number of steps: never); ego has a margin of 10 cm."""
+    """Return the step at which tested pairs first overlap (the number of steps: never), with a margin around ego."""
     box = box.copy()
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
@@ -144,7 +149,7 @@ def inside(
     for ring in rings:
         a, b = ring, np.roll(ring, -1, axis=0)
         near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
-        # A ray to the right only meets sides at the points' heights that do not end left of all points.
+        # Rays to the right meet only sides at the height of a point that reach beyond the leftmost one.
         keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
         (ax, ay), (bx, by) = a[keep].T, b[keep].T
         across = (ay > y) != (by > y)
@@ -154,7 +159,7 @@ def inside(
 
 
 def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
-    """Whether a corner of the box is ever outside the edges."""
+    """Whether a corner of the box leaves the road at any step."""
     moved = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
     points = corners(box[moved]).reshape(-1, 2)
     return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
@@ -205,12 +210,12 @@ def _passes_red_off_route(
     if not np.any(passed):
         return False
     route_xy = np.concatenate([network.lanes[k].curve.xy for k in own])
-    off = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _OFF_ROUTE_M
-    return bool((np.any(passed, axis=0) & off[1:]).any())
+    off_route = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _OFF_ROUTE_M
+    return bool((np.any(passed, axis=0) & off_route[1:]).any())
 
 
 def _front(motion: Motion, user: int) -> _Points:
-    """Middle of a user's front bumper."""
+    """Return the middle of a user's front bumper."""
     heading = motion.heading[user]
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[user, 0] / 2
     return motion.xy[user] + ahead
@@ -232,7 +237,7 @@ def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Po
     """Whether ego stopped before each passing of a line."""
     for step in np.flatnonzero(passed):
         # The stop may lie before the recording.
-        begin = max(0, first_step + int(step) - round(_STOOD_S / DT_S))
+        begin = max(0, first_step + int(step) - round(_STOP_WINDOW_S / DT_S))
         gap = np.hypot(*(motion.xy[0, begin : first_step + step + 1] - lane.curve.xy[0]).T)
         close = gap < motion.size_m[0, 0] / 2 + _BEFORE_LINE_M
         slow = motion.speed[0, begin : first_step + step + 1] < _STANDING_MPS
@@ -257,24 +262,24 @@ def against_traffic(
     gap = np.hypot(xy[:, None, 0] - points[:, 0], xy[:, None, 1] - points[:, 1])
     against = np.cos(heading[:, None] - course) < math.cos(math.radians(135.0))
     opposed = np.where(against, gap, np.inf).min(axis=1)
-    return opposed < np.where(against, np.inf, gap).min(axis=1) - _DOUBT_M
+    return opposed < np.where(against, np.inf, gap).min(axis=1) - _AMBIGUITY_M
 
 
 def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) -> bool:
     """Whether ego travels more than 2 m against traffic within a second."""
-    every = 2
-    wrong = against_traffic(network, xy[::every], heading[::every])
-    travelled = np.hypot(*np.diff(xy[::every], axis=0).T) * wrong[1:]
-    window = round(1.0 / (every * DT_S))
+    stride = 2
+    wrong = against_traffic(network, xy[::stride], heading[::stride])
+    travelled = np.hypot(*np.diff(xy[::stride], axis=0).T) * wrong[1:]
+    window = round(1.0 / (stride * DT_S))
     return bool(np.convolve(travelled, np.ones(window)).max() > _WRONG_WAY_M)
 
 
 @cache
 def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float64[np.ndarray, "count count"]:
-    """The Savitzky-Golay filter (Savitzky and Golay 1964) of ``count`` samples as a matrix.
+    """Return the Savitzky-Golay filter (Savitzky and Golay 1964) of ``count`` samples as a matrix.
 
-    At the ends the first and last polynomial are evaluated. As in SciPy, an even window is centred half a sample before
-    its upper middle.
+    The first and last polynomials extend to the ends. As in SciPy, an even window is centred half a sample before its
+    upper middle.
     """
     half = window // 2
     first = np.clip(np.arange(count) - half + (window % 2 == 0), 0, count - window)

@@ -13,9 +13,9 @@ from drivax.geometry.vectors import wrap
 
 #: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
 STEP_M = 0.5
-#: Poses with a smaller change of heading are joined by a quintic, others by a fillet.
+#: Change of heading below which a quintic joins two poses, and above which a fillet does.
 _FILLET_ANGLE = math.radians(25.0)
-#: Shorter straight remainders are left out, m.
+#: Length below which straight remainders are dropped, m.
 _SHORTEST_M = 1e-3
 
 
@@ -213,14 +213,17 @@ def quintic(start: Pose, end: Pose) -> Curve:
 
 
 def tangent_lengths(start: Pose, end: Pose, sin: float) -> tuple[float, float]:
-    """Distances ahead of ``start`` and behind ``end`` of their tangents' intersection; ``sin`` of the angle between."""
+    """Return the distances ahead of ``start`` and behind ``end`` of the tangents' intersection.
+
+    ``sin`` is the sine of the angle between the tangents.
+    """
     dx, dy = end.x - start.x, end.y - start.y
     before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / sin
     return before, (dy * math.cos(start.heading) - dx * math.sin(start.heading)) / sin
 
 
 def connect_poses(start: Pose, end: Pose) -> Curve:
-    """Smooth curve between poses: a fillet of the two tangents, or a quintic for small changes of heading.
+    """Connect poses by a smooth curve: a fillet of the two tangents, or a quintic for small changes of heading.
 
     Raises:
         ValueError: When the tangents do not meet ahead of the start and behind the end.
@@ -232,12 +235,12 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
     tangent = min(before, after)
     if tangent < 1.0:
         raise ValueError("no single bend connects the poses: their tangents do not meet between them")
-    parts = [turn(start.ahead(before - tangent), angle, tangent)]
+    pieces = [turn(start.ahead(before - tangent), angle, tangent)]
     if before - tangent > _SHORTEST_M:
-        parts.insert(0, straight(start, before - tangent))
+        pieces.insert(0, straight(start, before - tangent))
     if after - tangent > _SHORTEST_M:
-        parts.append(straight(parts[-1].end, after - tangent))
-    return resample(join_curves(*parts), STEP_M)
+        pieces.append(straight(pieces[-1].end, after - tangent))
+    return resample(join_curves(*pieces), STEP_M)
 
 
 def draw_winding_curve(

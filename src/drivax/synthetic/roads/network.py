@@ -27,7 +27,7 @@ _T = TypeVar("_T")
 
 
 def per_roads(derive: Callable[[RoadNetwork], _T]) -> Callable[[RoadNetwork], _T]:
-    """Cache what derives from a network for all networks with the same roads (:meth:`RoadNetwork.with_signals`)."""
+    """Cache a function of a network for all networks with the same roads (:meth:`RoadNetwork.with_signals`)."""
 
     @wraps(derive)
     def look_up(network: RoadNetwork) -> _T:
@@ -58,9 +58,9 @@ class Lane:
         control: Rule at the entry of a connector; the stop line is where it begins.
         yields_to: Connectors with right of way: the priority road at a yield or stop sign, oncoming traffic of a
             left turn, traffic in a roundabout; empty at all-way stops.
-        ends: The lane ends without a successor while the road continues (lane drops, acceleration lanes).
-        exit_only: The lane leads off the road (deceleration lanes).
-        kind: For cars or for bicycles only.
+        ends: Whether the lane ends without a successor while the road continues (lane drops, acceleration lanes).
+        exit_only: Whether the lane leads off the road (deceleration lanes).
+        kind: Type of the lane: for cars, or for bicycles only.
     """
 
     curve: Curve
@@ -197,6 +197,7 @@ def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
 
 
 def _shared_length(a: Curve, b: Curve) -> float:
+    """Return the distance along ``a`` over which it shares space with ``b``, m."""
     separation = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
     return float(a.arc_m[int(np.argmax(separation)) if separation.any() else -1])
 

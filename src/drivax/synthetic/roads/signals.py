@@ -12,7 +12,7 @@ from drivax.scenario.schema import LightState
 
 
 class Colour(enum.IntEnum):
-    """Colour that a driver sees."""
+    """Colour of a light."""
 
     NONE = 0
     GREEN = 1
@@ -79,7 +79,11 @@ class SignalPlan:
         return replace(self, green_s=(self.green_s[0] + extra, *self.green_s[1:]))
 
     def phase_of(self, lane: int) -> int:
-        """Phase that serves a connector lane; raises KeyError when no light controls it."""
+        """Return the phase that serves a connector lane.
+
+        Raises:
+            KeyError: No light controls the lane.
+        """
         for phase, groups in enumerate(self.phases):
             if any(lane in self.groups[group].lanes for group in groups):
                 return phase
@@ -88,16 +92,16 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """Colour of each of ``lanes`` lanes (NONE without a light), and the seconds until a yellow light turns red."""
+        """Return the colour of each of ``lanes`` lanes (NONE without a light), and the time until yellow ends, s."""
         colour = np.zeros((len(times_s), lanes), np.int8)
-        left = np.zeros((len(times_s), lanes))
+        remaining_s = np.zeros((len(times_s), lanes))
         for group in self.groups:
             colour[:, list(group.lanes)] = Colour.RED
         starts = self.starts_s
         for program in self._programs:
             cycle = self._duration_s(program)
             for phase in program:
-                # Slightly late, so that rounding does not shift changes that fall on a step.
+                # Slightly late: rounding must not shift changes that fall on a step.
                 since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
                 green = since < self.green_s[phase]
                 to_red = self.green_s[phase] + self.yellow_s - since
@@ -105,8 +109,8 @@ class SignalPlan:
                 for lane in (lane for group in self.phases[phase] for lane in self.groups[group].lanes):
                     colour[green, lane] = Colour.GREEN
                     colour[yellow, lane] = Colour.YELLOW
-                    left[yellow, lane] = to_red[yellow]
-        return colour, left
+                    remaining_s[yellow, lane] = to_red[yellow]
+        return colour, remaining_s
 
 
 def yellow_time_s(limit_mps: float) -> float:

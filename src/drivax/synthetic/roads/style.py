@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Lanes ahead (inward), lanes the other way (outward), and the share of that layout.
+#: Numbers of lanes ahead (inward) and of opposite lanes (outward), and share, of each layout.
 Layouts = tuple[tuple[int, int, float], ...]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,26 +16,26 @@ from drivax.synthetic.traffic.obstacles import Boxes, Extents, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, interpolate_curve, mean_curvature
 
-#: Distance at which drivers begin to look for a detour around an obstacle, m.
+#: Distance from an obstacle at which drivers start to look for a detour, m.
 LOOK_M = 45.0
-#: An obstacle blocks a vehicle if it comes this close to its side, m; lateral distance at which it is passed, m.
-DETOUR_MARGIN_M, _ROOM_M = 0.3, 0.55
-#: Largest offset of a detour, m, and its steepest slope, m forward per m aside.
-_FURTHEST_M, _STEEPEST = 4.3, 2.2
+#: Lateral distance from a vehicle's side within which an obstacle blocks it, and lateral gap to it in passing, m.
+DETOUR_MARGIN_M, _PASSING_GAP_M = 0.3, 0.55
+#: Largest offset of a detour, m, and least distance along the road per metre of offset.
+_MAX_OFFSET_M, _MIN_RATIO = 4.3, 2.2
 #: Distance ahead over which a detour occupies adjacent lanes, m.
 _ADJACENT_M = 60.0
 #: Distance kept to the road's edge, m, and speed at which obstacles are passed, m/s.
 _EDGE_M, _PASS_MPS = 0.2, 6.0
 #: Gap to the first obstacle at the end of the way out, and to the last one at the beginning of the way back, m.
 _GAP_BEFORE_M, _GAP_BEHIND_M = 0.3, 0.5
-#: Least length of the way out and back: as a multiple of the steepest one, and as a travel time, s.
-_EASE_OUT, _EASE_BACK, _OUT_S, _BACK_S = 2.0, 1.6, 2.4, 2.0
-#: Length of the path that remains after a detour, m.
+#: Least length of the way out and back: as a multiple of the steepest possible one, and as a travel time, s.
+_OUT_FACTOR, _BACK_FACTOR, _OUT_S, _BACK_S = 2.0, 1.6, 2.4, 2.0
+#: Least length of the path after a detour, m.
 _END_MARGIN_M = 5.0
 #: Share of a lane change after which a vehicle has left the old lane.
-_LEFT_SHARE = 0.75
+_EXIT_SHARE = 0.75
 #: Lateral offset from which on a vehicle occupies the adjacent lane, m.
-_INTRUDES_M = 0.7
+_INTRUSION_M = 0.7
 
 _Samples = Float64[np.ndarray, " point"]
 _Point = Float64[np.ndarray, " 2"]
@@ -54,7 +55,7 @@ def displace_path(
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
     moved_curve = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
     old = step * np.arange(len(moved_curve.xy))
-    new = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(moved_curve.xy, axis=0).T))])
+    new = moved_curve.arc_m
     count = max(2, round(float(new[-1]) / STEP_M) + 1)
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
@@ -62,7 +63,7 @@ def displace_path(
     lane = path.lane[index]
     lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
-        _occupy(span, source, lane, lane_m)
+        _enter_span(span, source, lane, lane_m)
     moved, step = interpolate_curve(moved_curve, new, position), float(new[-1]) / (count - 1)
     spans = _moved_spans(path, occupied, old, new)
     curvature = mean_curvature(moved, step)
@@ -93,7 +94,7 @@ def _moved_spans(
     return tuple(spans)
 
 
-def _occupy(
+def _enter_span(
     span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied."""
@@ -121,7 +122,7 @@ def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: floa
 
 
 def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tuple[float, float, float]:
-    """Project a point onto a path, if given only within 30 m of a position.
+    """Project a point onto a path, within 30 m of the position ``near_m`` if there is one.
 
     Returns:
         Position along the path and offset to its left, m, and the path's heading there.
@@ -139,7 +140,7 @@ def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tupl
 
 
 def positions_along(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np.ndarray, " time"]:
-    """Positions along a path of a moving point, m."""
+    """Return the positions along a path of a moving point, m."""
     result, near = np.zeros(len(xy)), None
     for k, point in enumerate(xy):
         near = project_on_path(path, point, near)[0]
@@ -147,10 +148,13 @@ def positions_along(path: Path, xy: Float64[np.ndarray, "time 2"]) -> Float64[np
     return result
 
 
-def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
-    """A lane change: the path from a position on the present path onto a parallel one.
+def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) -> tuple[Path, float]:
+    """Build the path of a lane change from a position on the present path to a parallel one.
 
-    Returns the path, and the vehicle's position on it. The old lanes stay occupied for most of the change.
+    The old lanes stay occupied for most of the change.
+
+    Returns:
+        The path, and the vehicle's position on it.
     """
     sample = min(max(at_m / present.step_m, 0.0), len(present.curve.xy) - 1.001)
     index, share = int(sample), sample - int(sample)
@@ -161,7 +165,7 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
     old = target.step_m * np.arange(len(target.curve.xy))
     offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
     own = {span.lane for span in target.spans}
-    left = along + _LEFT_SHARE * length_m
+    left = along + _EXIT_SHARE * length_m
     occupied = tuple(
         LaneSpan(
             s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(left, along + s.end_m - at_m + 2.0)
@@ -173,17 +177,24 @@ def change_onto(target: Path, present: Path, at_m: float, length_m: float) -> tu
     return path, float(np.interp(along, old, new))
 
 
-def around(
-    path: Path, at_m: tuple[float, float, float, float], aside_m: float, adjacent: tuple[LaneSpan, ...] = ()
-) -> Path:
-    """A detour to the left by ``aside_m``: out between the first two positions, back between the last two.
+class DetourPositions(NamedTuple):
+    """Path positions of a detour: begin, end of the way out, begin of the way back, and end, m."""
 
-    ``adjacent`` are the lanes that the detour may enter.
-    """
+    begin: float
+    out_end: float
+    back_begin: float
+    end: float
+
+
+def detour_path(
+    path: Path, positions: DetourPositions, aside_m: float, adjacent: tuple[LaneSpan, ...] = ()
+) -> Path:
+    """Build a detour to the left by ``aside_m``; ``adjacent`` are the lanes that it may enter."""
+    begin, out_end, back_begin, end = positions
     old = path.step_m * np.arange(len(path.curve.xy))
-    out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
-    back = quintic_step(old, (at_m[2], 1.0, 0.0), at_m[3] - at_m[2])
-    return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]
+    out_end = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
+    back = quintic_step(old, (back_begin, 1.0, 0.0), end - back_begin)
+    return displace_path(path, aside_m * out_end * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
 
 
 @dataclass(frozen=True)
@@ -201,11 +212,11 @@ def detour_request(
     tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    position, adjacent, world = float(now[0]), [], tables.worlds.of[row]
+    position, adjacent, world = float(now[0]), [], tables.worlds.world[row]
     network = tables.worlds.networks[world]
-    lane, along = tables.on(np.array([position]), slice(row, row + 1))
+    lane, along = tables.lanes_at(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
-        current = network.lanes[lane[0, 0] - tables.worlds.lane[world]]
+        current = network.lanes[lane[0, 0] - tables.worlds.first_lane[world]]
         for other in (current.left, current.right):
             if other >= 0:
                 scale = current.length_m / network.lanes[other].length_m
@@ -215,65 +226,64 @@ def detour_request(
     return DetourRequest(tables.paths[row], position, float(now[1]), size_m, tuple(adjacent))
 
 
-#: Path positions of a detour: begin, end of the way out, begin of the way back, end.
-_Positions = tuple[float, float, float, float]
-
-
 class Detours:
-    """Finds detours around standing obstacles."""
+    """Search for detours around standing obstacles."""
 
     def __init__(self, network: RoadNetwork) -> None:
-        xy = np.concatenate([np.zeros((0, 2)), *(_dense(edge.xy) for edge in network.edges)])
+        xy = np.concatenate([np.zeros((0, 2)), *(_densify(edge.xy) for edge in network.edges)])
         self._edge = Boxes(xy, np.zeros(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 2)))
 
     def find(self, request: DetourRequest, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
         """Return a path around the obstacles ahead, and the position where it rejoins the old one (m), if any."""
         half_width, half_length = request.size_m[1] / 2, request.size_m[0] / 2
-        seen, _ = _extents(request, standing, request.at_m, LOOK_M + 40.0)
+        obstacles, _ = _extents(request, standing, request.at_m, LOOK_M + 40.0)
         front, side = request.at_m + half_length, half_width + DETOUR_MARGIN_M
-        blocks = (seen.right_m < side) & (seen.left_m > -side) & (seen.near_m > front - 0.5)
+        blocks = (obstacles.right_m < side) & (obstacles.left_m > -side) & (obstacles.near_m > front - 0.5)
         if not blocks.any():
             return None
-        first = float(seen.near_m[blocks].min())
+        first = float(obstacles.near_m[blocks].min())
         if not 2.0 < first - front < LOOK_M:
             return None
         last = first
-        for k in np.argsort(seen.near_m, kind="stable"):
-            if blocks[k] and seen.near_m[k] < last + 2 * half_length + 14.0:
-                last = max(last, float(seen.far_m[k]))
-        group = blocks & (seen.near_m <= last)
-        left = float(seen.left_m[group].max()) + half_width + _ROOM_M
-        right = float(seen.right_m[group].min()) - half_width - _ROOM_M
+        for k in np.argsort(obstacles.near_m, kind="stable"):
+            if blocks[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
+                last = max(last, float(obstacles.far_m[k]))
+        group = blocks & (obstacles.near_m <= last)
+        left = float(obstacles.left_m[group].max()) + half_width + _PASSING_GAP_M
+        right = float(obstacles.right_m[group].min()) - half_width - _PASSING_GAP_M
         for lateral in sorted([left, right], key=abs):
             positions = _detour_positions(request, first, last, lateral)
-            if positions is not None and self._is_free(request, positions, lateral, seen, moving):
-                return around(request.path, positions, lateral, request.adjacent), positions[3]
+            if positions is not None and self._is_free(request, positions, lateral, obstacles, moving):
+                return detour_path(request.path, positions, lateral, request.adjacent), positions.end
         return None
 
     def _is_free(
-        self, request: DetourRequest, positions: _Positions, lateral: float, seen: Extents, moving: Boxes
+        self,
+        request: DetourRequest,
+        positions: DetourPositions,
+        lateral: float,
+        obstacles: Extents,
+        moving: Boxes,
     ) -> bool:
         """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
-        begin, out, back, end = positions
+        begin, out_end, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
-        adjacent = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
-        edges, _ = _extents(request, self._edge, (out + back) / 2, (end - begin) / 2 + 15.0)
-        sweep = (edges.near_m > out) & (edges.near_m < back)
+        blocks = (obstacles.near_m < back) & (obstacles.far_m > out_end)
+        blocks &= (obstacles.right_m < high) & (obstacles.left_m > low)
+        edges, _ = _extents(request, self._edge, (out_end + back) / 2, (end - begin) / 2 + 15.0)
+        sweep = (edges.near_m > out_end) & (edges.near_m < back)
         sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
-        if adjacent.any() or sweep.any():
+        if blocks.any() or sweep.any():
             return False
-        path, position, lasts = (
-            request.path,
-            request.at_m,
-            (end - request.at_m) / max(request.speed, _PASS_MPS) + 1.0,
-        )
+        path, position = request.path, request.at_m
+        duration_s = (end - position) / max(request.speed, _PASS_MPS) + 1.0
         others, near = _extents(request, moving, (position + end) / 2, end - position + 90.0, within_m=6.0)
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
         relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
         speed = near.speed * np.cos(relative_heading)
         meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
-        ahead = (others.far_m > position) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
+        ahead = (others.far_m > position) & (others.near_m + np.minimum(speed, 0.0) * duration_s < end + 5.0)
         behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
         ahead &= ~((speed > 1.0) & (others.near_m > back))
@@ -282,22 +292,24 @@ class Detours:
 
 def _detour_positions(
     request: DetourRequest, first_m: float, last_m: float, lateral_m: float
-) -> _Positions | None:
+) -> DetourPositions | None:
     """Return the positions of a detour around obstacles from ``first_m`` to ``last_m`` of the path.
 
     None if the offset ``lateral_m`` is too large, the rest of the way out is too steep, or the path ends too soon.
     """
     half_length, offset_m = request.size_m[0] / 2, abs(lateral_m)
-    out = first_m - half_length - _GAP_BEFORE_M
-    begin = max(request.at_m, out - max(_STEEPEST * _EASE_OUT * offset_m, _OUT_S * request.speed))
+    out_end = first_m - half_length - _GAP_BEFORE_M
+    begin = max(request.at_m, out_end - max(_MIN_RATIO * _OUT_FACTOR * offset_m, _OUT_S * request.speed))
     back = last_m + half_length + _GAP_BEHIND_M
-    end = back + max(_STEEPEST * _EASE_BACK * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
-    is_steep, is_short = out - begin < _STEEPEST * offset_m, end > request.path.length_m - _END_MARGIN_M
-    return None if offset_m > _FURTHEST_M or is_steep or is_short else (begin, out, back, end)
+    end = back + max(_MIN_RATIO * _BACK_FACTOR * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
+    is_steep, is_short = out_end - begin < _MIN_RATIO * offset_m, end > request.path.length_m - _END_MARGIN_M
+    if offset_m > _MAX_OFFSET_M or is_steep or is_short:
+        return None
+    return DetourPositions(begin, out_end, back, end)
 
 
-def _dense(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:
-    """A closed ring with points at most a metre apart."""
+def _densify(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:
+    """Return a closed ring with points at most a metre apart."""
     closed = np.concatenate([ring, ring[:1]])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
     position = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
@@ -307,9 +319,9 @@ def _dense(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2
 def _extents(
     request: DetourRequest, boxes: Boxes, at_m: float, radius_m: float, within_m: float = 12.0
 ) -> tuple[Extents, Boxes]:
-    """Extents along the path of the boxes within a radius of a position on it, and these boxes."""
+    """Return the extents along the path of the boxes within a radius of a position on it, and these boxes."""
     path = request.path
     centre = path.curve.xy[min(int(max(at_m, 0.0) / path.step_m), len(path.curve.xy) - 1)]
     near = boxes.select(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
-    seen, which = extents(path, near, within_m)
-    return seen, near.select(which)
+    obstacles, rows = extents(path, near, within_m)
+    return obstacles, near.select(rows)

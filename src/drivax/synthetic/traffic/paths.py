@@ -21,10 +21,10 @@ _CURVATURE_WINDOW_M = 3.0
 
 @dataclass(frozen=True)
 class LaneSpan:
-    """A lane on a path.
+    """Stretch of a path on a lane.
 
     Attributes:
-        lane: Its index.
+        lane: Index of the lane.
         begin_m, end_m: Path positions of the lane's start and end, m; the start may be negative.
         scale: Path metres per lane metre.
         from_m, until_m: Range of positions of the vehicle's centre in which it occupies the lane.
@@ -37,10 +37,10 @@ class LaneSpan:
     until_m: float = math.inf
     end_m: float = math.inf
 
-    def stretch(self, by: float) -> LaneSpan:
+    def stretch(self, factor: float) -> LaneSpan:
         """Return the span on a path that is longer by a factor."""
-        begin, scale, end = self.begin_m * by, self.scale * by, self.end_m * by
-        return LaneSpan(self.lane, begin, scale, self.from_m * by, self.until_m * by, end)
+        values = {name: value * factor for name, value in vars(self).items() if name != "lane"}
+        return LaneSpan(self.lane, **values)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Path:
 
     @property
     def length_m(self) -> float:
-        """Length, m."""
+        """Length of the curve."""
         return self.step_m * (len(self.curve.xy) - 1)
 
     @cached_property
@@ -77,7 +77,12 @@ class Path:
 
 @dataclass(frozen=True)
 class LaneChange:
-    """A planned change between adjacent lanes: index of the old one in the lane sequence, position on it, length."""
+    """A planned change between adjacent lanes of a sequence.
+
+    Attributes:
+        section: Index of the old lane in the sequence; the new one follows.
+        begin_m, length_m: Position on the old lane, and length of the change.
+    """
 
     section: int
     begin_m: float
@@ -109,32 +114,34 @@ def lane_path(
     network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
 ) -> Path:
     """Build the path along consecutive lanes; with a lane change the new lane comes after the old one."""
-    if change is None:
-        lengths = [network.lanes[lane].length_m for lane in lanes]
-        begins = list(accumulate(lengths, initial=0.0))
-        spans = [
-            LaneSpan(lane, a, 1.0, end_m=b) for lane, (a, b) in zip(lanes, pairwise(begins), strict=True)
-        ]
-        curve = _lane_curve(network, lanes)
-        return _build_path(network, resample(sway.apply(curve), STEP_M), begins[-1], spans)
+    if change is not None:
+        return _lane_change_path(network, lanes, sway, change)
+    ends = accumulate((network.lanes[lane].length_m for lane in lanes), initial=0.0)
+    spans = [LaneSpan(lane, a, 1.0, end_m=b) for lane, (a, b) in zip(lanes, pairwise(ends), strict=True)]
+    return _build_path(network, sway.apply(_lane_curve(network, lanes)), spans[-1].end_m, spans)
+
+
+def _lane_change_path(network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange) -> Path:
+    """Build the path along consecutive lanes with a lane change."""
     pieces, spans, position = [], [], 0.0
     for index, lane in enumerate(lanes):
         if index == change.section + 1:
             continue
         curve = network.lanes[lane].curve
         if index == change.section:
-            curve, crossing = _lane_change_curve(curve, network.lanes[lanes[index + 1]].curve, change)
+            new = lanes[index + 1]
+            curve, (entry_m, exit_m) = _lane_change_curve(curve, network.lanes[new].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
-                _span(network, lane, position, length, until_m=position + crossing[1]),
-                _span(network, lanes[index + 1], position, length, from_m=position + crossing[0]),
+                _span(network, lane, position, length, until_m=position + exit_m),
+                _span(network, new, position, length, from_m=position + entry_m),
             ]
         else:
             length = network.lanes[lane].length_m
             spans.append(LaneSpan(lane, position, 1.0, end_m=position + length))
         pieces.append(curve)
         position += length
-    return _build_path(network, resample(sway.apply(join_curves(*pieces)), STEP_M), position, spans)
+    return _build_path(network, sway.apply(join_curves(*pieces)), position, spans)
 
 
 @lru_cache(maxsize=64)
@@ -143,12 +150,18 @@ def _lane_curve(network: RoadNetwork, lanes: tuple[int, ...]) -> Curve:
     return join_curves(*(network.lanes[lane].curve for lane in lanes))
 
 
-def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
-    return LaneSpan(lane, at, length / network.lanes[lane].length_m, end_m=at + length, **when)
+def _span(network: RoadNetwork, lane: int, begin_m: float, length_m: float, **limits_m: float) -> LaneSpan:
+    """Return the span of a lane that is stretched to a length."""
+    scale = length_m / network.lanes[lane].length_m
+    return LaneSpan(lane, begin_m, scale, end_m=begin_m + length_m, **limits_m)
 
 
 def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
-    """Change from curve ``a`` to the parallel ``b``; also where the new lane is occupied from and the old one until."""
+    """Change from curve ``a`` to the parallel ``b``.
+
+    Returns:
+        The curve, and the positions on it of the entry to the new lane and of the exit from the old one, m.
+    """
     count = max(len(a.xy), len(b.xy))
     a, b = (resample(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
     arc = a.arc_m
@@ -164,9 +177,10 @@ def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, t
     return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
 
 
-def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
-    """Add curvature, limits and lane slots; spans are stretched to the length of the swaying curve."""
-    stretch = float(curve.arc_m[-1]) / length
+def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list[LaneSpan]) -> Path:
+    """Resample a curve and add curvature, limits and lanes; spans of a total length are stretched to the curve."""
+    curve = resample(curve, STEP_M)
+    stretch = float(curve.arc_m[-1]) / length_m
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretch(stretch) for span in spans]
     position = step * np.arange(len(curve.xy))
@@ -184,7 +198,7 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
         along = np.maximum(current - span.begin_m, 0.0) / span.scale
         if span.from_m > -math.inf or span.until_m < math.inf:
             along[(current < span.from_m) | (current > span.until_m)] = math.inf
-        for shared_lane, until_m in _lanes_sharing_space(network)[span.lane]:
+        for shared_lane, until_m in _shared_lanes(network)[span.lane]:
             on_lane = ((along < until_m) & (slots < SLOTS)).nonzero()[0]
             place = (first + on_lane) * SLOTS + slots[on_lane]
             lane.put(place, shared_lane)
@@ -196,7 +210,7 @@ def _build_path(network: RoadNetwork, curve: Curve, length: float, spans: list[L
 def interpolate_curve(
     curve: Curve, arc_m: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " n"]
 ) -> Curve:
-    """Interpolate a curve, whose samples lie at ``arc_m``, linearly at positions."""
+    """Interpolate a curve whose samples lie at ``arc_m`` linearly at positions ``at_m``."""
     return Curve(interpolate(at_m, arc_m, curve.xy), np.interp(at_m, arc_m, curve.heading))
 
 
@@ -205,7 +219,7 @@ def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
     before, heading = window // 2, curve.heading
     padded = np.empty(len(heading) + window - 1)
-    # Central differences, the same as those of np.gradient, whose checks take longer.
+    # The differences of np.gradient, without its checks.
     rate = padded[before : before + len(heading)]
     np.divide(heading[2:] - heading[:-2], 2.0 * step_m, out=rate[1:-1])
     padded[: before + 1] = (heading[1] - heading[0]) / step_m
@@ -214,21 +228,24 @@ def mean_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]
 
 
 @per_roads
-def _lanes_sharing_space(network: RoadNetwork) -> list[list[tuple[int, float]]]:
-    """Each lane and those that branch off the same lane, and positions up to which a vehicle on it occupies them, m."""
+def _shared_lanes(network: RoadNetwork) -> list[list[tuple[int, float]]]:
+    """List the lanes that a vehicle on each lane occupies, and the positions up to which it does, m.
+
+    These are the lane itself and those that branch off the same predecessor.
+    """
     result = [[(lane, math.inf)] for lane in range(len(network.lanes))]
     for lane, shared in enumerate(result):
         for before in network.lanes[lane].predecessors:
             for other in network.lanes[before].successors:
                 if other != lane:
-                    # Half a vehicle's length longer: its rear leaves after its centre.
+                    # The rear of a vehicle leaves later than its centre, by half its length.
                     shared.append((other, network.shared_m[lane, other] + 2.5))
     return result
 
 
 @dataclass(frozen=True)
 class Sway:
-    """Lateral deviation of a driver from the lane's centre: slow waves (m, 1/m, rad)."""
+    """Lateral deviation of a driver from the lane's centre, a sum of sine waves along the path."""
 
     amplitude_m: tuple[float, ...] = ()
     wave_per_m: tuple[float, ...] = ()
@@ -236,19 +253,18 @@ class Sway:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
-        """Draw two waves 60 to 160 m long with amplitudes of at most ``largest_m`` in sum, about a constant offset."""
-        share = rng.uniform(0.2, 0.5, size=2) * largest_m
-        waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
-        phases = rng.uniform(0.0, 2 * math.pi, size=2)
-        # A wave without end is a constant.
-        offset = ([aside_m], [0.0], [math.pi / 2]) if aside_m else ([], [], [])
-        waves_by_field = (values.tolist() for values in (share, waves, phases))
-        return cls(
-            *(tuple(values + constant) for values, constant in zip(waves_by_field, offset, strict=True))
-        )
+        """Draw two waves 60 to 160 m long, whose amplitudes add up to at most ``largest_m``, and add an offset."""
+        amplitude = rng.uniform(0.2, 0.5, size=2) * largest_m
+        wave = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
+        phase = rng.uniform(0.0, 2 * math.pi, size=2)
+        waves = np.stack([amplitude, wave, phase])
+        if aside_m:
+            # A sine of wave number 0 is a constant.
+            waves = np.column_stack([waves, [aside_m, 0.0, math.pi / 2]])
+        return cls(*map(tuple, waves.tolist()))
 
     def apply(self, curve: Curve) -> Curve:
-        """Return the curve that is driven; its heading is its tangent (to first order in the deviation)."""
+        """Return the curve with the deviation; its heading is its tangent (to first order in the deviation)."""
         if not self.amplitude_m:
             return curve
         lateral, slope = np.zeros((2, len(curve.xy)))

@@ -1,4 +1,4 @@
-"""Pedestrians, who walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
+"""Pedestrians: they walk along sidewalks, wait at kerbs until it is safe to cross, and cross."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from drivax.synthetic.traffic.roles import Pedestrian
 _WAIT_M, _OCCUPY_M, _GAP_SEARCH_M = 0.4, 1.0, 1.8
 #: Acceleration of pedestrians, m/s2.
 _ACCELERATION_MPS2 = 1.5
-#: Drivers that need less braking than this yield at a crosswalk, m/s2; distance at which they stop before it, m.
+#: Hardest braking with which drivers yield at a crosswalk, m/s2, and distance from it at which they stop, m.
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
-#: Slower vehicles count as standing, m/s.
+#: Speed below which vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
 #: Accepted gap minus the crossing time, s, where drivers yield and where they do not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
@@ -35,7 +35,7 @@ _MAX_BEARING, _MAX_HEADING_DIFFERENCE = math.radians(75.0), math.radians(80.0)
 _CLEARANCE_M = 0.4
 #: Steps between two decisions.
 _DECISION_STEPS = 2
-#: Connectors next to lanes that begin or end this close to a crossing control it, m.
+#: Distance of a crossing from the end of a lane within which the adjacent connectors control it, m.
 _NEAR_JUNCTION_M = 25.0
 
 #: A number and a flag per pedestrian.
@@ -47,7 +47,12 @@ _Point = Float64[np.ndarray, " 2"]
 
 @dataclass(frozen=True)
 class _CrossingConflicts:
-    """Intersections of crossings and lanes, and a mask of connectors that must be red while pedestrians cross."""
+    """Intersections of crossings and lanes.
+
+    Attributes:
+        strip: Box of each crossing.
+        red: Mask of connectors whose light must be red while pedestrians cross.
+    """
 
     xy: Float64[np.ndarray, "conflict 2"]
     heading: Float64[np.ndarray, " conflict"]
@@ -59,6 +64,7 @@ class _CrossingConflicts:
 
 @per_roads
 def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
+    """Compute the conflicts of all crossings of a network."""
     poses, owner = [], []
     for index, crossing in enumerate(network.crossings):
         for lane, along in crossing.lanes:
@@ -107,7 +113,7 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
 
 
 class Pedestrians:
-    """The pedestrians of all worlds, moved step by step; crossings count through all worlds.
+    """The pedestrians of all worlds, moved step by step; indices of crossings run through all worlds.
 
     Args:
         worlds: The worlds.
@@ -138,14 +144,14 @@ class Pedestrians:
         self._begin = np.concatenate(([0], np.cumsum(self._last + 1)))[:-1]
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
         numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in pedestrians]
-        self._at, self._free_speed, self._kerb, self._across = (
+        self._position_m, self._free_speed, self._kerb, self._across = (
             np.array(numbers, float).reshape(-1, 4).T.copy()
         )
         self._size_m = np.array([pedestrian.size_m[:2] for pedestrian in pedestrians], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
         self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
         self._crosses = self._crossing >= 0
-        self._crossing += worlds.crossing[self.world]
+        self._crossing += worlds.first_crossing[self.world]
         self._any_crosses = bool(self._crosses.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
         marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
@@ -158,22 +164,23 @@ class Pedestrians:
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Return all pedestrians at step ``t`` and the occupied crossings, then advance; call it step by step.
+        """Return all pedestrians at step ``t`` and a mask of occupied crossings, then advance.
 
         A crossing is occupied if a pedestrian is on it or, where drivers must yield, about to step on it.
         """
-        sample = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
+        sample = np.minimum(np.maximum(self._position_m / self._step_m, 0.0), self._last)
         index = np.minimum(sample.astype(int), self._last - 1)
         rows = index + self._begin
         low = self._table.take(rows, axis=0)
         pose = low + (sample - index)[:, None] * (self._table.take(rows + 1, axis=0) - low)
-        occupied = np.zeros(self._worlds.crossing[-1], bool)
+        occupied = np.zeros(self._worlds.first_crossing[-1], bool)
         if t % _DECISION_STEPS == 0:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
         if self._any_crosses:
-            users = self._crosses & (self._at < self._across) & (self._at > self._kerb - _OCCUPY_M)
-            users &= self._released | self._has_priority | (self._at > self._kerb)
+            users = self._crosses & (self._position_m < self._across)
+            users &= self._position_m > self._kerb - _OCCUPY_M
+            users &= self._released | self._has_priority | (self._position_m > self._kerb)
             occupied[self._crossing[users]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
@@ -182,7 +189,7 @@ class Pedestrians:
     def _blocked_by_vehicles(
         self, pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask
     ) -> _Mask:
-        """Mask of pedestrians that would come too close to a vehicle and are not close to one yet."""
+        """Mask of pedestrians that would come too close to a vehicle and are not close to a vehicle yet."""
         x, y, angle = pose.T
         half = vehicles.size_m / 2 + _CLEARANCE_M
         half[~active] = -1.0
@@ -195,12 +202,12 @@ class Pedestrians:
 
     def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
-        to_kerb = self._kerb - self._at
+        to_kerb = self._kerb - self._position_m
         waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
         waiting = waiting.nonzero()[0]
         if not len(waiting):
             return
-        crossing_s = (self._across[waiting] - self._at[waiting]) / self._free_speed[waiting]
+        crossing_s = (self._across[waiting] - self._position_m[waiting]) / self._free_speed[waiting]
         # Starting from standstill takes v / (2 a) longer.
         crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
         # Traffic matters only to those whose conflicting lights stay red.
@@ -213,9 +220,9 @@ class Pedestrians:
             self._release_in(world, waiting[among], crossing_s[among], vehicles.select(rows))
 
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
-        """Release pedestrians of one world before its active vehicles."""
+        """Release pedestrians of a world if its active vehicles leave them a gap."""
         conflicts, crossing = self._conflicts[world], self._crossing[waiting]
-        local, place = np.unique(crossing - self._worlds.crossing[world], return_inverse=True)
+        local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
         any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         gap = np.where(
@@ -228,10 +235,10 @@ class Pedestrians:
 
     def _advance(self) -> None:
         """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
-        room = self._last * self._step_m - self._at
+        room = self._last * self._step_m - self._position_m
         if self._any_crosses:
-            waits = self._crosses & ~self._released & (self._at <= self._kerb)
-            kerb = np.where(waits, self._kerb - _WAIT_M - self._at, math.inf)
+            waits = self._crosses & ~self._released & (self._position_m <= self._kerb)
+            kerb = np.where(waits, self._kerb - _WAIT_M - self._position_m, math.inf)
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
@@ -239,18 +246,18 @@ class Pedestrians:
         speed = np.maximum(speed, 0.0)
         distance = np.minimum((self._speed + speed) / 2 * DT_S, np.maximum(room, 0.0))
         speed[self._is_blocked], distance[self._is_blocked] = 0.0, 0.0
-        self._at = self._at + distance
+        self._position_m = self._position_m + distance
         self._speed = speed
 
 
 def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
-    """Time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
+    """Return the time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
     remaining_s = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
         return remaining_s
-    # Extended by one cycle beyond the last step, because pedestrians know the cycle.
+    # One more cycle after the last step: pedestrians know the cycle.
     next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
@@ -264,7 +271,7 @@ def _remaining_red_s(
 def _arrivals(
     conflicts: _CrossingConflicts, crossings: _Indices, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
 ) -> tuple[_Values, _Values]:
-    """Time until the next vehicle arrives at each of some crossings, s: any vehicle, and one that cannot yield."""
+    """Return the time until the next vehicle, and the next that cannot yield, arrives at each crossing, s."""
     any_s, hard_s = np.full((2, len(crossings)), math.inf)
     if not len(boxes):
         return any_s, hard_s
@@ -344,7 +351,7 @@ def _draw_crossing_pedestrian(
 
 
 def _along_sidewalk(
-    network: RoadNetwork, kerb: _Point, out: _Point, rng: np.random.Generator
+    network: RoadNetwork, kerb: _Point, outward: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
     """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
     best: tuple[float, Curve, int] | None = None
@@ -354,7 +361,7 @@ def _along_sidewalk(
         if gap[index] < 6.0 and (best is None or gap[index] < best[0]):
             best = float(gap[index]), sidewalk, index
     if best is None:
-        return kerb + np.outer([2.0, 20.0], out)
+        return kerb + np.outer([2.0, 20.0], outward)
     _, sidewalk, index = best
     pieces = [piece for piece in (sidewalk.xy[index:], sidewalk.xy[index::-1]) if len(piece) > 4]
     piece = pieces[int(rng.integers(len(pieces)))]

@@ -13,7 +13,7 @@ from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
-from drivax.synthetic.traffic.roles import Drivers, Scripted
+from drivax.synthetic.traffic.roles import Drivers, ScriptedUser
 
 #: Width left next to a double-parked car where it can be passed within the lane, m.
 _PASSAGE_M = 2.3
@@ -27,9 +27,9 @@ _GAP_M, _GAP_S = 5.0, 0.9
 _BUSY_GAP_SHARE = 0.4
 #: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
 _MAX_CYCLING_LIMIT_MPS, _KERB_M = 16.0, 0.55
-#: No vehicle is placed within this time of a lane's end, s.
+#: Time before a lane's end within which no vehicle is placed, s.
 _MERGE_S = 5.0
-#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
+#: Free distance before and behind an obstacle in a lane, and width of the widest vehicle, m.
 _FREE_BEFORE_M, _FREE_BEHIND_M, _MAX_WIDTH_M = 30.0, 14.0, 2.55
 #: Distance between centres of vehicles on different lanes that share space, m.
 _MIN_SEPARATION_M = 15.0
@@ -54,7 +54,7 @@ _Places = list[_Place]
 
 def parked_cars(
     network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
-) -> tuple[Scripted, ...]:
+) -> tuple[ScriptedUser, ...]:
     """Draw parked cars in bays, and sometimes a double-parked one.
 
     A bay is occupied with probability ``share``. With probability ``double_share`` a car is double-parked next to a bay
@@ -63,7 +63,7 @@ def parked_cars(
     result = []
     for bay in network.bays:
         # Drawn for every bay, so that cars do not depend on the share.
-        size = _size(rng, bay.length_m)
+        size = _draw_size(rng, bay.length_m)
         along, lateral = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
         occupied = rng.random() < share
@@ -71,17 +71,17 @@ def parked_cars(
             clearance = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
             pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
-            result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+            result.append(ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
     has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
-        bay, size = network.bays[index], _size(rng, network.bays[index].length_m)
+        bay, size = network.bays[index], _draw_size(rng, network.bays[index].length_m)
         if _can_double_park(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
-            return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+            return (*result, ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
 
 
-def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
+def _draw_size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
     """Draw the size of a car or, in one case of eight, a van that fits a bay."""
     length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
     if rng.random() < 0.125 and room_m > 6.2:
@@ -99,7 +99,7 @@ def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: f
 
 
 def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
-    """Whether a car may be double-parked next to a bay: away from the ends of a lane, and where others can pass it."""
+    """Whether a car may be double-parked next to a bay: away from the lane's ends, with room for others to pass."""
     lane = network.lanes[bay.lane]
     if lane.connector or not _MIN_FROM_ENDS_M < bay.along_m < lane.length_m - _MIN_FROM_ENDS_M:
         return False
@@ -109,7 +109,7 @@ def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: floa
 
 
 def _has_oncoming_lane(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
-    """Whether a lane of the other direction is adjacent."""
+    """Whether a lane has an adjacent lane of the other direction."""
     current = _pose_at(lane, along_m)
     for other in network.lanes:
         gap = np.hypot(other.curve.xy[:, 0] - current.x, other.curve.xy[:, 1] - current.y)
@@ -121,6 +121,7 @@ def _has_oncoming_lane(network: RoadNetwork, lane: Lane, along_m: float) -> bool
 
 
 def _pose_at(lane: Lane, along_m: float) -> Pose:
+    """Interpolate the pose at a distance along a lane."""
     arc = lane.curve.arc_m
     x, y = (float(np.interp(along_m, arc, lane.curve.xy[:, axis])) for axis in (0, 1))
     return Pose(x, y, float(np.interp(along_m, arc, lane.curve.heading)))
@@ -157,7 +158,7 @@ class Placement:
 
 def place_vehicles(
     network: RoadNetwork, ego_lane: int, ego_along_m: float, density: Density, rng: np.random.Generator,
-    parked: tuple[Scripted, ...] = (), busy: Collection[int] = (),
+    parked: tuple[ScriptedUser, ...] = (), busy: Collection[int] = (),
 ) -> Placement:  # fmt: skip
     """Draw initial positions off connectors, with safe gaps to ego, other vehicles and parked cars.
 
@@ -173,7 +174,7 @@ def place_vehicles(
         if lane.connector:
             continue
         minimum = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
-        occupied = [along for where, along in vehicles if where == index]
+        occupied = [along for other, along in vehicles if other == index]
         occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY_GAP_SHARE if index in network.busy or index in busy else 1.0)
         position = rng.uniform(6.0, 6.0 + mean)
@@ -182,36 +183,36 @@ def place_vehicles(
                 vehicles.append((index, float(position)))
                 occupied.append(float(position))
             position += minimum + rng.exponential(mean)
-    vehicles = [sample for sample in vehicles if not _is_blocked(network, *sample, parked)]
+    vehicles = [vehicle for vehicle in vehicles if not _is_blocked(network, *vehicle, parked)]
     vehicles = _drop_close_followers(network, vehicles, (ego_lane, ego_along_m))
     current = network.lanes[ego_lane].curve
     ego_xy = current.xy[np.searchsorted(current.arc_m, ego_along_m).clip(max=len(current.xy) - 1)]
-    vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
+    vehicles.sort(key=lambda vehicle: float(np.hypot(*(_point_on_lane(network, *vehicle) - ego_xy))))
     vehicles = _drop_overlapping(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
 def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
     """Drop vehicles that overlap an earlier one on another lane, for example where lanes fork or merge."""
-    remaining: list[tuple[float, float]] = []
+    centres: list[tuple[float, float]] = []
     result = []
-    for index in [ego, *vehicles]:
-        lane, along = network.lanes[index[0]], index[1]
-        x, y = _point(network, *index)
-        heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
+    for lane, along in [ego, *vehicles]:
+        curve = network.lanes[lane].curve
+        x, y = _point_on_lane(network, lane, along)
+        heading = float(np.interp(along, curve.arc_m, curve.heading))
         cos, sin = np.cos(heading), np.sin(heading)
         overlaps = (
             abs((x - a) * cos + (y - b) * sin) < _MIN_SEPARATION_M
             and abs((y - b) * cos - (x - a) * sin) < _MAX_WIDTH_M
-            for a, b in remaining
+            for a, b in centres
         )
         if not any(overlaps):
-            remaining.append((float(x), float(y)))
-            result.append(index)
+            centres.append((float(x), float(y)))
+            result.append((lane, along))
     return result[1:]
 
 
-def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
+def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[ScriptedUser, ...]) -> bool:
     """Whether a parked car is in the lane at or close to a position."""
     curve = network.lanes[lane].curve
     index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
@@ -235,7 +236,7 @@ def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) 
         current = network.lanes[lane]
         minimum = 10.0 + _GAP_M + _GAP_S * current.limit_mps
         next_along = min((first.get(b, np.inf) for b in current.successors), default=np.inf)
-        # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
+        # Only the last vehicle of a lane can be too close to the first one of the next lane. Ego always stays.
         along_before_ego = network.lanes[ego[0]].length_m - ego[1] + along
         gap_to_ego = along_before_ego if ego[0] in current.predecessors else np.inf
         if (along < last[lane] or current.length_m - along + next_along > minimum) and gap_to_ego > minimum:
@@ -243,7 +244,8 @@ def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) 
     return remaining
 
 
-def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
+def _point_on_lane(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
+    """Return the sample of a lane nearest to a distance along it."""
     curve = network.lanes[lane].curve
     return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
 
@@ -253,12 +255,11 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    Given the first lane of each, no cyclist is on a fast road, and only cyclists are on bicycle lanes.
+    With the first lane of each, fast roads have no cyclists, and bicycle lanes only cyclists.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
-    draw = np.searchsorted(shares, rng.random(count), side="right")
-    # The types in the order of the shares; the rest are cars.
-    kind = (draw + 1) % (len(shares) + 1)
+    # Types in the order of the shares; the rest are cars.
+    kind = (np.searchsorted(shares, rng.random(count), side="right") + 1) % (len(shares) + 1)
     if lanes is not None:
         fast = np.array([lane.limit_mps > _MAX_CYCLING_LIMIT_MPS for lane in lanes], bool)
         kind[(kind == _CYCLIST) & fast] = _CAR

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int8, Int64
@@ -21,23 +22,23 @@ from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
-#: A driver requests a connector when it can still stop with this braking, m/s2, with this time and distance to spare.
-_ASK_MPS2, _ASK_S, _ASK_M = 2.0, 0.7, 3.5
-#: A driver that expects a blocker to clear waits with braking until this much is needed, m/s2; turning speed, m/s.
-_LATEST_MPS2, _TURNING_MPS = 3.4, 7.0
-#: Drivers that would have to brake harder than this do not stop for others, m/s2.
+#: Braking with which a driver can still stop when it requests a connector, m/s2, and reserves of time and distance.
+_REQUEST_MPS2, _REQUEST_S, _REQUEST_M = 2.0, 0.7, 3.5
+#: Required braking up to which a driver waits for a blocker to clear, m/s2, and speed of turning vehicles, m/s.
+_WAITING_MPS2, _TURNING_MPS = 3.4, 7.0
+#: Hardest braking for others, m/s2.
 _HARDEST_MPS2 = 6.5
 #: A vehicle has stopped at a sign below this speed, m/s, and within this distance of the line, m.
-_STANDS_MPS, _STANDS_M = 0.2, 4.5
+_STOPPED_MPS, _STOPPED_M = 0.2, 4.5
 #: Least duration of a stop at a stop sign, s.
 _PAUSE_S = 0.45
 #: Vehicles that stop within this time of each other arrive simultaneously, s.
 _TIE_S = 0.35
 #: Lowest speed at which vehicles with priority are expected to approach, m/s.
 _EXPECTED_MPS = 3.0
-#: After this time drivers accept two thirds of their usual gap, s.
+#: Waiting time after which drivers accept two thirds of their usual gap, s.
 _IMPATIENT_S = 30.0
-# Plain numbers: members of enumerations are looked up slowly.
+# Plain numbers, since lookups of enumeration members are slow.
 _NONE, _STOP, _ALL_WAY_STOP = int(Control.NONE), int(Control.STOP), int(Control.ALL_WAY_STOP)
 _RED, _YELLOW = int(Colour.RED), int(Colour.YELLOW)
 
@@ -55,7 +56,7 @@ class TrafficState:
         colour, to_red: Colour of each lane's light, and time until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
-        committed: Rows of planned vehicles and how many connectors each enters without yielding.
+        committed: Number of connectors that each planned vehicle (by row) enters without yielding.
     """
 
     tables: PathTables
@@ -76,7 +77,7 @@ class TrafficState:
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
-    """Begin and end on each connector of the stretch that conflicts with each other connector, m (nan: no conflict).
+    """Find the stretch of each connector that conflicts with each other one: begin and end, m (nan: no conflict).
 
     Connectors that leave the same lane do not conflict: vehicles on them follow each other.
     """
@@ -104,7 +105,7 @@ def conflict_zones(
 def time_to_cover(
     distance_m: Float64[np.ndarray, "*n"], speed: float, acceleration: float, top: float
 ) -> Float64[np.ndarray, "*n"]:
-    """Time to cover distances at constant acceleration up to a top speed, s (0 for negative distances)."""
+    """Return the time to cover distances at constant acceleration up to a top speed, s (0 for negative distances)."""
     distance = np.maximum(distance_m, 0.0)
     top = max(top, speed, 0.1)
     ramp = (top**2 - speed**2) / (2 * acceleration)
@@ -115,11 +116,16 @@ def time_to_cover(
 
 @dataclass(frozen=True)
 class _Request:
-    """A vehicle's request for a connector, at an index (``place``) of its path, and the distance to its stop line."""
+    """Request of a vehicle for a connector.
+
+    Attributes:
+        slot: Index of the connector among those of the path.
+        line_m, distance_m: Path position of the stop line, and distance to it.
+    """
 
     row: int
     connector: int
-    place: int
+    slot: int
     line_m: float
     distance_m: float
     speed: float
@@ -130,6 +136,14 @@ class _Request:
         return self.speed**2 / (2 * max(self.distance_m, 0.05))
 
 
+class _Blocker(NamedTuple):
+    """A vehicle in conflict with a request, and the distance until its rear bumper clears the conflict zone."""
+
+    row: int
+    connector: int
+    clear_m: float
+
+
 class Rules:
     """Rules and conflicts of the connectors of a network."""
 
@@ -138,7 +152,7 @@ class Rules:
         self.conflict = ~np.isnan(self.zone_begin)
         self.rivals = [set(np.flatnonzero(conflict).tolist()) for conflict in self.conflict]
         self.control = [int(lane.control) for lane in network.lanes]
-        self.yields = [
+        self.yields_to = [
             np.array([b for b in lane.yields_to if self.conflict[a, b]], int)
             for a, lane in enumerate(network.lanes)
         ]
@@ -150,7 +164,7 @@ _rules = per_roads(Rules)
 
 
 class RightOfWay:
-    """Grants connectors to drivers."""
+    """Grants of connectors to drivers."""
 
     def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
         self._worlds, self._drivers = worlds, drivers
@@ -159,26 +173,26 @@ class RightOfWay:
         count = len(self._length)
         self._rows = np.arange(count)
         self._granted = np.zeros(count, int)  # number of connectors on the path
-        self._stood = np.full(count, np.inf)  # time of the stop at the requested connector, s
+        self._stopped_at_s = np.full(count, np.inf)  # time of the stop at the requested connector, s
         self._requested = np.full(count, -1)
         self._denied = np.zeros(count, bool)
 
     def reset_vehicle(self, row: int, tables: PathTables, front_m: float) -> None:
         """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
         self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
-        self._stood[row], self._requested[row] = np.inf, -1
+        self._stopped_at_s[row], self._requested[row] = np.inf, -1
 
-    def lines(self, state: TrafficState) -> PerVehicle:
-        """Distance from the front bumper to the next line at which to stop (infinite: none)."""
+    def stop_line_m(self, state: TrafficState) -> PerVehicle:
+        """Decide all requests and return the distance to the next line at which to stop (infinite: none)."""
         begin = state.tables.connector_begin
         connectors = begin.shape[1]
         entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
         self._granted = np.maximum(self._granted, entered)
-        stop, halts = self._lights(state)
+        stop, halts = self._closed_lines(state)
         self._granted = np.maximum(np.minimum(self._granted, halts), entered)
         for row, count in state.committed.items():
             self._granted[row] = max(count, entered[row])
-        near = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
+        near = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
         index = np.minimum(self._granted, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
@@ -190,35 +204,36 @@ class RightOfWay:
         if len(rows):
             holders = self._holders(state)
             for world, requested in groupby(self._requests(state, rows, index), self._world):
-                self._decide(state, world, list(requested), holders[world], stop)
+                self._grant(state, world, list(requested), holders[world], stop)
         return stop
 
     def _world(self, request: _Request) -> int:
-        return int(self._worlds.of[request.row])
+        return int(self._worlds.world[request.row])
 
-    def _requests(self, state: TrafficState, rows: _Requests, place: VehicleRows) -> list[_Request]:
-        """Requests of some vehicles for the connectors at an index of their paths."""
-        place = place[rows]
-        connector = state.tables.connector[rows, place] - self._worlds.lane[self._worlds.of[rows]]
-        line = state.tables.connector_begin[rows, place]
-        columns = (rows, connector, place, line, line - state.front_m[rows], state.speed[rows])
+    def _requests(self, state: TrafficState, rows: _Requests, slot: VehicleRows) -> list[_Request]:
+        """Return the requests of some vehicles for the connectors in a slot of each path."""
+        slot = slot[rows]
+        connector = state.tables.connector[rows, slot] - self._worlds.first_lane[self._worlds.world[rows]]
+        line = state.tables.connector_begin[rows, slot]
+        columns = (rows, connector, slot, line, line - state.front_m[rows], state.speed[rows])
         return [_Request(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
 
     def _holders(self, state: TrafficState) -> list[_Holders]:
-        """Vehicles of each world that hold a connector."""
+        """List the vehicles of each world that hold a connector."""
         tables = state.tables
         is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
         is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
         row, slot = np.nonzero(is_held & (tables.connector >= 0))
-        world = self._worlds.of[row]
-        connector = tables.connector[row, slot] - self._worlds.lane[world]
+        world = self._worlds.world[row]
+        connector = tables.connector[row, slot] - self._worlds.first_lane[world]
         result: list[_Holders] = [[] for _ in self._rules]
-        for w, *holder in zip(world.tolist(), row.tolist(), connector.tolist(), strict=True):
-            result[w].append((holder[0], holder[1]))
+        holders = zip(row.tolist(), connector.tolist(), strict=True)
+        for w, holder in zip(world.tolist(), holders, strict=True):
+            result[w].append(holder)
         return result
 
-    def _lights(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
-        """Distance to the nearest line closed by a light, and index of its connector (their number: none)."""
+    def _closed_lines(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
+        """Return the distance to the nearest line closed by a light, and the slot of its connector (last + 1: none)."""
         begin, connector = state.tables.connector_begin, state.tables.connector
         count = connector.shape[1]
         if not np.count_nonzero(state.colour):
@@ -237,7 +252,7 @@ class RightOfWay:
         has_line = halt.ravel().take(flat)
         return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
-    def _decide(
+    def _grant(
         self, state: TrafficState, world: int, requests: list[_Request], holders: _Holders, stop: PerVehicle
     ) -> None:
         """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
@@ -245,10 +260,10 @@ class RightOfWay:
         for request in requests:
             i = request.row
             if self._requested[i] != request.connector:
-                self._requested[i], self._stood[i] = request.connector, np.inf
-            has_stopped = request.speed < _STANDS_MPS and request.distance_m < _STANDS_M
-            if has_stopped and self._stood[i] == np.inf:
-                self._stood[i] = state.step * DT_S
+                self._requested[i], self._stopped_at_s[i] = request.connector, np.inf
+            has_stopped = request.speed < _STOPPED_MPS and request.distance_m < _STOPPED_M
+            if has_stopped and self._stopped_at_s[i] == np.inf:
+                self._stopped_at_s[i] = state.step * DT_S
         waiting: list[int] = []  # connectors of vehicles that stand at an all-way stop and must still wait
         for request in self._order(rules, requests):
             i, connector = request.row, request.connector
@@ -259,22 +274,24 @@ class RightOfWay:
                 continue
             self._denied[i] = not granted
             if granted:
-                self._granted[i] = request.place + 1
-                self._stood[i] = np.inf
+                self._granted[i] = request.slot + 1
+                self._stopped_at_s[i] = np.inf
                 holders.append((i, connector))
             else:
                 stop[i] = min(stop[i], request.distance_m)
-                if rules.control[connector] == _ALL_WAY_STOP and self._stood[i] < np.inf:
+                if rules.control[connector] == _ALL_WAY_STOP and self._stopped_at_s[i] < np.inf:
                     waiting.append(connector)
 
     def _order(self, rules: Rules, requests: list[_Request]) -> list[_Request]:
-        """Order in which requests are decided."""
+        """Sort requests into the order of decision."""
         stops = [
-            (r, float(self._stood[r.row])) for r in requests if rules.control[r.connector] == _ALL_WAY_STOP
+            (r, float(self._stopped_at_s[r.row]))
+            for r in requests
+            if rules.control[r.connector] == _ALL_WAY_STOP
         ]
         key = {request.row: request.distance_m / max(request.speed, 1.0) for request in requests}
         for request, stood in stops:
-            # Of vehicles that arrived simultaneously the one without another to its right goes first.
+            # Of vehicles that arrived simultaneously, the one with none to its right goes first.
             tied = (r.connector for r, since in stops if abs(since - stood) < _TIE_S)
             angles = (wrap(rules.heading[c] - rules.heading[request.connector]) for c in tied)
             to_right = any(math.pi / 4 < angle < 3 * math.pi / 4 for angle in angles)
@@ -284,66 +301,66 @@ class RightOfWay:
     def _may_enter(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
+        """Whether stop, conflicts, room beyond the connector and priority permit a vehicle to enter."""
         i, connector, line = request.row, request.connector, request.line_m
         control = rules.control[connector]
-        if control >= _STOP and state.step * DT_S - self._stood[i] < _PAUSE_S:
+        if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
             return False
         tail = float(state.front_m[i] + state.room_m[i])
         if tail < line and self._denied[state.leader[i]]:
             return False
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
-        exit_m = state.tables.connector_end[i, request.place]
+        exit_m = state.tables.connector_end[i, request.slot]
         full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
         if full and tail >= line - 1.0 and control != _NONE:
             return False
-        return not len(rules.yields[connector]) or self._accepts_gap(state, rules, request)
+        return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)
 
     def _blockers(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
-    ) -> list[tuple[int, int, float]]:
-        """Row and connector of each conflicting vehicle, and distance until its rear bumper clears the zone, m."""
+    ) -> list[_Blocker]:
+        """Return the vehicles on conflicting connectors that have not cleared the conflict zone."""
         result, tables = [], state.tables
-        rivals = rules.rivals[request.connector]
         for j, other in holders:
-            if other in rivals and j != request.row:
-                clear_m = (
-                    tables.begin[j, other] + tables.scale[j, other] * rules.zone_end[other, request.connector]
-                )
+            if other in rules.rivals[request.connector] and j != request.row:
+                end_m = rules.zone_end[other, request.connector]
+                clear_m = tables.begin[j, other] + tables.scale[j, other] * end_m
                 if state.rear_m[j] < clear_m + 0.3:
-                    result.append((j, other, float(clear_m - state.rear_m[j]) + 0.3))
+                    result.append(_Blocker(j, other, float(clear_m - state.rear_m[j]) + 0.3))
         return result
 
     def _clears_in_time(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
     ) -> bool:
-        """Whether a driver with priority need not brake yet because all blockers move and will have cleared."""
+        """Whether a driver with priority need not brake yet, since all blockers will clear before it arrives."""
         connector = request.connector
-        if rules.control[connector] >= _STOP or not request.required_mps2 < _LATEST_MPS2:
+        if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
         blockers = self._blockers(state, rules, request, holders)
-        yields = {other for _, other, _ in blockers} & set(rules.yields[connector].tolist())
-        if not blockers or yields:
+        has_priority = {blocker.connector for blocker in blockers} & set(rules.yields_to[connector].tolist())
+        if not blockers or has_priority:
             return False
-        for j, other, left in blockers:
-            leaves = time_to_cover(np.array([left]), float(state.speed[j]), 1.0, _TURNING_MPS)[0]
-            arrives = (request.distance_m + rules.zone_begin[connector, other]) / max(request.speed, 1.0)
-            if state.speed[j] < 0.5 or leaves + 1.0 > arrives:
+        for blocker in blockers:
+            speed = float(state.speed[blocker.row])
+            clear_s = time_to_cover(np.array([blocker.clear_m]), speed, 1.0, _TURNING_MPS)[0]
+            to_zone = request.distance_m + rules.zone_begin[connector, blocker.connector]
+            if speed < 0.5 or clear_s + 1.0 > to_zone / max(request.speed, 1.0):
                 return False
         return True
 
     def _accepts_gap(self, state: TrafficState, rules: Rules, request: _Request) -> bool:
         """Whether the gap to vehicles with priority is large enough."""
         i, connector, tables = request.row, request.connector, state.tables
-        world = int(self._worlds.of[i])
-        others, vehicles = rules.yields[connector], self._worlds.vehicles(world)
+        world = int(self._worlds.world[i])
+        others, vehicles = rules.yields_to[connector], self._worlds.vehicles(world)
         begin, scale = tables.begin[vehicles][:, others], tables.scale[vehicles][:, others]
         reach = begin + scale * rules.zone_begin[others, connector] - state.front_m[vehicles, None]
         clear = begin + scale * rules.zone_end[others, connector] - state.rear_m[vehicles, None]
         coming = (clear > 0) & state.active[vehicles, None]
         coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
-        is_red = state.colour[self._worlds.lane[world] + others] == _RED
+        is_red = state.colour[self._worlds.first_lane[world] + others] == _RED
         waits = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
         coming &= ~(waits & (reach > 0))
         if not coming.any():
@@ -352,13 +369,13 @@ class RightOfWay:
         speed, own = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
-        top = float(tables.at(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
+        top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + rules.zone_begin[connector, own]
         through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]
         enter = time_to_cover(to_zone, own_speed, push, top)
         leave = time_to_cover(through_zone, own_speed, push, top)
-        wait_s = state.step * DT_S - self._stood[i] if self._stood[i] < np.inf else 0.0
+        wait_s = state.step * DT_S - self._stopped_at_s[i] if self._stopped_at_s[i] < np.inf else 0.0
         patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
         least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
         return not np.any((arrival < least_gap) & (departure > enter - 0.3))

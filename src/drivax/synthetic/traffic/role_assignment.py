@@ -33,13 +33,13 @@ from drivax.synthetic.traffic.placement import (
 )
 from drivax.synthetic.traffic.roles import Drivers, Roles
 
-#: Length of approaches to a conflict with dense traffic, m.
+#: Length of lanes with dense traffic before a conflict, m.
 _FEEDER_LENGTH_M = 160.0
-#: Time at which an unhindered ego arrives where it gives way, s after the recording begins.
+#: Arrival of an unhindered ego at a place where it gives way, s after the recording begins.
 _ARRIVAL_S = (0.4, 4.0)
-#: Ego begins at least this far along its path, m.
+#: Least position of ego along its path, m.
 _MIN_START_M = 12.0
-#: Number of further draws of ego's route until it has to give way.
+#: Number of further draws of a route on which ego does not have to give way.
 _EXTRA_ROUTES = 4
 #: Shares of the phases in which ego meets its next light: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
@@ -56,7 +56,7 @@ def yielding_destinations(network: RoadNetwork) -> tuple[Destination, ...]:
 
 
 def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
-    """Return the connectors that a path yields to, unless these yield too, and the lanes that it changes to."""
+    """Return the connectors to which a path yields, unless these yield too, and the lanes to which it changes."""
     result: set[int] = set()
     for before, span in pairwise((path.spans[0], *path.spans)):
         lane, previous = network.lanes[span.lane], network.lanes[before.lane]
@@ -69,15 +69,15 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
 
 
 def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
-    """Add the lanes that lead to some lanes within 160 m."""
+    """Add the lanes that lead to any of several lanes within 160 m."""
     result: set[int] = set()
-    ahead = [(lane, 0.0) for lane in sorted(lanes)]
-    while ahead:
-        lane, away = ahead.pop()
-        if lane not in result and away < _FEEDER_LENGTH_M:
+    queue = [(lane, 0.0) for lane in sorted(lanes)]
+    while queue:
+        lane, distance_m = queue.pop()
+        if lane not in result and distance_m < _FEEDER_LENGTH_M:
             result.add(lane)
             current = network.lanes[lane]
-            ahead += [(before, away + current.length_m) for before in current.predecessors]
+            queue += [(before, distance_m + current.length_m) for before in current.predecessors]
     return frozenset(result)
 
 
@@ -85,7 +85,7 @@ def assign_roles(
     network: RoadNetwork, domain: Domain, times_s: _Values, lane_change_share: float, timing: SignalTiming,
     rng: np.random.Generator, destinations: Sequence[Destination] = (), critical: bool = False,
 ) -> Roles:  # fmt: skip
-    """Draw ego, its route and lights, then the others.
+    """Draw ego, its route and its lights, then all other users.
 
     Args:
         network: The roads.
@@ -94,8 +94,8 @@ def assign_roles(
         lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
         timing: Shares of the phases in which ego meets its next light.
         rng: Source of randomness.
-        destinations: Candidate places for ego to pass in free traffic; none: ego's route is random.
-        critical: Ego must give way to dense traffic, if the roads allow it.
+        destinations: Candidate places for ego to pass in free traffic; without any, ego's route is random.
+        critical: Whether ego must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
     destination_route = draw_route(network, yielding_destinations(network) if critical else destinations, rng)
@@ -104,7 +104,7 @@ def assign_roles(
         network, driver, first_s, lane_change_share, rng, destination_route, attempts
     )
     rivals = add_feeders(network, conflicts_on(network, path)) if critical else frozenset()
-    network = network.with_signals(_lights(network, lanes, timing, destination_route, rng))
+    network = network.with_signals(_shift_lights(network, lanes, timing, destination_route, rng))
     current = max((span for span in path.spans if span.begin_m <= position), key=lambda span: span.begin_m)
     density, share = domain.density, float(rng.uniform(*domain.parked_share))
     parked = parked_cars(network, share, domain.double_share, rng, len(times_s))
@@ -133,7 +133,7 @@ def _draw_route(
     network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
     destination_route: DestinationRoute | None, attempts: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
-    """Draw ego's lanes, path and position before the warm-up; redraw a route without conflicts ``attempts`` times."""
+    """Draw ego's lanes, path and position before the warm-up, up to ``attempts`` times more without a conflict."""
     if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
@@ -150,11 +150,11 @@ def _draw_route(
     return lanes, path, position
 
 
-def _lights(
+def _shift_lights(
     network: RoadNetwork, lanes: tuple[int, ...], timing: SignalTiming,
     destination_route: DestinationRoute | None, rng: np.random.Generator,
 ) -> SignalPlan | None:  # fmt: skip
-    """Set the clock so that ego's next light is green, turns green or turns yellow when the recording begins."""
+    """Shift the plan: ego's next light is green, turns green or turns yellow when the recording begins."""
     plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
     signalised = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not signalised:
@@ -162,20 +162,20 @@ def _lights(
     if destination_route is not None and destination_route.alone:
         return green_on_arrival(plan, signalised[0])
     phase = plan.phase_of(signalised[0])
-    phase_case = int(rng.choice(3, p=timing))
-    if phase_case == 0:
-        green_at = -rng.uniform(0.0, 3.0)
-    elif phase_case == 1:
-        green_at = rng.uniform(0.5, 5.0)
-    else:
-        green_at = rng.uniform(0.3, 4.5) - plan.green_s[phase]
+    match int(rng.choice(3, p=timing)):
+        case 0:
+            green_at = -rng.uniform(0.0, 3.0)
+        case 1:
+            green_at = rng.uniform(0.5, 5.0)
+        case _:
+            green_at = rng.uniform(0.3, 4.5) - plan.green_s[phase]
     return replace(plan, offset_s=float(green_at) - plan.starts_s[phase])
 
 
 def _first_speeds(
     network: RoadNetwork, paths: list[Path], drivers: Drivers, distance: _Values, rng: np.random.Generator
 ) -> _Values:
-    """Draw speeds from which each vehicle can stop at its next stop line."""
+    """Draw speeds at which each vehicle can stop at its next stop line."""
     speeds = []
     for i, path in enumerate(paths):
         fastest = driver_profile(path, drivers, i)

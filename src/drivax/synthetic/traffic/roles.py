@@ -74,7 +74,7 @@ class Drivers:
 
 @dataclass(frozen=True)
 class Pedestrian:
-    """A pedestrian: walks along a curve and waits at kerbs.
+    """A pedestrian that walks along a curve and waits at kerbs.
 
     Attributes:
         curve: Along a sidewalk, or over a crossing from one sidewalk to the other.
@@ -95,8 +95,8 @@ class Pedestrian:
 
 
 @dataclass(frozen=True)
-class Scripted:
-    """A road user with a fixed trajectory: parked, or part of an event; speeds are negative when reversing."""
+class ScriptedUser:
+    """A road user with a fixed trajectory, parked or part of an event; it reverses at negative speeds."""
 
     kind: AgentKind
     size_m: tuple[float, float, float]
@@ -108,7 +108,7 @@ class Scripted:
     @classmethod
     def standing(
         cls, kind: AgentKind, size_m: tuple[float, float, float], pose: Pose, steps: int
-    ) -> Scripted:
+    ) -> ScriptedUser:
         """Return a user that never moves."""
         xy = np.tile([pose.x, pose.y], (steps, 1))
         return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
@@ -137,7 +137,7 @@ class Roles:
     speed_mps: Float64[np.ndarray, " vehicle"]
     route: tuple[int, ...]
     pedestrians: tuple[Pedestrian, ...] = ()
-    parked: tuple[Scripted, ...] = ()
+    parked: tuple[ScriptedUser, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Override:
 
 @dataclass(frozen=True)
 class Tailgate:
-    """A vehicle that keeps this time gap to its leader."""
+    """Time gap of a vehicle to its leader, in place of its driver's."""
 
     vehicle: int
     headway_s: float
@@ -160,10 +160,15 @@ class Tailgate:
 
 @dataclass(frozen=True)
 class Staging:
-    """Changes of an event to traffic; vehicles that would prevent it (``removed``) do not take part."""
+    """Changes of an event to traffic.
+
+    Attributes:
+        extras: Additional users.
+        removed: Rows of vehicles that would prevent the event and do not take part.
+    """
 
     overrides: tuple[Override, ...] = ()
-    extras: tuple[Scripted, ...] = ()
+    extras: tuple[ScriptedUser, ...] = ()
     tailgates: tuple[Tailgate, ...] = ()
     removed: tuple[int, ...] = ()
 
@@ -184,9 +189,9 @@ class Motion:
 
     Attributes:
         xy, heading, speed: Pose of the box centre and signed speed along the heading.
-        valid: False before a user exists and after it has left the map.
+        valid: Mask of the steps at which a user is on the map.
         distance_m: Position along each vehicle's present path.
-        acceleration: Acceleration of each vehicle during the step that begins here.
+        acceleration: Acceleration of each vehicle from each step to the next one.
     """
 
     kind: Int8[np.ndarray, " user"]
@@ -206,16 +211,17 @@ class Motion:
 
     def from_step(self, step: int) -> Motion:
         """Return the motion from a given step on."""
-        return self._at(slice(step, None))
+        return self._select_steps(slice(step, None))
 
     def before_step(self, step: int) -> Motion:
         """Return the motion before a step."""
-        return self._at(slice(step))
+        return self._select_steps(slice(step))
 
     def every_nth(self, stride: int) -> Motion:
         """Return the motion at every n-th step."""
-        return self._at(slice(None, None, stride))
+        return self._select_steps(slice(None, None, stride))
 
-    def _at(self, steps: slice) -> Motion:
-        timed = ("xy", "heading", "speed", "valid", "distance_m", "acceleration")
-        return replace(self, **{name: getattr(self, name)[:, steps] for name in timed})
+    def _select_steps(self, steps: slice) -> Motion:
+        """Return the motion at some steps."""
+        names = ("xy", "heading", "speed", "valid", "distance_m", "acceleration")
+        return replace(self, **{name: getattr(self, name)[:, steps] for name in names})

@@ -1,7 +1,7 @@
 """Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
-The car-following law is the simulator's (:mod:`drivax.simulator.idm`). All vehicles of several worlds move at once: one
-step is a few dozen array operations over all of them, and a world moves as it does alone.
+The car-following law is the simulator's (:mod:`drivax.simulator.idm`). Several worlds are simulated together: one step
+is a few dozen array operations over all their vehicles, and each world evolves as it does alone.
 """
 
 from __future__ import annotations
@@ -17,15 +17,22 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.traffic.lane_changes import HELP_MPS2, NO_HELP, Change, LaneChanges, Situation
+from drivax.synthetic.traffic.lane_changes import (
+    MAKE_ROOM_MPS2,
+    NO_GAP_PAIRS,
+    Change,
+    LaneChanges,
+    VehicleState,
+)
 from drivax.synthetic.traffic.lateral import (
     DETOUR_MARGIN_M,
     LOOK_M,
     Detours,
-    change_onto,
     detour_request,
+    lane_change_path,
     positions_along,
 )
+from drivax.synthetic.traffic.leaders import Leaders
 from drivax.synthetic.traffic.obstacles import (
     NO_EXTENTS,
     Boxes,
@@ -43,42 +50,40 @@ from drivax.synthetic.traffic.path_arrays import (
     group_indices,
     pad_steps,
 )
-from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, next_lanes
+from drivax.synthetic.traffic.paths import Path, Sway, lane_path, next_lanes
 from drivax.synthetic.traffic.pedestrians import Pedestrians
 from drivax.synthetic.traffic.placement import join_drivers
 from drivax.synthetic.traffic.right_of_way import RightOfWay, TrafficState
-from drivax.synthetic.traffic.roles import Drivers, EgoPlan, Motion, Roles, Scripted, Staging
+from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, ScriptedUser, Staging
 
-#: Half the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, and 1.5 m to a car.
-_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
 #: Distance between the front bumper and a stop line at standstill, m.
-_STOP_SHORT_M = 1.0
-#: Distance kept to an obstacle in the lane, to leave room for passing it, and to the end of a lane, m.
-_KEEP_M, _END_M = 5.0, 10.0
+_LINE_GAP_M = 1.0
+#: Distance kept to an obstacle in the lane, which leaves room for passing it, and to the end of a lane, m.
+_OBSTACLE_GAP_M, _LANE_END_GAP_M = 5.0, 10.0
 #: Time constant with which a driver follows the speed profile, s.
 _SPEED_TIME_S = 0.6
-#: Jerk limit beyond a driver's own when braking harder than this, m/s2 and m/s3.
+#: Deceleration beyond which a driver's own jerk limit is replaced, m/s2, and the limit that replaces it, m/s3.
 _EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
 #: Steps between decisions about lane changes and detours.
-_DECIDE_EVERY = 5
+_DECISION_STEPS = 5
 #: Steps between the end of a decision to leave the lane and the next one.
 _REST_STEPS = round(4.0 / DT_S)
-#: Braking that drivers accept for pedestrians, m/s2: to begin to stop, and once they brake.
-_YIELD_MPS2, _HARDEST_MPS2 = 3.0, 8.0
-#: Limit of the braking for lines, as a multiple of what is needed.
-_FIRMLY = 1.3
+#: Braking that drivers accept for pedestrians, m/s2: to start to brake, and once they brake.
+_COMFORTABLE_MPS2, _HARDEST_MPS2 = 3.0, 8.0
+#: Limit of the braking for lines as a multiple of the required braking.
+_LINE_BRAKING_FACTOR = 1.3
 #: Longest reaction, steps.
-_SLOWEST = 6
-#: A planned ego claims junctions this many steps ahead.
-_FORESEEN = 25
+_MAX_REACTION_STEPS = 6
+#: Steps ahead for which a planned ego reserves connectors.
+_LOOKAHEAD_STEPS = 25
 #: Runs that are simulated together.
-_TOGETHER = 6
+_BATCH_RUNS = 6
 
 _T = TypeVar("_T")
 
 
-def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
-    """Boxes of scripted users at a step."""
+def boxes_at(scripted: tuple[ScriptedUser, ...], step: int) -> Boxes:
+    """Return the boxes of scripted users at a step."""
     return Boxes(
         np.array([user.xy[step] for user in scripted]).reshape(-1, 2),
         np.array([user.heading[step] for user in scripted], float),
@@ -103,7 +108,7 @@ class _Log:
 
     @classmethod
     def empty(cls, steps: int, vehicles: int, pedestrians: int) -> _Log:
-        """Return a log to fill."""
+        """Allocate a log."""
         speed, at_m, acceleration = np.zeros((3, steps, vehicles))
         valid = np.zeros((steps, vehicles), bool)
         poses = np.zeros((steps, vehicles, 3)), np.zeros((steps, pedestrians, 4))
@@ -140,64 +145,8 @@ class _Log:
         )
 
 
-class Leaders:
-    """Finds the leader of every vehicle."""
-
-    def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
-        self._worlds, self._half_m, self._half_width_m = (
-            worlds,
-            drivers.size_m[:, 0] / 2,
-            drivers.size_m[:, 1] / 2,
-        )
-        self._rows = np.arange(len(self._half_m))
-        self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist within the lane.
-        widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
-        self._passes_m = np.array(widths) / 2 - _PASS_CYCLIST_M
-        self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
-
-    def ahead(
-        self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
-    ) -> tuple[PerVehicle, VehicleRows]:
-        """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
-        own, world = at_m[:, None], self._worlds.of
-        lane, along = tables.on(at_m)
-        lane[~active] = -1
-        # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
-        slots = (lane.ravel() >= 0).nonzero()[0]
-        if not len(slots):
-            return self._nearest
-        vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
-        k = group_indices(world[vehicle], len(self._worlds))
-        lanes = np.where(k < 0, self._worlds.lane[:-1, None], lane[k])
-        index = lanes.take(world, axis=0)
-        index += tables.column[:, None]
-        position = tables.scale.take(index)
-        position *= along.ravel().take(slots)[k].take(world, axis=0)
-        # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
-        position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = vehicle[k]
-        seen = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
-        if self._any_cyclist:
-            # Where the lane is wide enough, cyclists are overtaken within it.
-            passes_m = np.where(self._cyclist[vehicle_ahead], self._passes_m[lanes], -np.inf)
-            seen &= passes_m.take(world, axis=0) < self._half_width_m[:, None]
-        position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
-        gap = np.where(seen, position, np.inf)
-        gap -= own
-        gap -= self._half_m[:, None]
-        nearest = gap.argmin(axis=1)
-        result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
-        # A world without a vehicle on a lane keeps the last result.
-        empty = (k[:, 0] < 0)[world]
-        for values, last in zip(result, self._nearest, strict=True):
-            values[empty] = last[empty]
-        self._nearest = result
-        return result
-
-
 class Traffic:
-    """Traffic of all users of a world."""
+    """Traffic of all users of a world, which can be run several times."""
 
     def __init__(self, roles: Roles, times_s: Float64[np.ndarray, " time"]) -> None:
         self.roles, self.times_s = roles, times_s
@@ -216,21 +165,21 @@ class Traffic:
 
     @cached_property
     def parked_extents(self) -> list[Extents]:
-        """Extents of the parked cars on each path."""
+        """Extents of the parked cars along each path."""
         return self.extents(self.parked)
 
     def extents(self, boxes: Boxes) -> list[Extents]:
-        """Extents of boxes on each path."""
+        """Return the extents of boxes along each path."""
         return [extents(path, boxes)[0] if len(boxes) else NO_EXTENTS for path in self.roles.paths]
 
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Run all steps, with the changes of an event, and with ego on a plan (None: ego drives like the others)."""
+        """Run all steps, with the changes of an event and ego on a plan (default: ego drives like the others)."""
         return simulate([Run(self, staging or Staging(), ego)])[0]
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run of traffic: :meth:`Traffic.run`."""
+    """Arguments of :meth:`Traffic.run`."""
 
     traffic: Traffic
     staging: Staging = field(default_factory=Staging)
@@ -245,7 +194,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     """Run tasks and return their results in order.
 
-    Runs for which several tasks wait are simulated together; a task starts as soon as there is room for its first run.
+    Each task yields runs and receives their motion. Up to six runs of different tasks are simulated together.
     """
     remaining = iter(enumerate(tasks))
     results: dict[int, _T] = {}
@@ -259,7 +208,7 @@ def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
             results[number] = end.value
 
     while True:
-        while len(waiting) < _TOGETHER and (entry := next(remaining, None)):
+        while len(waiting) < _BATCH_RUNS and (entry := next(remaining, None)):
             advance(*entry, None)
         while first in results:
             yield results.pop(first)
@@ -276,64 +225,73 @@ class _Simulation:
     """State of runs that are simulated together."""
 
     def __init__(self, runs: Sequence[Run]) -> None:
-        self._runs, traffics = runs, [run.traffic for run in runs]
-        roles = [traffic.roles for traffic in traffics]
+        self._runs, roles = runs, [run.traffic.roles for run in runs]
         self._worlds = worlds = Worlds([r.network for r in roles], [len(r.paths) for r in roles])
-        self._ego_rows = worlds.row[:-1]
+        self._ego_rows = worlds.first_row[:-1]
         drivers = join_drivers(*(r.drivers for r in roles))
         self._half_m, self._width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
-        count = len(self._half_m)
-        self._rows, self._size_m = np.arange(count), drivers.size_m[:, :2]
+        self._rows, self._size_m = np.arange(len(self._half_m)), drivers.size_m[:, :2]
         self._tables = PathTables(worlds, [path for r in roles for path in r.paths], drivers)
-        static = [tuple(user for user in run.staging.extras if user.is_static) for run in runs]
-        boxes = [t.parked.concatenate(boxes_at(s, 0)) for t, s in zip(traffics, static, strict=True)]
-        seen = [
-            traffic.extents(standing) if extras else traffic.parked_extents
-            for traffic, standing, extras in zip(traffics, boxes, static, strict=True)
-        ]
-        self._standing = StaticObstacles(worlds, boxes, [e for group in seen for e in group], self._width_m)
-        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+        self._gather_obstacles(runs)
         self._right_of_way = RightOfWay(worlds, drivers)
-        self._changes = LaneChanges(worlds, drivers, boxes)
+        self._changes = LaneChanges(worlds, drivers, self._standing.boxes)
         self._leaders = Leaders(worlds, drivers)
-        self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
-        for world, run in enumerate(runs):
+        self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _MAX_REACTION_STEPS)
+        for first_row, run in zip(self._ego_rows.tolist(), runs, strict=True):
             for tailgate in run.staging.tailgates:
-                drivers = drivers.with_headway(int(worlds.row[world]) + tailgate.vehicle, tailgate.headway_s)
+                drivers = drivers.with_headway(first_row + tailgate.vehicle, tailgate.headway_s)
         self._drivers, self._idm = drivers, drivers.idm()
-        pedestrians = [r.pedestrians for r in roles]
-        times_s = [traffic.times_s for traffic in traffics]
+        self._gather_pedestrians(runs)
+        self._gather_scripts(runs)
+        self._initialise(runs)
+
+    def _gather_obstacles(self, runs: Sequence[Run]) -> None:
+        """Gather parked cars and static scripted users."""
+        boxes, path_extents = [], []
+        for run in runs:
+            static = tuple(user for user in run.staging.extras if user.is_static)
+            boxes.append(run.traffic.parked.concatenate(boxes_at(static, 0)))
+            path_extents += run.traffic.extents(boxes[-1]) if static else run.traffic.parked_extents
+        self._standing = StaticObstacles(self._worlds, boxes, path_extents, self._width_m)
+        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+
+    def _gather_pedestrians(self, runs: Sequence[Run]) -> None:
+        """Gather pedestrians and the state of crossings."""
+        worlds, pedestrians = self._worlds, [run.traffic.roles.pedestrians for run in runs]
+        times_s = [run.traffic.times_s for run in runs]
         self._pedestrians = Pedestrians(worlds, pedestrians, times_s) if any(pedestrians) else None
         self._pedestrian_world = np.repeat(np.arange(len(runs)), list(map(len, pedestrians)))
-        self._pedestrians_of = group_indices(self._pedestrian_world, len(runs))
-        self._occupied_crossings = np.zeros(worlds.crossing[-1], bool)
-        self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.crossing))
-        self._halting = np.zeros(self._tables.crossing.shape, bool)  # per vehicle and crossing on its path
-        self._gather_scripts(runs)
-        self._at = np.concatenate([r.distance_m for r in roles])
-        self._speed = np.concatenate([r.speed_mps for r in roles])
-        for world, run in enumerate(runs):
-            removed = worlds.row[world] + np.array(run.staging.removed, int)
-            self._at[removed] = self._tables.length_m[removed]
-        self._last = np.zeros(count)
-        self._memory = np.zeros((_SLOWEST + 1, count))
-        self._busy_m = np.full(count, -np.inf)  # path position at which a lane change or detour ends
-        self._rest = np.zeros(count, int)  # first step of the next decision
-        self._helped = NO_HELP
+        self._pedestrians_by_world = group_indices(self._pedestrian_world, len(runs))
+        self._occupied_crossings = np.zeros(worlds.first_crossing[-1], bool)
+        self._crossing_world = np.repeat(np.arange(len(runs)), np.diff(worlds.first_crossing))
+        self._brakes_for_crossing = np.zeros(self._tables.crossing.shape, bool)
+
+    def _initialise(self, runs: Sequence[Run]) -> None:
+        """Set the initial state of all vehicles and allocate the log."""
+        traffics, count = [run.traffic for run in runs], len(self._rows)
+        self._position_m = np.concatenate([traffic.roles.distance_m for traffic in traffics])
+        self._speed = np.concatenate([traffic.roles.speed_mps for traffic in traffics])
+        for first_row, run in zip(self._ego_rows, runs, strict=True):
+            removed = first_row + np.array(run.staging.removed, int)
+            self._position_m[removed] = self._tables.length_m[removed]
+        self._last_acceleration = np.zeros(count)
+        self._preferred_memory = np.zeros((_MAX_REACTION_STEPS + 1, count))
+        # Path position at which a lane change or detour ends, and first step of the next decision.
+        self._busy_m, self._rest_until = np.full(count, -np.inf), np.zeros(count, int)
+        self._gap_pairs = NO_GAP_PAIRS
         # Gap to and speed of the next leader, line and obstacle.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
         self._moving_users = self._vehicles = _NO_BOXES
-        self._user_world, self._users_of = self._pedestrian_world, self._pedestrians_of
-        self._colour, self._to_red = (
-            np.concatenate(pad_steps(series), axis=1)
-            for series in ([t.colour for t in traffics], [t.to_red for t in traffics])
-        )
-        self._steps = np.array([len(times) for times in times_s])[worlds.of]
-        self._log = _Log.empty(max(map(len, times_s)), count, len(self._pedestrian_world))
+        self._user_world, self._users_by_world = self._pedestrian_world, self._pedestrians_by_world
+        self._colour = np.concatenate(pad_steps([traffic.colour for traffic in traffics]), axis=1)
+        self._to_red = np.concatenate(pad_steps([traffic.to_red for traffic in traffics]), axis=1)
+        steps = [len(traffic.times_s) for traffic in traffics]
+        self._steps = np.array(steps)[self._worlds.world]
+        self._log = _Log.empty(max(steps), count, len(self._pedestrian_world))
 
     def _gather_scripts(self, runs: Sequence[Run]) -> None:
-        """Gather scripted users that move, overrides, and planned egos with their positions along their paths."""
-        row = self._worlds.row
+        """Gather moving scripted users, overrides, and planned egos with their positions along their paths."""
+        row = self._worlds.first_row
         self._movers = [
             (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
         ]  # fmt: skip
@@ -355,6 +313,7 @@ class _Simulation:
         return [self._motion(world, run) for world, run in enumerate(self._runs)]
 
     def _motion(self, world: int, run: Run) -> Motion:
+        """Return the motion of a world from the log."""
         pedestrians = slice(*np.searchsorted(self._pedestrian_world, [world, world + 1]).tolist())
         vehicles = self._worlds.vehicles(world)
         return self._log.motion(run, vehicles, pedestrians, self._tables.paths[vehicles])
@@ -368,33 +327,33 @@ class _Simulation:
             if t >= plan.first_step
         ]
         for row, plan, k, at in plans:
-            self._at[row], self._speed[row] = at[k], plan.speed[k]
-        active = self._at + self._half_m < self._tables.length_m
-        soon = self._at + self._speed * _SPEED_TIME_S
-        sample = self._tables.at(np.concatenate((self._at, soon)).reshape(2, -1))
-        pose, fastest, fastest_soon = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
+            self._position_m[row], self._speed[row] = at[k], plan.speed[k]
+        active = self._position_m + self._half_m < self._tables.length_m
+        ahead_m = self._position_m + self._speed * _SPEED_TIME_S
+        sample = self._tables.interpolate(np.concatenate((self._position_m, ahead_m)).reshape(2, -1))
+        pose, fastest, fastest_ahead = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
         for row, plan, k, _ in plans:
             active[row] = True
             pose[row] = (*plan.xy[k], plan.heading[k])
         self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._size_m)
         self._advance_pedestrians(t, active)
-        log.pose[t], log.speed[t], log.at_m[t], log.valid[t] = pose, self._speed, self._at, active
-        preferred = self._preferred_acceleration(t, fastest, fastest_soon, active)
-        if t % _DECIDE_EVERY == 0:
-            self._decide(t, preferred, fastest, active)
+        log.pose[t], log.speed[t], log.at_m[t], log.valid[t] = pose, self._speed, self._position_m, active
+        preferred = self._preferred_acceleration(t, fastest, fastest_ahead, active)
+        if t % _DECISION_STEPS == 0:
+            self._start_manoeuvres(t, preferred, fastest, active)
         log.acceleration[t] = self._advance(self._apply_reaction_times(t, preferred), active)
 
-    def _swap(self, t: int, row: int, path: Path, at: float, end_m: float) -> None:
-        """Put a vehicle on another path, which it follows undisturbed up to a position."""
-        world = int(self._worlds.of[row])
+    def _switch_path(self, t: int, row: int, path: Path, position_m: float, end_m: float) -> None:
+        """Put a vehicle at a position on another path; it makes no decisions before ``end_m``."""
+        world = int(self._worlds.world[row])
         crossings = self._tables.crossings[world]
         self._tables.replace(row, path)
         self._standing.replace(row, path)
-        self._at[row] = at
+        self._position_m[row] = position_m
         widened = self._tables.crossings[world] > crossings
-        self._halting[self._worlds.vehicles(world) if widened else row] = False
-        self._right_of_way.reset_vehicle(row, self._tables, at + self._half_m[row])
-        self._busy_m[row], self._rest[row] = end_m, t + _REST_STEPS
+        self._brakes_for_crossing[self._worlds.vehicles(world) if widened else row] = False
+        self._right_of_way.reset_vehicle(row, self._tables, position_m + self._half_m[row])
+        self._busy_m[row], self._rest_until[row] = end_m, t + _REST_STEPS
 
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians and gather scripted users."""
@@ -405,26 +364,31 @@ class _Simulation:
             log[:, :2], log[:, 2], log[:, 3] = users.xy, users.heading, users.speed
         movers = [(world, user) for world, user in self._movers if t < len(user.valid) and user.valid[t]]
         self._moving_users = users.concatenate(boxes_at(tuple(user for _, user in movers), t))
-        self._user_world, self._users_of = self._pedestrian_world, self._pedestrians_of
+        self._user_world, self._users_by_world = self._pedestrian_world, self._pedestrians_by_world
         if movers:
             self._user_world = np.append(self._user_world, [world for world, _ in movers])
-            self._users_of = group_indices(self._user_world, len(self._worlds))
+            self._users_by_world = group_indices(self._user_world, len(self._worlds))
 
     def _preferred_acceleration(
-        self, t: int, fastest: PerVehicle, fastest_soon: PerVehicle, active: VehicleMask
+        self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """The least of the accelerations towards leaders, lines, obstacles and the preferred speed (now and soon)."""
+        """Return the least acceleration for leaders, lines, obstacles, and the present and next highest speeds."""
         gaps, leads = self._gaps, self._leads
-        gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
+        gaps[0], leader = self._leaders.find(self._tables, self._position_m, active)
         leads[0] = self._speed[leader]
-        # Lines and obstacles are updated in alternate steps, and extrapolated in between.
+        # Lines and obstacles are updated in alternate steps and extrapolated in the others.
         if t % 2 or t == 0:
-            gaps[1] = self._stops(t, active, leader)
+            gaps[1] = self._stop_gap(t, active, leader)
         else:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables, self._vehicles, self._at, active, self._moving_users, self._users_of
+                self._tables,
+                self._vehicles,
+                self._position_m,
+                active,
+                self._moving_users,
+                self._users_by_world,
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
@@ -432,39 +396,39 @@ class _Simulation:
         speed = np.maximum(self._speed, 0.0)
         accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
-        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
-        lines = np.maximum(accelerations[1], -_FIRMLY * to_stop - 0.5)
+        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _LINE_GAP_M), 0.1))
+        lines = np.maximum(accelerations[1], -_LINE_BRAKING_FACTOR * to_stop - 0.5)
         preferred = np.minimum(np.minimum(accelerations[0], lines), accelerations[2])
-        preferred = np.minimum(preferred, (fastest_soon - self._speed) / _SPEED_TIME_S)
+        preferred = np.minimum(preferred, (fastest_ahead - self._speed) / _SPEED_TIME_S)
         return self._open_gaps(preferred, fastest)
 
     def _open_gaps(self, preferred: PerVehicle, fastest: PerVehicle) -> PerVehicle:
-        """Open gaps for mandatory lane changes on both lanes."""
-        h = self._helped
-        if len(h.behind):
-            gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
-            idm, speed = self._drivers.idm(h.behind), self._speed[h.behind]
-            helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
-            # Vehicles that are already past need no gap, and slow ones open none.
-            helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
-            np.minimum.at(preferred, h.behind, helpful)
+        """Limit the accelerations of vehicles that open gaps for mandatory lane changes."""
+        behind, ahead = self._gap_pairs.behind, self._gap_pairs.ahead
+        if len(behind):
+            gap = self._gap_pairs.gap_m + self._position_m[ahead] - self._position_m[behind]
+            idm, speed = self._drivers.idm(behind), self._speed[behind]
+            limit = idm_acceleration(speed, fastest[behind], gap, self._speed[ahead], idm)
+            # A vehicle that is already past needs no gap, and slow ones open none.
+            limit = np.where((gap > -2.0) & (speed > 1.5), np.maximum(limit, -MAKE_ROOM_MPS2), np.inf)
+            np.minimum.at(preferred, behind, limit)
         return preferred
 
-    def _stops(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
-        """Gap to the next place to stop (line, crossing, obstacle, end of the lane), plus the IDM's gap of 2 m."""
-        p, front = self._tables, self._at + self._half_m
+    def _stop_gap(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
+        """Return the gap to the next place to stop (line, crossing, obstacle, lane end), plus the IDM's gap of 2 m."""
+        tables, front = self._tables, self._position_m + self._half_m
         committed = {}
         for row, plan, at in self._plans:
             if t >= plan.first_step:
-                soon = at[min(t - plan.first_step + _FORESEEN, len(at) - 1)] + self._half_m[row]
-                committed[row] = int(np.sum(p.connector_begin[row] < soon))
+                ahead_m = at[min(t - plan.first_step + _LOOKAHEAD_STEPS, len(at) - 1)] + self._half_m[row]
+                committed[row] = int(np.sum(tables.connector_begin[row] < ahead_m))
         state = TrafficState(
-            tables=p,
+            tables=tables,
             step=t,
             colour=self._colour[t],
             to_red=self._to_red[t],
             front_m=front,
-            rear_m=self._at - self._half_m,
+            rear_m=self._position_m - self._half_m,
             speed=self._speed,
             active=active,
             room_m=self._gaps[0],
@@ -472,129 +436,130 @@ class _Simulation:
             leader_speed=self._leads[0],
             committed=committed,
         )
-        room = self._right_of_way.lines(state) + 2.0 - _STOP_SHORT_M
+        room = self._right_of_way.stop_line_m(state) + 2.0 - _LINE_GAP_M
         if np.count_nonzero(self._occupied_crossings):
-            room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
-        room = np.minimum(room, p.stop_m - front - _END_M)
+            room = np.minimum(room, self._crossing_gap(front) + 2.0 - _LINE_GAP_M)
+        room = np.minimum(room, tables.stop_m - front - _LANE_END_GAP_M)
         if self._has_standing.any():
-            room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
+            room = np.minimum(room, self._standing.gap(front) + 2.0 - _OBSTACLE_GAP_M)
         return room
 
-    def _crossings(self, front: PerVehicle) -> PerVehicle:
-        """Distance to the next occupied crossing at which a vehicle can stop."""
-        crossing, away = self._tables.crossing, self._tables.crossing_m - front[:, None]
-        to_stop = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
-        halt = self._occupied_crossings[crossing] & (crossing >= 0) & (away > -0.5)
-        halting = self._halting
-        if crossing.shape[1] > halting.shape[1]:
-            halting = np.pad(halting, ((0, 0), (0, crossing.shape[1] - halting.shape[1])))
-        halt &= to_stop < np.where(halting, _HARDEST_MPS2, _YIELD_MPS2)
+    def _crossing_gap(self, front: PerVehicle) -> PerVehicle:
+        """Return the distance to the next occupied crossing before which a vehicle can stop."""
+        crossing, distance = self._tables.crossing, self._tables.crossing_m - front[:, None]
+        required_mps2 = self._speed[:, None] ** 2 / (2 * np.maximum(distance, 0.05))
+        brakes = self._brakes_for_crossing
+        if crossing.shape[1] > brakes.shape[1]:
+            brakes = np.pad(brakes, ((0, 0), (0, crossing.shape[1] - brakes.shape[1])))
+        stops = self._occupied_crossings[crossing] & (crossing >= 0) & (distance > -0.5)
+        stops &= required_mps2 < np.where(brakes, _HARDEST_MPS2, _COMFORTABLE_MPS2)
         # A world without an occupied crossing keeps its state.
-        occupied_in = self._worlds.with_any(self._crossing_world[self._occupied_crossings])
-        self._halting = np.where(occupied_in[self._worlds.of, None], halt, halting)
-        return np.where(halt, away, np.inf).min(axis=1)
+        is_occupied = self._worlds.mask(self._crossing_world[self._occupied_crossings])
+        self._brakes_for_crossing = np.where(is_occupied[self._worlds.world, None], stops, brakes)
+        return np.where(stops, distance, np.inf).min(axis=1)
 
     def _apply_reaction_times(self, t: int, preferred: PerVehicle) -> PerVehicle:
-        """Return the accelerations preferred a reaction time ago, bounded by overrides."""
-        depth = len(self._memory)
+        """Return the accelerations preferred one reaction time ago, bounded by overrides."""
+        depth = len(self._preferred_memory)
         if t == 0:
-            self._memory[:] = preferred
-        self._memory[t % depth] = preferred
-        result = self._memory[(t - self._delay) % depth, self._rows]
+            self._preferred_memory[:] = preferred
+        self._preferred_memory[t % depth] = preferred
+        result = self._preferred_memory[(t - self._delay) % depth, self._rows]
         for row, override in self._overrides:
             if override.first_step <= t <= override.last_step:
                 result[row] = min(result[row], override.acceleration_mps2)
         return result
 
     def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
-        """Advance by one step and return accelerations; speeds stay non-negative."""
-        jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
-        a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
+        """Advance by one step and return the accelerations; speeds stay non-negative."""
+        last, jerk = self._last_acceleration, self._drivers.jerk_mps3 * DT_S
+        braking_jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
+        a = np.clip(preferred, last - braking_jerk, last + jerk)
         after = self._speed + a * DT_S
         stops = after <= 0.0
-        # Vehicles that stop within the step travel v^2 / (2 |a|).
-        distance = np.where(
-            stops, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
-        )
-        self._at = self._at + np.where(active, distance, 0.0)
-        self._last = np.where(stops, 0.0, a)
+        stopping_m = self._speed**2 / (2 * np.maximum(-a, 1e-9))
+        distance = np.where(stops, stopping_m, (self._speed + after) * DT_S / 2)
+        self._position_m = self._position_m + np.where(active, distance, 0.0)
+        self._last_acceleration = np.where(stops, 0.0, a)
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
 
-    def _decide(self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask) -> None:
-        """Start lane changes and detours."""
-        # In a world that is over the paths stay.
-        calm = (self._at > self._busy_m) & (self._rest <= t) & active & (t < self._steps)
+    def _start_manoeuvres(
+        self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask
+    ) -> None:
+        """Start lane changes and detours of vehicles that may decide now."""
+        # Paths of finished worlds stay.
+        may_decide = (self._position_m > self._busy_m) & (self._rest_until <= t) & active & (t < self._steps)
         for row, override in self._overrides:
-            calm[row] &= t < override.first_step
-        free = calm.copy()
+            may_decide[row] &= t < override.first_step
+        free = may_decide.copy()
         free[self._ego_rows] = False
-        state = Situation(self._at, self._speed, active, free, fastest, preferred)
-        changes, self._helped = self._changes.decide(state, self._tables)
+        state = VehicleState(self._position_m, self._speed, active, free, fastest, preferred)
+        changes, self._gap_pairs = self._changes.decide(state, self._tables)
         for change in changes:
-            self._change(t, change)
-            calm[change.vehicle] = False
+            self._start_lane_change(t, change)
+            may_decide[change.vehicle] = False
         for row, plan, _ in self._plans:
-            calm[row] &= t < plan.first_step
-        self._pass(t, calm)
+            may_decide[row] &= t < plan.first_step
+        self._start_detours(t, may_decide)
 
-    def _change(self, t: int, change: Change) -> None:
-        """Start a lane change; beyond it the vehicle keeps to its old lanes where it can."""
-        row, world, present = (
-            change.vehicle,
-            self._worlds.of[change.vehicle],
-            self._tables.paths[change.vehicle],
-        )
-        network, number = self._worlds.networks[world], row - int(self._worlds.row[world])
-        lanes = [change.lane - int(self._worlds.lane[world])]
-        ahead = {span.lane for span in present.spans}
+    def _start_lane_change(self, t: int, change: Change) -> None:
+        """Start a lane change; after it the vehicle returns to the lanes of its old path where it can."""
+        row, worlds = change.vehicle, self._worlds
+        world, present = worlds.world[row], self._tables.paths[row]
+        network, number = worlds.networks[world], row - int(worlds.first_row[world])
+        lanes = [change.lane - int(worlds.first_lane[world])]
+        old_lanes = {span.lane for span in present.spans}
         while network.lanes[lanes[-1]].successors:
-            after = next_lanes(network, lanes)
-            on_path = [lane for lane in after if lane in ahead]
-            # Elsewhere branches take turns: this draws no random number.
-            lanes.append(on_path[0] if on_path else after[(number + len(lanes)) % len(after)])
+            options = next_lanes(network, lanes)
+            on_path = [lane for lane in options if lane in old_lanes]
+            # Other branches take turns, which draws no random number.
+            lanes.append(on_path[0] if on_path else options[(number + len(lanes)) % len(options)])
         sway = Sway((0.08,), (0.07,), (float(number),))
         target = lane_path(network, tuple(lanes), sway)
-        path, position = change_onto(target, present, self._at[row], change.length_m)
-        self._swap(t, row, path, position, position + change.length_m)
+        path, position = lane_change_path(target, present, self._position_m[row], change.length_m)
+        self._switch_path(t, row, path, position, position + change.length_m)
 
-    def _pass(self, t: int, calm: VehicleMask) -> None:
+    def _start_detours(self, t: int, may_decide: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
         stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
         for row, override in self._overrides:
-            state = override.first_step <= t <= override.last_step
-            stuck[row] |= state and self._speed[row] < 0.05
+            is_overridden = override.first_step <= t <= override.last_step
+            stuck[row] |= is_overridden and self._speed[row] < 0.05
         halts = np.abs(self._moving_users.speed) < 0.05
-        big = halts & (self._moving_users.size_m[:, 0] > 1.2)
-        stuck_in = worlds.with_any(worlds.of[stuck])
-        halted_in = stuck_in | worlds.with_any(self._user_world[big])
-        considered = halted_in | self._has_standing
+        large = halts & (self._moving_users.size_m[:, 0] > 1.2)
+        has_stuck = worlds.mask(worlds.world[stuck])
+        has_halted = has_stuck | worlds.mask(self._user_world[large])
+        considered = has_halted | self._has_standing
         if not considered.any():
             return
-        slow_only = (stuck_in | worlds.with_any(self._user_world[halts]))[worlds.of]
-        near = np.where(slow_only, self._speed < 3.0, self._standing.gap(self._at + self._half_m) < 45.0)
-        near &= calm & considered[worlds.of] & (self._speed < 9.0)
+        front = self._position_m + self._half_m
+        slow_only = (has_stuck | worlds.mask(self._user_world[halts]))[worlds.world]
+        near = np.where(slow_only, self._speed < 3.0, self._standing.gap(front) < 45.0)
+        near &= may_decide & considered[worlds.world] & (self._speed < 9.0)
+        half_m = self._width_m / 2 + DETOUR_MARGIN_M
         for row in near.nonzero()[0].tolist():
-            front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
-            meets = halted_in[worlds.of[row]] or self._standing.meets(
-                row, front, half + DETOUR_MARGIN_M, LOOK_M
-            )
-            if meets:
-                self._start_detour(t, row, stuck, big)
+            if has_halted[worlds.world[row]] or self._standing.is_blocked(
+                row, front[row], half_m[row], LOOK_M
+            ):
+                self._start_detour(t, row, stuck, large)
 
-    def _start_detour(self, t: int, row: int, stuck: VehicleMask, big: Bool[np.ndarray, " user"]) -> None:
-        """Start a detour around an obstacle ahead, if there is one."""
-        world, worlds = int(self._worlds.of[row]), self._worlds
+    def _start_detour(self, t: int, row: int, stuck: VehicleMask, large: Bool[np.ndarray, " user"]) -> None:
+        """Start a detour around an obstacle ahead, if there is one; ``large`` are halted users."""
+        world, worlds = int(self._worlds.world[row]), self._worlds
         own_users, moves = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
-        other = (self._at > 0.0) & ~stuck & (worlds.of == world)
+        other = (self._position_m > 0.0) & ~stuck & (worlds.world == world)
         other[row] = False
         standing = self._standing.boxes[world].concatenate(
-            self._vehicles.select(stuck & (worlds.of == world))
+            self._vehicles.select(stuck & (worlds.world == world))
         )
-        standing = standing.concatenate(self._moving_users.select(big & own_users))
+        standing = standing.concatenate(self._moving_users.select(large & own_users))
         moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
-        position, size = float(self._at[row]), (float(2 * self._half_m[row]), float(self._width_m[row]))
+        position, size = (
+            float(self._position_m[row]),
+            (2 * float(self._half_m[row]), float(self._width_m[row])),
+        )
         request = detour_request(self._tables, row, (position, self._speed[row]), size)
         detour = self._runs[world].traffic.detours.find(request, standing, moving)
         if detour is not None:
-            self._swap(t, row, detour[0], position, detour[1])
+            self._switch_path(t, row, detour[0], position, detour[1])

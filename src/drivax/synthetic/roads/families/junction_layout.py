@@ -34,9 +34,9 @@ from drivax.synthetic.roads.style import RoadStyle
 #: Distances from the mouth of the crossing's two sides and of the stop line, with a crosswalk and without, m.
 _CROSSING_M = ((0.8, 4.0), (0.2, 3.0))
 _STOP_LINE_M = (5.5, 3.6)
-#: Least distance of the centres of adjacent and opposing lanes, m; closer lanes count as in conflict.
+#: Least distance between the centres of adjacent or opposing lanes, m; closer lanes would be in conflict.
 _LEAST_PITCH_M = 3.2
-#: Arms that differ less than this from a straight line have no corner, rad.
+#: Deviation of two arms from a straight line below which they have no corner, rad.
 _NO_CORNER = math.radians(25.0)
 #: Largest distance of ego's start from the stop line, in seconds at the limit and in m, and the least one, m.
 _EARLIEST_S, _EARLIEST_M, _LATEST_M = 6.0, 85.0, 12.0
@@ -95,7 +95,7 @@ class CrossSection:
 
 @dataclass(frozen=True)
 class Arm:
-    """A street at the junction; ``base`` is where its middle line passes the centre, looking outwards."""
+    """A street at the junction; ``base`` is the pose of its middle line next to the centre, looking outwards."""
 
     base: Pose
     street: CrossSection
@@ -107,8 +107,7 @@ class Approach:
 
     Attributes:
         mouth_m: Distance of the mouth from the arm's base.
-        middle: Middle line from the stop line outwards: the range of the lanes.
-        side: Middle line from the mouth outwards: the range of the edges.
+        middle, side: Middle line outwards from the stop line (range of the lanes), and from the mouth (of the edges).
         inward, outward: Lanes, each from the middle to the edge.
     """
 
@@ -178,7 +177,7 @@ class Geometry:
     def arms(
         self, rng: np.random.Generator, headings: Sequence[float], streets: Sequence[CrossSection]
     ) -> list[Arm]:
-        """Draw arms in about these directions, each centred on its lanes."""
+        """Draw arms in approximately these directions, each centred on its lanes."""
         arms = []
         for heading, street in zip(headings, streets, strict=True):
             pose = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
@@ -199,9 +198,9 @@ class Geometry:
             if abs(angle) < _NO_CORNER:
                 continue
             tangent = radius * math.tan(angle / 2)
-            mine, theirs = _intersection(arm, arms[k])
-            mouths[i] = max(mouths[i], mine + tangent)
-            mouths[k] = max(mouths[k], theirs + tangent)
+            right_m, left_m = _intersection(arm, arms[k])
+            mouths[i] = max(mouths[i], right_m + tangent)
+            mouths[k] = max(mouths[k], left_m + tangent)
         return mouths
 
 
@@ -216,23 +215,23 @@ def draw_street(
 
 
 def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
-    """Distances along both middle lines of the intersection of an arm's left edge and the next arm's right edge."""
+    """Intersect an arm's left edge with the next arm's right edge; return the distances along both middle lines."""
     start, end = right.base.aside(right.street.left_m), left.base.aside(-left.street.right_m)
-    mine, behind = tangent_lengths(start, end, math.sin(end.heading - start.heading))
-    return mine, -behind
+    right_m, behind = tangent_lengths(start, end, math.sin(end.heading - start.heading))
+    return right_m, -behind
 
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
     """Add an arm that leads off the map."""
     middle = reach.draw(rng, arm.base.ahead(mouth_m + arm.street.stop_line_m))
     side = join_curves(straight(arm.base.ahead(mouth_m), arm.street.stop_line_m), middle)
-    return Approach(arm, mouth_m, middle, side, *lay_lanes(draft, arm.street, middle))
+    return Approach(arm, mouth_m, middle, side, *add_lanes(draft, arm.street, middle))
 
 
-def lay_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def add_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Add the lanes of a street, whose middle line leads outwards; return inward and outward lanes."""
 
-    def lay(count: int, side: float) -> tuple[int, ...]:
+    def add_direction(count: int, side: float) -> tuple[int, ...]:
         lanes = []
         for j in range(count):
             curve = middle.parallel(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))
@@ -242,11 +241,11 @@ def lay_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[
             draft.link_neighbours(*pair)
         return tuple(lanes)
 
-    return lay(street.inward, 1.0), lay(street.outward, -1.0)
+    return add_direction(street.inward, 1.0), add_direction(street.outward, -1.0)
 
 
 def open_site(rng: np.random.Generator, arms: Sequence[Arm], geometry: Geometry) -> tuple[Draft, Site]:
-    """Begin a draft with all arms of a single junction, without connectors."""
+    """Start a draft with all arms of a single junction, without connectors."""
     draft, mouths = Draft(), geometry.mouths(rng, arms)
     pairs = zip(arms, mouths, strict=True)
     return draft, Site(tuple(open_approach(rng, draft, arm, mouth, geometry.reach) for arm, mouth in pairs))
@@ -255,7 +254,7 @@ def open_site(rng: np.random.Generator, arms: Sequence[Arm], geometry: Geometry)
 def open_crossroads(
     rng: np.random.Generator, streets: Sequence[CrossSection], geometry: Geometry, skew: float
 ) -> tuple[Draft, Site]:
-    """Begin a draft with the arms of two streets that cross at a right angle, give or take ``skew`` (rad)."""
+    """Start a draft with the arms of two streets that cross at a right angle, up to a deviation ``skew`` (rad)."""
     first = float(rng.uniform(-math.pi, math.pi))
     second = first + math.pi / 2 + float(rng.uniform(-skew, skew))
     headings = [first, second, first + math.pi, second + math.pi]
@@ -266,8 +265,8 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
     """Add the connectors.
 
     Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
-    outside. Where fewer lanes leave than arrive, the innermost one is for turning only; with ``left_only`` of an
-    approach, the innermost of several lanes always is.
+    outside. The innermost lane is for turning only where fewer lanes leave than arrive, and on ``left_only`` approaches
+    with several lanes.
     """
     moves = []
     for i, approach in enumerate(site.approaches):
@@ -275,26 +274,28 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
         turns = {_turn(approach.arm, site.approaches[k].arm): k for k in others}
         lanes = approach.inward
         for turn, k in sorted(turns.items()):
-            out = site.approaches[k].outward
+            targets = site.approaches[k].outward
             if turn == Turn.STRAIGHT:
                 first = 1 if left_only[i] and approach.arm.street.inward > 1 and Turn.LEFT in turns else 0
-                shift = len(out) - len(lanes)
-                pairs = [(lanes[j], out[shift + j]) for j in range(first, len(lanes)) if shift + j >= 0]
+                shift = len(targets) - len(lanes)
+                pairs = [(lanes[j], targets[shift + j]) for j in range(first, len(lanes)) if shift + j >= 0]
             else:
-                pairs = [(lanes[0], out[0]) if turn == Turn.LEFT else (lanes[-1], out[-1])]
+                pairs = [(lanes[0], targets[0]) if turn == Turn.LEFT else (lanes[-1], targets[-1])]
             ends = (approach.arm.street.stop_line_m, site.approaches[k].arm.street.stop_line_m)
-            moves += [Move(_connector(draft, a, b, ends), i, k, turn) for a, b in pairs]
+            moves += [Move(_add_connector(draft, a, b, ends), i, k, turn) for a, b in pairs]
     return Site(site.approaches, tuple(moves))
 
 
 def _turn(before: Arm, after: Arm) -> Turn:
+    """Classify the turn from one arm to another."""
     angle = float(wrap(after.base.heading - before.base.heading - math.pi))
     if abs(angle) < math.pi / 4:
         return Turn.STRAIGHT
     return Turn.LEFT if angle > 0 else Turn.RIGHT
 
 
-def _connector(draft: Draft, before: int, after: int, ends_m: tuple[float, float]) -> int:
+def _add_connector(draft: Draft, before: int, after: int, ends_m: tuple[float, float]) -> int:
+    """Add a connector between lanes, straight over the distances ``ends_m`` from the stop lines to the mouths."""
     a, b = draft.lanes[before], draft.lanes[after]
     # The bend lies between the mouths: a turn from the stop line would cut the corner.
     first = straight(a.curve.end, ends_m[0])
@@ -307,7 +308,7 @@ def _connector(draft: Draft, before: int, after: int, ends_m: tuple[float, float
 
 
 def starts(draft: Draft, lanes: Sequence[int]) -> tuple[Start, ...]:
-    """Starts on inward lanes; a repeated lane is drawn more often."""
+    """Return starts on inward lanes; a repeated lane is drawn more often."""
     result = []
     for index in lanes:
         length, limit = draft.lanes[index].length_m, draft.lanes[index].limit_mps
@@ -315,7 +316,7 @@ def starts(draft: Draft, lanes: Sequence[int]) -> tuple[Start, ...]:
     return tuple(result)
 
 
-#: An approach by the number of its site and its own.
+#: An approach: number of its site, and its number there.
 Place = tuple[int, int]
 
 
@@ -339,12 +340,12 @@ def finish_sites(
     for number, site in enumerate(sites):
         for i, approach in enumerate(site.approaches):
             if links.get((number, i), (number, i)) >= (number, i):
-                _paint(draft, approach.arm.street, approach.middle)
+                _add_markings(draft, approach.arm.street, approach.middle)
         _add_crossings(draft, site)
 
 
 def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: Place) -> tuple[Curve, Place]:
-    """Edge from one end of the map to the next: in along an arm's left, around the corners, out along a right."""
+    """Return the edge from one end of the map to the next: left of an arm inwards, round corners, right of an arm."""
 
     def approach(place: Place) -> Approach:
         return sites[place[0]].approaches[place[1]]
@@ -360,7 +361,7 @@ def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: 
         end = links[after]
 
 
-def _paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
+def _add_markings(draft: Draft, street: CrossSection, middle: Curve) -> None:
     """Add the markings of a street."""
     draft.mark(RoadKind.LINE_SOLID_DOUBLE_YELLOW, middle)
     for side, count in ((1.0, street.inward), (-1.0, street.outward)):

@@ -24,10 +24,10 @@ from drivax.synthetic.roads.families.junction_layout import (
     Reach,
     Site,
     Turn,
+    add_lanes,
     connect,
     draw_street,
     finish_sites,
-    lay_lanes,
     open_approach,
     open_crossroads,
     open_site,
@@ -41,7 +41,7 @@ from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 _SIGNAL_LAYOUTS: Layouts = ((1, 1, 0.35), (2, 1, 0.15), (2, 2, 0.38), (3, 2, 0.12))
 #: Layouts of the main road at unprotected left turns; the left lane is for turning left.
 _LEFT_LAYOUTS: Layouts = ((2, 1, 0.4), (2, 2, 0.3), (3, 2, 0.3))
-#: The left-turn lane is this many times as likely to be ego's as another one.
+#: Weight of a start in the left-turn lane relative to one in another lane.
 _LEFT_WEIGHT = 4
 #: Kinds of junctions in a corridor and their shares.
 _LIGHTS, _SIDE_ROAD = "lights", "side_road"
@@ -80,7 +80,7 @@ class LeftTurns:
 def set_lights(
     rng: np.random.Generator, draft: Draft, site: Site, lefts: list[LeftTurns], green_s: tuple[float, float]
 ) -> SignalPlan:
-    """Set the lights of a four-way junction: one or two phases for approaches 0 and 2, then for 1 and 3.
+    """Set the lights of a four-way junction: phases for approaches 0 and 2, then for 1 and 3.
 
     ``lefts`` has the left turns of both pairs of approaches, ``green_s`` the least and the largest green time.
     """
@@ -102,10 +102,10 @@ def set_lights(
             [[m for m in approach if (m.turn == Turn.LEFT) is turning] for approach in approaches]
             for turning in (True, False)
         )
-        if turns.protected and _apart(left, conflicts) and _apart(other, conflicts):
+        if turns.protected and _are_separate(left, conflicts) and _are_separate(other, conflicts):
             phase(*left, arrow=True)
             phase(*other)
-        elif turns.permissive and _apart(other, conflicts):
+        elif turns.permissive and _are_separate(other, conflicts):
             phase(*approaches)
         else:
             for approach in approaches:
@@ -117,7 +117,7 @@ def set_lights(
 def _yields_to(
     move: Move, others: Sequence[Move], conflicts: Conflicts, major: Sequence[int]
 ) -> tuple[int, ...]:
-    """Conflicting moves with right of way: by priority road, then turn, then approach."""
+    """Return the conflicting moves with right of way: by priority road, then turn, then approach."""
 
     def order(m: Move) -> tuple[bool, Turn, int]:
         return m.arm not in major, m.turn, m.arm
@@ -125,7 +125,8 @@ def _yields_to(
     return tuple(m.lane for m in others if conflicts[move.lane, m.lane] and order(m) < order(move))
 
 
-def _apart(approaches: list[list[Move]], conflicts: Conflicts) -> bool:
+def _are_separate(approaches: list[list[Move]], conflicts: Conflicts) -> bool:
+    """Whether no moves of two approaches are in conflict."""
     a, b = approaches
     return not any(conflicts[x.lane, y.lane] for x in a for y in b)
 
@@ -274,9 +275,9 @@ class UnprotectedLeft:
         else:
             set_priorities(draft, site, (0, 2), Control.STOP)
         inward = [site.approaches[i].inward for i in (0, 2)]
-        chosen = [lane for left, *others in inward for lane in [left] * _LEFT_WEIGHT + others]
+        start_lanes = [lane for left, *others in inward for lane in [left] * _LEFT_WEIGHT + others]
         oncoming = tuple(lane for lanes in inward for lane in lanes[1:])
-        return replace(draft.network(self.name, starts(draft, chosen), signals), busy=oncoming)
+        return replace(draft.network(self.name, starts(draft, start_lanes), signals), busy=oncoming)
 
 
 @dataclass(frozen=True)
@@ -319,7 +320,7 @@ class Corridor:
     green when vehicles arrive that left the first one at the beginning of green.
 
     Attributes:
-        side_reach: Shape of side roads: nearly straight, so that those of both junctions stay apart.
+        side_reach: Shape of side roads: nearly straight, which keeps those of both junctions separate.
         between_m: Length of the road between the stop lines of both junctions, low and high.
         left_lane_share: Share of left-turn lanes at lights of two-lane roads.
         protected_share: Share of protected left turns at lights with left-turn lanes.
@@ -343,24 +344,27 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        first = self._plot(rng, style, main).move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
-        middle = self._between(rng, first.gate)
-        second = self._plot(rng, style, main).move_to(middle.end.turned())
+        first = self._draw_plot(rng, style, main).move_to(
+            Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
+        )
+        middle = self._draw_middle(rng, first.gate)
+        second = self._draw_plot(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
-        sites = self._sites(rng, draft, (first, second), middle)
+        sites = self._add_sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
         pairs = list(zip((first, second), sites, strict=True))
         plans = [self._set_right_of_way(rng, draft, *pair) for pair in pairs]
-        chosen = [
+        start_lanes = [
             lane
             for plot, site in pairs
             for i, approach in enumerate(site.approaches[1:], 1)
             for lane in approach.inward * (_MAIN_WEIGHT if i in plot.main else 1)
         ]
         travel = (float(middle.arc_m[-1]) + first.mouths[0] + second.mouths[0]) / (_PLATOON * main.limit_mps)
-        return draft.network(self.name, starts(draft, chosen), self._signals(rng, plans, travel))
+        return draft.network(self.name, starts(draft, start_lanes), self._combine_signals(rng, plans, travel))
 
-    def _plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
+    def _draw_plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
+        """Draw the kind and the arms of a junction."""
         kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
         side_limit_mps = min(main.limit_mps, float(rng.choice(style.limits_mps)))
@@ -374,13 +378,14 @@ class Corridor:
         left_only = kind == _LIGHTS and main.inward > 1 and bool(rng.random() < self.left_lane_share)
         return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
 
-    def _between(self, rng: np.random.Generator, gate: Pose) -> Curve:
+    def _draw_middle(self, rng: np.random.Generator, gate: Pose) -> Curve:
+        """Draw the middle line between the junctions: bent, with straight ends."""
         near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
         shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
         bent = draw_winding_curve(rng, length, start=near.end, **shape)
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
-    def _sites(
+    def _add_sites(
         self, rng: np.random.Generator, draft: Draft, plots: tuple[_Plot, _Plot], middle: Curve
     ) -> list[Site]:
         """Add the shared road, then the other arms and the connectors of both junctions."""
@@ -390,10 +395,10 @@ class Corridor:
             middle,
             straight(middle.end, far.arms[0].street.stop_line_m),
         )
-        there, back = lay_lanes(draft, near.arms[0].street, middle)[::-1]
+        inward, outward = add_lanes(draft, near.arms[0].street, middle)
         shared = (
-            Approach(near.arms[0], near.mouths[0], middle, side, back, there),
-            Approach(far.arms[0], far.mouths[0], middle.reversed(), side.reversed(), there, back),
+            Approach(near.arms[0], near.mouths[0], middle, side, inward, outward),
+            Approach(far.arms[0], far.mouths[0], middle.reversed(), side.reversed(), outward, inward),
         )
         sites = []
         for plot, first in zip(plots, shared, strict=True):
@@ -416,9 +421,10 @@ class Corridor:
         lefts = [LeftTurns(protected, permissive=True), LeftTurns(protected=False, permissive=True)]
         return set_lights(rng, draft, site, lefts, self.green_s)
 
-    def _signals(
+    def _combine_signals(
         self, rng: np.random.Generator, plans: Sequence[SignalPlan | None], travel_s: float
     ) -> SignalPlan | None:
+        """Combine the plans of both junctions, coordinated or not."""
         first, second = plans
         if first is None or second is None:
             return first or second

@@ -46,7 +46,7 @@ _SPLITTER_M = (13.0, 42.0)
 _CROSSING_M = 6.5
 #: Distance from a kerb to the adjacent lane, m.
 _KERB_M = 0.4
-#: Least length of the circle between an entry and the next exit, m: vehicles on them are clear of each other.
+#: Least length of the circle between an entry and the next exit, m, which keeps vehicles on them clear of each other.
 _ARC_M = 3.3
 
 
@@ -114,15 +114,15 @@ class Roundabout:
         plan = self._plan(rng, style)
         draft = Draft()
         arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
-        chains = _go_round(draft, plan, arms, self.circle_mps)
+        chains = _add_circles(draft, plan, arms, self.circle_mps)
         _set_priorities(draft)
         sidewalk_m = float(rng.uniform(1.2, 2.0)) if rng.random() < style.sidewalk_share else None
         _add_boundary(draft, plan, chains, sidewalk_m)
         _add_islands(draft, plan, arms)
         marked = bool(rng.random() < self.marked_share)
         for arm in arms:
-            _paint(draft, plan, arm)
-            _cross(draft, plan, arm, marked)
+            _add_markings(draft, plan, arm)
+            _add_crossing(draft, plan, arm, marked)
         lengths = {lane: draft.lanes[lane].length_m for arm in arms for lane in arm.inward}
         starts = tuple(Start(lane, length - 85.0, length - 12.0) for lane, length in lengths.items())
         return draft.network(self.name, starts)
@@ -134,7 +134,9 @@ class Roundabout:
         circle, gap = width + float(rng.uniform(0.7, 1.2)), float(rng.uniform(*self.gap_m))
         outer = float(rng.uniform(*self.radius_m[lanes - 1]))
         radius = [outer - circle * (lanes - 1 - j) for j in range(lanes)]
-        join, reach = zip(*(_join(r, gap / 2 + (j + 0.5) * width) for j, r in enumerate(radius)), strict=True)
+        join, reach = zip(
+            *(_solve_join(r, gap / 2 + (j + 0.5) * width) for j, r in enumerate(radius)), strict=True
+        )
         limits = [limit for limit in style.limits_mps if limit <= self.limit_mps]
         return _Plan(
             radius_m=tuple(radius),
@@ -171,25 +173,27 @@ class Roundabout:
         return _Arm(heading, middle, inward, outward)
 
 
-def _join(radius: float, lateral: float) -> tuple[float, float]:
-    """Angle from an arm at which its lane joins the circle, and distance from the centre at which the bend begins.
+def _solve_join(radius: float, lateral: float) -> tuple[float, float]:
+    """Find the angle from an arm at which its lane joins the circle, and the distance at which the bend begins.
 
     The arm's lane (at a distance ``lateral`` from the arm) and the circle's tangent at angle d intersect at a distance
-    ``t = (r sin d - aside) / cos d`` from the circle; a fillet with that tangent has the radius ``t / tan(45 - d/2)``.
+    ``t = (r sin d - lateral) / cos d`` from the circle; its fillet has the radius ``t / tan(45 - d/2)``.
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
     tangents = (radius * np.sin(angles) - lateral) / np.cos(angles)
     wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
-    chosen = int(np.argmax(wide)) if wide.any() else -1
-    angle, tangent = float(angles[chosen]), float(tangents[chosen])
+    index = int(np.argmax(wide)) if wide.any() else -1
+    angle, tangent = float(angles[index]), float(tangents[index])
     return angle, (radius - lateral * math.sin(angle)) / math.cos(angle) + tangent
 
 
 def _on_circle(radius: float, angle: float) -> Pose:
+    """Return the pose on a circle at an angle."""
     return Pose(radius * math.cos(angle), radius * math.sin(angle), angle + math.pi / 2)
 
 
 def _arc(radius: float, begin: float, end: float) -> Curve:
+    """Return the arc of a circle between two angles."""
     count = max(4, math.ceil(radius * (end - begin) / STEP_M) + 1)
     step = (end - begin) / (count - 1)
     # Steps are chords: the samples lie on the circle.
@@ -197,7 +201,7 @@ def _arc(radius: float, begin: float, end: float) -> Curve:
     return from_curvature(np.full(count, step / chord), chord, _on_circle(radius, begin))
 
 
-def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list[list[Curve]]:
+def _add_circles(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list[list[Curve]]:
     """Add entries, exits and circles; return the outermost curves from each arm to the next one."""
     chains: list[list[Curve]] = []
     for j, (radius, join) in enumerate(zip(plan.radius_m, plan.join, strict=True)):
@@ -264,7 +268,8 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
     draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
-def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
+def _add_markings(draft: Draft, plan: _Plan, arm: _Arm) -> None:
+    """Add the markings of an arm."""
     spread, lanes = plan.spread_m(arm.middle), len(arm.inward)
     for side in (-1.0, 1.0):
         draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.offset_by(side * (spread + 0.08)))
@@ -273,7 +278,7 @@ def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
             draft.mark(kind, arm.middle.offset_by(side * (spread + j * plan.width_m)))
 
 
-def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
+def _add_crossing(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
     """Add the crossing of an arm, a car's length before the yield line."""
     half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
     mouth = arm.middle.start

@@ -29,9 +29,9 @@ class Strip:
         place: -1 is the first lane right of the middle line, -2 the next one, 1 the first one to the left.
         forward: Whether traffic goes along the middle line or against it.
         first, last: Range of its sections, ``last`` excluded.
-        fork: It branches off from the strip nearer to the middle in the section before ``first``.
-        ends: Its last lane ends while the road continues and narrows.
-        exit_only: It leads off the road at its end.
+        fork: Whether it branches off from the strip nearer to the middle in the section before ``first``.
+        ends: Whether its last lane ends while the road continues and narrows.
+        exit_only: Whether it leads off the road at its end.
     """
 
     place: int
@@ -44,7 +44,7 @@ class Strip:
 
 
 def strips(ahead: int, back: int, sections: int) -> tuple[Strip, ...]:
-    """Strips over the whole length: lanes ahead right of the middle line, opposite lanes to the left of it."""
+    """Return strips over the whole length: lanes ahead on the right of the middle line, opposite ones on the left."""
     forward = [Strip(-j - 1, True, 0, sections) for j in range(ahead)]
     return (*forward, *(Strip(j + 1, False, 0, sections) for j in range(back)))
 
@@ -95,7 +95,7 @@ class Street:
         return right + self.shoulder_m + self.rows_m[0], left + self.shoulder_m + self.rows_m[1]
 
     def presence(self, strip: Strip) -> Float64[np.ndarray, " point"]:
-        """Share of a strip's width at every sample: it grows along a fork and shrinks on a taper."""
+        """Return the share of a strip's width at every sample, which grows along a fork and shrinks on a taper."""
         index = np.arange(len(self.middle.xy))
         inside = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
         present = inside.astype(float)
@@ -103,23 +103,23 @@ class Street:
             begin, end = self.cuts[strip.first - 1], self.cuts[strip.first]
             present = np.where(index < end, smooth_step((index - begin) / (end - begin)), present)
         if strip.ends:
-            beyond = (index - self.cuts[strip.last]) * STEP_M / self.taper_m
-            present = np.where(beyond > 0, 1.0 - smooth_step(beyond), present)
+            taper = (index - self.cuts[strip.last]) * STEP_M / self.taper_m
+            present = np.where(taper > 0, 1.0 - smooth_step(taper), present)
         return present
 
     def build(self) -> None:
         """Add the lanes, the edges and the markings."""
-        self.lay()
+        self.add_lanes()
         right, left = self.edge_m
         outer = ring(self.middle.offset_by(-right), self.middle.offset_by(left).reversed())
         self.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
-        self.divide()
+        self.add_median()
         for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
             if reach[0] > self.median_m / 2:
                 self.draft.mark(RoadKind.LINE_SOLID_SINGLE_WHITE, self.middle.offset_by(side * reach))
-        self.paint_inside()
+        self.add_markings()
 
-    def lay(self) -> None:
+    def add_lanes(self) -> None:
         """Add all lanes with their links."""
         for strip in self.strips:
             line = self.middle.parallel(self.offset_m(strip.place))
@@ -139,7 +139,7 @@ class Street:
         for strip in self.strips:
             self._link_neighbours(strip)
             if strip.fork:
-                self._fork(strip)
+                self._add_fork(strip)
 
     def network(self, name: str) -> RoadNetwork:
         """Return the network; ego starts in the second half of the second section of any lane ahead."""
@@ -158,7 +158,7 @@ class Street:
             pair = self.lanes[strip.place, k], self.lanes[index, k]
             self.draft.link_neighbours(*(pair if strip.forward else pair[::-1]))
 
-    def _fork(self, strip: Strip) -> None:
+    def _add_fork(self, strip: Strip) -> None:
         """Add the lane by which a strip branches off from its neighbour nearer to the middle line."""
         inner = strip.place - int(np.sign(strip.place))
         k, offset = strip.first - 1, self.offset_m(inner)
@@ -170,7 +170,7 @@ class Street:
         self.draft.link(lane, self.lanes[strip.place, strip.first])
         self.lanes[strip.place, k] = lane
 
-    def divide(self) -> None:
+    def add_median(self) -> None:
         """Add the median, if any; traffic may pass around its ends."""
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
@@ -178,7 +178,7 @@ class Street:
             island = ring(inner.parallel(half), inner.parallel(-half).reversed())
             self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
-    def paint_inside(self) -> None:
+    def add_markings(self) -> None:
         """Add the markings: white between lanes of one direction, yellow between directions."""
         for strip in self.strips:
             inner = strip.place - int(np.sign(strip.place))
@@ -186,9 +186,10 @@ class Street:
                 lateral = self.offset_m(strip.place) + (0.5 if inner < 0 else -0.5) * self.width_m
                 line = self.middle.piece(self.cuts[strip.first], self.cuts[strip.last]).parallel(lateral)
                 self.draft.mark(RoadKind.LINE_BROKEN_SINGLE_WHITE, line)
-        self._paint_middle()
+        self._mark_middle()
 
-    def _paint_middle(self) -> None:
+    def _mark_middle(self) -> None:
+        """Add the markings along the middle line."""
         one_way = len({strip.forward for strip in self.strips}) == 1
         left = [strip for strip in self.strips if strip.place > 0]
         kind, lines = RoadKind.LINE_SOLID_SINGLE_YELLOW, [self.middle]
@@ -207,10 +208,13 @@ class Street:
     def add_sidewalks(self, rng: np.random.Generator) -> None:
         """Add a sidewalk on both sides, 1.2 to 2.5 m outside the edges."""
         right, left = self.edge_m
-        away = float(rng.uniform(1.2, 2.5))
-        self.draft.sidewalks += [self.middle.offset_by(-right - away), self.middle.offset_by(left + away)]
+        distance_m = float(rng.uniform(1.2, 2.5))
+        self.draft.sidewalks += [
+            self.middle.offset_by(-right - distance_m),
+            self.middle.offset_by(left + distance_m),
+        ]
 
-    def cross(self, at: int, marked: bool) -> None:
+    def add_crossing(self, at: int, marked: bool) -> None:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
         current, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
         section = self._section(at)
@@ -222,7 +226,7 @@ class Street:
             self.draft.crosswalk(near.aside(right), near.aside(left), far.aside(left), far.aside(right))
 
     def _on_lane(self, place: int, section: int, at: int) -> tuple[int, float]:
-        """Lane of a section, and the distance along it at sample ``at`` of the middle line, m."""
+        """Return the lane of a section, and the distance along it at sample ``at`` of the middle line, m."""
         lane = self.lanes[place, section]
         index = at - self.cuts[section] if self._forward(place) else self.cuts[section + 1] - at
         return lane, float(self.draft.lanes[lane].curve.arc_m[index])
@@ -233,7 +237,7 @@ class Street:
     def _forward(self, place: int) -> bool:
         return next(strip.forward for strip in self.strips if strip.place == place)
 
-    def park(self, margin_m: float, rng: np.random.Generator) -> None:
+    def add_bays(self, margin_m: float, rng: np.random.Generator) -> None:
         """Add bays in the parking rows, away from the road's ends, with gaps for driveways and at crossings."""
         end_m = STEP_M * self.cuts[-1] - margin_m
         for side, row in zip((-1, 1), self.rows_m, strict=True):
@@ -250,16 +254,16 @@ class Street:
                     position += float(rng.uniform(4.0, 9.0))
                     continue
                 room = pitch / float(stretch[round((position + pitch / 2) / STEP_M)])
-                self._bay(outer, lateral, position + room / 2, pitch)
+                self._add_bay(outer, lateral, position + room / 2, pitch)
                 position += room
 
-    def _bay(self, place: int, lateral: float, at_m: float, length_m: float) -> None:
+    def _add_bay(self, place: int, lateral: float, at_m: float, length_m: float) -> None:
         sample = round(at_m / STEP_M)
         pose = self.middle.pose(sample).aside(lateral)
-        # Bays do not hide crossings.
+        # Keep the view of crossings free.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
-        to = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
-        if not any(np.hypot(*d) < 30.0 and abs(d @ along) < _BAY_CLEAR_M for d in to):
+        offsets = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
+        if not any(np.hypot(*offset) < 30.0 and abs(offset @ along) < _BAY_CLEAR_M for offset in offsets):
             pose = pose if self._forward(place) else pose.turned()
             self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(sample), sample)))
 

@@ -58,7 +58,7 @@ class CurvedRoad(StreetFamily):
         street.build()
         if rng.random() < style.sidewalk_share:
             street.add_sidewalks(rng)
-        street.park(20.0, rng)
+        street.add_bays(20.0, rng)
         return street.network(self.name)
 
 
@@ -159,8 +159,8 @@ class MidblockCrosswalk(StreetFamily):
             else [position]
         )
         for station in stations:
-            street.cross(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
-        street.park(20.0, rng)
+            street.add_crossing(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
+        street.add_bays(20.0, rng)
         return street.network(self.name)
 
 
@@ -199,8 +199,8 @@ class ParkedStreet(StreetFamily):
         street.add_sidewalks(rng)
         if rng.random() < self.crossing_share:
             sample = round(float(rng.uniform(170.0, 250.0)) / STEP_M)
-            street.cross(sample, marked=bool(rng.random() < 0.5))
-        street.park(15.0, rng)
+            street.add_crossing(sample, marked=bool(rng.random() < 0.5))
+        street.add_bays(15.0, rng)
         return street.network(self.name)
 
 
@@ -263,14 +263,14 @@ class Highway(StreetFamily):
             taper_m=float(rng.uniform(50.0, 90.0)),
             kind=RoadKind.LANE_FREEWAY,
         )
-        street.lay()
-        on = None if extra.fork else self._ramp(rng, street, extra, away=-1)
-        off = self._ramp(rng, street, extra, away=1) if extra.exit_only else None
-        _edges(street, extra, on, off)
-        _paint(street, extra, on, off)
+        street.add_lanes()
+        on_ramp = None if extra.fork else self._ramp(rng, street, extra, direction=-1)
+        off_ramp = self._ramp(rng, street, extra, direction=1) if extra.exit_only else None
+        _add_boundary(street, extra, on_ramp, off_ramp)
+        _add_markings(street, extra, on_ramp, off_ramp)
         starts = [Start(street.lanes[-j - 1, 2], 20.0, 65.0) for j in range(lanes)]
-        if on is not None:
-            starts += [Start(on.lane, self.ramp_m[0] - 110.0, self.ramp_m[0] - 30.0)] * 2
+        if on_ramp is not None:
+            starts += [Start(on_ramp.lane, self.ramp_m[0] - 110.0, self.ramp_m[0] - 30.0)] * 2
         return street.draft.network(self.name, tuple(starts))
 
     def _draw_auxiliary_lane(self, rng: np.random.Generator, lanes: int) -> Strip:
@@ -283,31 +283,32 @@ class Highway(StreetFamily):
             return Strip(index, True, 4, 3 + length, fork=True, exit_only=True)
         return Strip(index, True, 3, 3 + length, exit_only=True)
 
-    def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, away: int) -> _Ramp:
-        """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
-        auxiliary = street.lanes[extra.place, extra.first if away < 0 else extra.last - 1]
-        cut = street.cuts[extra.first if away < 0 else extra.last]
-        length = self.ramp_m[0 if away < 0 else 1]
+    def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, direction: int) -> _Ramp:
+        """Add a ramp at the beginning of the auxiliary lane (``direction`` -1) or at its end (1)."""
+        auxiliary = street.lanes[extra.place, extra.first if direction < 0 else extra.last - 1]
+        cut = street.cuts[extra.first if direction < 0 else extra.last]
+        length = self.ramp_m[0 if direction < 0 else 1]
         line = street.draft.lanes[auxiliary].curve
-        gore = line.start.turned() if away < 0 else line.end
+        gore = line.start.turned() if direction < 0 else line.end
         # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
-        side = np.gradient(street.middle.heading, STEP_M)[cut::away][: round(length / STEP_M) + 1] * away
+        curvature = np.gradient(street.middle.heading, STEP_M)[cut::direction] * direction
+        side = curvature[: round(length / STEP_M) + 1]
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
-        outward = from_curvature(side - away * bend, STEP_M, gore)
-        curve = outward if away > 0 else outward.reversed()
+        outward = from_curvature(side - direction * bend, STEP_M, gore)
+        curve = outward if direction > 0 else outward.reversed()
         limit = street.limit_mps * float(rng.uniform(*self.ramp_limit))
-        lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=away > 0)
-        street.draft.link(*((lane, auxiliary) if away < 0 else (auxiliary, lane)))
+        lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=direction > 0)
+        street.draft.link(*((lane, auxiliary) if direction < 0 else (auxiliary, lane)))
         half = street.width_m / 2
         left, right = curve.parallel(half + _RAMP_SHOULDER_M), curve.parallel(-half - street.shoulder_m)
-        nose, sample = _nose(street, extra, left if away > 0 else left.reversed())
+        nose, sample = _nose(street, extra, left if direction > 0 else left.reversed())
         last = len(left.xy) - 1
-        left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
+        left = left.piece(nose, last) if direction > 0 else left.piece(0, last - nose)
         return _Ramp(lane, left, right, sample)
 
 
 def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray, " point"]:
-    """Curvature that rises to 1 / radius, holds, and falls, and integrates to an angle."""
+    """Return the curvature of a bend by an angle: it rises to 1 / radius, is constant, and falls."""
     hold = max(0.0, angle * radius_m - _EASING_M)
     knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
     position = STEP_M * np.arange(round(length_m / STEP_M) + 1)
@@ -316,13 +317,13 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
 
 
 def _main_edge(street: Street, extra: Strip) -> Curve:
-    """Right edge of the highway without its auxiliary lane."""
+    """Return the right edge of the highway without its auxiliary lane."""
     reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
     return street.middle.offset_by(-reach)
 
 
 def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
-    """First sample of a ramp's left edge beyond the highway's edge, and the nearest sample of that edge."""
+    """Find the first sample of a ramp's left edge beyond the highway's edge, and the nearest sample of that edge."""
     edge = _main_edge(street, extra)
     # The nose lies within 150 m of the beginning of the ramp.
     span = round(150.0 / STEP_M)
@@ -330,43 +331,44 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
     first, points = max(0, gore - span), left.xy[:span]
     window = edge.xy[first : gore + span]
     near = first + np.argmin(np.sum((points[:, None] - window[None]) ** 2, axis=-1), axis=1)
-    to = points - edge.xy[near]
-    lateral = -to[:, 0] * np.sin(edge.heading[near]) + to[:, 1] * np.cos(edge.heading[near])
+    dx, dy = (points - edge.xy[near]).T
+    lateral = -dx * np.sin(edge.heading[near]) + dy * np.cos(edge.heading[near])
     sample = int(np.argmax(lateral < -0.05))
     return sample, int(near[sample])
 
 
-def _edges(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
+def _add_boundary(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
     """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
     main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
-    parts, begin = [], 0
-    if on is not None:
+    pieces, begin = [], 0
+    if on_ramp is not None:
         begin = street.cuts[extra.first]
-        parts += [main.piece(0, on.nose - 2), on.left.reversed(), on.right]
-    end = last if off is None else street.cuts[extra.last]
-    parts.append(full.piece(begin, end))
-    if off is not None:
-        parts += [off.right, off.left.reversed(), main.piece(off.nose + 2, last)]
-    parts.append(street.middle.offset_by(left).reversed())
-    street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*parts)))
-    street.divide()
+        pieces += [main.piece(0, on_ramp.nose - 2), on_ramp.left.reversed(), on_ramp.right]
+    end = last if off_ramp is None else street.cuts[extra.last]
+    pieces.append(full.piece(begin, end))
+    if off_ramp is not None:
+        pieces += [off_ramp.right, off_ramp.left.reversed(), main.piece(off_ramp.nose + 2, last)]
+    pieces.append(street.middle.offset_by(left).reversed())
+    street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*pieces)))
+    street.add_median()
 
 
-def _paint(street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
-    street.paint_inside()
+def _add_markings(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
+    """Add the markings of the highway and its ramps."""
+    street.add_markings()
     inset = replace(street, shoulder_m=0.1)
     right, left = inset.edge_m
     main, last = _main_edge(inset, extra), len(right) - 1
-    begin = 0 if on is None else street.cuts[extra.first]
-    end = last if off is None else street.cuts[extra.last]
-    lines = [] if on is None else [main.piece(0, on.nose)]
+    begin = 0 if on_ramp is None else street.cuts[extra.first]
+    end = last if off_ramp is None else street.cuts[extra.last]
+    lines = [] if on_ramp is None else [main.piece(0, on_ramp.nose)]
     lines.append(street.middle.offset_by(-right).piece(begin, end))
-    if off is not None:
-        lines.append(main.piece(off.nose, last))
+    if off_ramp is not None:
+        lines.append(main.piece(off_ramp.nose, last))
     if any(strip.place > 0 for strip in street.strips):
         lines.append(street.middle.offset_by(left))
-    for ramp in (on, off):
+    for ramp in (on_ramp, off_ramp):
         if ramp is not None:
             lines += [ramp.left.parallel(-_RAMP_SHOULDER_M), ramp.right.parallel(street.shoulder_m)]
     for line in lines:
