@@ -12,17 +12,17 @@ WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed$(ACCELERATOR)
-JAX := $(shell sed -n 's/^jax==//p' requirements.lock)
+JAX := $(shell sed -n 's/^jax==\([^ ]*\).*/\1/p' requirements.lock)
 
 # Each process takes neighbouring files, because the tests of a file share compiled programs.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test test-all coverage lint docs bench setup hooks clean
+.PHONY: help demo test test-all coverage lint docs bench setup lock hooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
-	@echo "targets: demo  test  test-all  coverage  lint  docs  bench  setup  hooks  clean"
+	@echo "targets: demo  test  test-all  coverage  lint  docs  bench  setup  lock  hooks  clean"
 
 setup: $(STAMP)
 
@@ -62,6 +62,14 @@ lint: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+# Versions stay as they are unless ARGS=--upgrade or ARGS="--upgrade-package NAME".
+LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
+
+lock: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(LOCK) $(ARGS) pyproject.toml --extra all --group dev --output-file requirements.lock
+	$(LOCK) $(ARGS) --group docs --constraint requirements.lock --output-file requirements-docs.lock
 
 hooks: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check pre-commit

@@ -6,9 +6,14 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.markers import Marker
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 #: Rooms that are pure functions on arrays: nothing but these, the standard library and rooms below.
 PURE_ROOMS = ("geometry", "scenario", "simulator", "metrics", "tasks", "rl")
@@ -152,6 +157,63 @@ def test_episodes_and_tables_of_experiments_are_not_tracked(repository: Path):
     )
 
 
-def test_lock_file_pins_exactly(repository: Path):
-    for line in (repository / "requirements.lock").read_text().splitlines():
-        assert re.fullmatch(r"[A-Za-z0-9_.\-\[\]]+==[A-Za-z0-9_.+!]+( ; .+)?", line), line
+#: ``name==version`` with an optional marker, and one or more hashes on lines of their own.
+PIN = re.compile(
+    r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[\w.+!]+)(?P<marker> ; [^\\\n]+)?"
+    r"( \\\n    --hash=sha256:[0-9a-f]{64})+\n"
+)
+
+
+def pins(path: Path) -> dict[str, str]:
+    """Versions of a lock file by normal name, of the packages that this machine needs."""
+    return {
+        canonicalize_name(pin["name"]): pin["version"]
+        for pin in PIN.finditer(path.read_text())
+        if not pin["marker"] or Marker(pin["marker"].removeprefix(" ; ")).evaluate()
+    }
+
+
+def unmet(requirement: Requirement, versions: dict[str, str]) -> set[str]:
+    """The requirement, and what its package needs in turn, as far as the versions do not meet it."""
+    found, waiting, seen = set(), [requirement], set()
+    while waiting:
+        needed = waiting.pop()
+        version = versions.get(canonicalize_name(needed.name))
+        if version is None or not needed.specifier.contains(version, prereleases=True):
+            found.add(str(needed))
+        elif str(needed) not in seen:
+            assert metadata.version(needed.name) == version, f"install the lock file: {needed.name} {version}"
+            seen.add(str(needed))
+            for line in map(Requirement, metadata.requires(needed.name) or ()):
+                extras = ("", *needed.extras)
+                if line.marker is None or any(line.marker.evaluate({"extra": extra}) for extra in extras):
+                    waiting.append(line)
+    return found
+
+
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-docs.lock"])
+def test_lock_files_pin_exactly_with_hashes_and_name_no_index(name: str, repository: Path):
+    text = (repository / name).read_text()
+    assert PIN.sub("", text) == "", "something else than pins with hashes"
+    assert len(pins(repository / name)) > 20
+
+
+def test_lock_file_meets_every_requirement_of_the_project(repository: Path):
+    """pip refuses a file with hashes if any requirement, direct or indirect, is missing from it."""
+    project = tomllib.loads((repository / "pyproject.toml").read_text())
+    extras = project["project"]["optional-dependencies"]
+    lines = [*project["project"]["dependencies"], *project["dependency-groups"]["dev"]]
+    lines += [line for name in extras if name != "all" for line in extras[name]]
+    assert Requirement(extras["all"][0]).extras == extras.keys() - {"all"}
+    versions = pins(repository / "requirements.lock")
+    assert {found for line in lines for found in unmet(Requirement(line), versions)} == set()
+    assert unmet(Requirement("numpy<2"), versions) == {"numpy<2"}
+    del versions["optax"]
+    assert [line.split(">")[0] for line in unmet(Requirement("flax"), versions)] == ["optax"]
+
+
+def test_lock_files_agree(repository: Path):
+    """The documentation is built in the environment of the tests."""
+    one, other = (pins(repository / name) for name in ("requirements.lock", "requirements-docs.lock"))
+    shared = one.keys() & other.keys()
+    assert shared and {name: one[name] for name in shared} == {name: other[name] for name in shared}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import shutil
 import site
 import subprocess
 import sys
+import tarfile
 import zipfile
 from email.parser import Parser
 from pathlib import Path
@@ -14,23 +17,18 @@ from pathlib import Path
 import pytest
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [
-        sys.executable,
-        "-m",
-        "build",
-        "--wheel",
-        "--no-isolation",
-        "--outdir",
-        str(folder),
-        str(repository),
-    ]
+def build(tree: Path, folder: Path, *options: str) -> Path:
+    """Build a tree into a folder, and return the wheel."""
+    command = [sys.executable, "-m", "build", *options, "--no-isolation", "--outdir", str(folder), str(tree)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     (built,) = folder.glob("*.whl")
     return built
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path:
+    return build(repository, tmp_path_factory.mktemp("wheel"), "--wheel")
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +64,45 @@ def test_content(wheel: Path, repository: Path):
     tops = {name.split("/")[0] for name in names}
     assert len(tops) == 2, tops  # the package and its metadata
     assert not [name for name in names if "test" in Path(name).name or name.endswith(".pyc")]
+
+
+@pytest.mark.slow
+def test_wheel_and_sdist_are_reproducible_byte_for_byte(wheel: Path, repository: Path, tmp_path: Path):
+    """Two copies in other folders, with other times, modes and umask; the wheels come from the sdists."""
+    names = [
+        "src",
+        "configs",
+        "tests",
+        "examples",
+        "experiments",
+        "docs",
+        "pyproject.toml",
+        "requirements.lock",
+    ]
+    names += [*(path.name for path in repository.glob("*.md")), "LICENSE", "Makefile", ".gitignore"]
+    wheels, archives = [], []
+    for number, (umask, mode) in enumerate([(0o022, 0o644), (0o077, 0o600)]):
+        before = os.umask(umask)
+        try:
+            tree = tmp_path / ("tree" * (number + 1))
+            for name in sorted(names, reverse=bool(number)):
+                source, target = repository / name, tree / name
+                target.parent.mkdir(exist_ok=True)
+                ignore = shutil.ignore_patterns("__pycache__")
+                shutil.copytree(source, target, ignore=ignore) if source.is_dir() else shutil.copy(
+                    source, target
+                )
+            for path in filter(Path.is_file, tree.rglob("*")):
+                path.chmod(mode)
+                os.utime(path, (1e9 + 1e8 * number, 1e9 + 1e8 * number))
+            wheels.append(build(tree, tmp_path / f"out-{number}"))
+            archives.extend((tmp_path / f"out-{number}").glob("*.tar.gz"))
+        finally:
+            os.umask(before)
+    assert len({hashlib.sha256(path.read_bytes()).hexdigest() for path in archives}) == 1
+    assert len({hashlib.sha256(path.read_bytes()).hexdigest() for path in [wheel, *wheels]}) == 1
+    with tarfile.open(archives[0]) as archive:
+        assert any(name.endswith("/src/drivax/__init__.py") for name in archive.getnames())
 
 
 def test_metadata(wheel: Path):

@@ -2,9 +2,10 @@
 
 A set is a folder::
 
-    manifest.json        schema version, capacity, field table, shards, one entry per scenario, digests of both
+    manifest.json        schema version, capacity, field table, shards, one entry per scenario
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
+    seal.json            SHA-256 of the manifest (``drivax.seal``)
     splits/              lists for training, validation and test (``scenario.select.splits``)
     scores.npz           criticality scores by which the scenarios were selected (``curation.subset``)
 
@@ -44,7 +45,7 @@ from drivax.files import (
     file_digest,
     restore_folder,
     sync_and_close,
-    write_text,
+    write_json,
 )
 from drivax.reading import MOST_TEXT, explain_damage, read_array_header, read_bytes
 from drivax.scenario.schema import (
@@ -57,10 +58,9 @@ from drivax.scenario.schema import (
     stored_name,
 )
 from drivax.scenario.select.splits import Shares, write_splits
+from drivax.seal import check_seal, seal
 
 MANIFEST = "manifest.json"
-#: Key of the SHA-256 of the scenarios' entries in the manifest.
-ENTRIES_DIGEST = "scenarios_sha256"
 #: The cure for a set that cannot be repaired.
 AGAIN = "convert or generate the set again"
 #: Bytes at the beginning of a record that hold its names.
@@ -238,7 +238,8 @@ class ScenarioWriter:
         }
         if self._shares is not None:
             write_splits(self._partial.content, self._entries, self._shares)
-        write_text(self._partial.content / MANIFEST, _manifest_text(manifest, self._entries))
+        write_json(self._partial.content / MANIFEST, manifest | {"scenarios": self._entries})
+        seal(self._partial.content, MANIFEST)
         if self._further is not None:
             self._further(self._partial.content)
         self._refuse_existing()  # Another process may have written it in the meantime.
@@ -503,6 +504,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if not file.is_file():
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
+    check_seal(file)
     # A manifest is shorter than the records that it lists.
     most = sum(shard.stat().st_size for shard in path.glob("shard-*.npy") if shard.is_file())
     text = read_bytes(file, AGAIN, max(MOST_TEXT, most))
@@ -515,7 +517,6 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
     with explain_damage(file, AGAIN, "manifest is damaged"):
         _check_manifest(manifest, file)
-    _check_entries(manifest, text, file)
     return manifest
 
 
@@ -533,32 +534,6 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
             raise ValueError(f"scenario {number} has a value of another type")
     if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
-
-
-def _manifest_text(manifest: Mapping[str, Any], entries: Sequence[Any]) -> str:
-    """Return a manifest as JSON, with the SHA-256 of its last part: the entries of the scenarios."""
-    end = _entries_text(entries)
-    digest = hashlib.sha256(end.encode()).hexdigest()
-    return json.dumps({**manifest, ENTRIES_DIGEST: digest}, indent=1, allow_nan=False)[:-2] + "," + end
-
-
-def _entries_text(entries: Sequence[Any]) -> str:
-    return json.dumps({"scenarios": entries}, indent=1, allow_nan=False)[1:]
-
-
-def _check_entries(manifest: Mapping[str, Any], text: bytes, file: Path) -> None:
-    """Compare the entries of the scenarios with their digest, which sets of earlier versions do not have."""
-    if (digest := manifest.get(ENTRIES_DIGEST)) is None:
-        return
-    end = text[max(0, text.find(b'\n "scenarios": ')) :]
-    if digest != hashlib.sha256(end).hexdigest():  # of another program's JSON, compare the values
-        end = _entries_text(manifest["scenarios"]).encode()
-        if digest != hashlib.sha256(end).hexdigest():
-            problem, cure = (
-                "entries of scenarios (ids, tags, audit) were changed",
-                f"copy it again or {AGAIN}",
-            )
-            raise DataError(problem, file=file, cure=cure)
 
 
 def shard_name(number: int) -> str:

@@ -22,6 +22,7 @@ from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean
 from drivax.reading import read_text
 from drivax.scenario.schema import Flag
 from drivax.scenario.select.tags import TAGS
+from drivax.seal import check_seal
 
 #: Number of missing names in an error message.
 _MOST_NAMES = 3
@@ -246,6 +247,7 @@ def select_scenarios(
 
 def read_names(file: Path) -> list[_Name]:
     """Read names from a text file, one per line; empty lines are skipped."""
+    check_seal(file)
     lines = read_text(file, "give a file with one scenario id per line").splitlines()
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from drivax.errors import UsageError
 from drivax.files import write_text
+from drivax.seal import seal
 
 NAMES = ("train", "validation", "test")
 #: Percentages of recordings for each of :data:`NAMES`.
@@ -118,4 +119,5 @@ def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Sha
         lines[split].append(f"{entry['dataset']}\t{entry['scenario_id']}\n")
     for name, members in lines.items():
         write_text(folder / FOLDER / f"{name}.txt", "".join(members))
+    seal(folder / FOLDER, *(f"{name}.txt" for name in lines))
     return {name: len(members) for name, members in lines.items()}
