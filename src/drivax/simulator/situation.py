@@ -57,15 +57,9 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    Args:
-        bank: Scenarios.
-        context: Context with the present step and motion, but ``route_m`` and ``z`` of the step before.
-        frame: All agents at the present step.
-        previous: All agents one step before.
-        contacts: Contact codes of the step before.
-        lights: Light memory of the step before.
-        reads: Names of the facts to measure; the others are None.
-        strand: The fact of that name one step before; None at the start of an episode.
+    ``context`` has the present step and motion; its ``route_m`` and ``z``, ``contacts``, ``lights`` and the fact
+    ``strand`` (None at the start of an episode) are those of the step before. ``frame`` and ``previous`` are all agents
+    now and one step before. Facts that ``reads`` does not name are None and not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.

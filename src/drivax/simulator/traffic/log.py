@@ -69,14 +69,9 @@ def frame_of(
 ) -> Frame:  # fmt: skip
     """Return the frame of ``step - back`` from the traffic model's rows, driven agents and parked agents.
 
-    Args:
-        bank: Scenarios.
-        index: Row of the bank.
-        step: Present step.
-        agents: Rows of the moving agents at ``step - back``, from the traffic model.
-        driven: Contexts of all driven agents of the scenario ``[K]``; slots beyond the moving agents are empty.
-        back: Steps before the present one, less than ``HISTORY``; reactive traffic remembers 9.
-        slots: Selected agents; by default all.
+    ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the moving agents are
+    empty. ``back`` is less than ``HISTORY``; reactive traffic remembers 9 steps. ``slots`` selects agents; by default
+    all.
     """
     motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
     rows = agent_rows(motion, jnp.zeros_like(present), present)

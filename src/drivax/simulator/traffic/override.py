@@ -75,13 +75,9 @@ def with_override(
 ) -> ScenarioBank:  # fmt: skip
     """Return the bank with trajectories of some agents, differentiable with respect to ``motion``.
 
-    Heights follow the nearest lane on the level of the step before, starting at the agent's first logged height.
-
-    Args:
-        bank: Scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
-        valid: Mask of ``motion``; by default all steps are valid.
+    ``motion`` is x, y (m), heading (rad), speed (m/s) at every step of the log, with the mask ``valid`` (by default
+    all); ``slots`` are moving agents of each scenario, -1 for none. Heights follow the nearest lane on the level of the
+    step before, starting at the agent's first logged height.
     """
     valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
     slots = jnp.asarray(slots, jnp.int32)
@@ -111,15 +107,10 @@ def motions_of_actions(
 ) -> Float[Array, "N T K 4"]:  # fmt: skip
     """Return the trajectories of agents that follow the log until step ``begin`` and then execute actions.
 
-    Differentiable with respect to ``actions``. An agent that the log lacks at ``begin`` starts where it was last valid,
-    or first. At most 22 steps before ``begin`` are as logged; before them the agent stands.
-
-    Args:
-        bank: Scenarios.
-        slots: Moving agents of each scenario, -1 for none.
-        actions: One action per step; the last one is repeated.
-        move: Dynamics of the action space, such as ``Task().motion``.
-        begin: First step of the actions.
+    Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
+    action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
+    the log lacks at ``begin`` starts where it was last valid, or first. At most 22 steps before ``begin`` are as
+    logged; before them the agent stands.
     """
     steps = bank.steps - 1 - begin
     action_index = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
