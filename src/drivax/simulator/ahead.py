@@ -109,8 +109,8 @@ def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scal
     speed = context.history[-1, MOTION_SPEED]
     can_stop = speed * speed / (2.0 * jnp.maximum(distance, 0.1)) < _YELLOW_BRAKING_MPS2
     requires_stop = is_red(state) | (is_yellow(state) & can_stop)
-    in_range = (distance > 0.0) & (distance < _POINTS * _STEP_M)
-    return jnp.min(jnp.where(requires_stop & in_range, distance, jnp.inf))
+    counts = requires_stop & (distance > 0.0) & (distance < _POINTS * _STEP_M)
+    return jnp.min(jnp.where(counts, distance, jnp.inf))
 
 
 def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:

@@ -72,8 +72,8 @@ def offroad_potential(
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
     offroad_m = offroad_distance(bank, index, box[:2], points, near, ground)
-    potentials = _squared_hinge(OFFROAD_TOLERANCE_M - offroad_m, margin_m)
-    return jnp.where(is_mapped(bank, index), potentials.sum(), 0.0)
+    has_map = is_mapped(bank, index)
+    return jnp.where(has_map, _squared_hinge(OFFROAD_TOLERANCE_M - offroad_m, margin_m).sum(), 0.0)
 
 
 def fault_potential(bank: ScenarioBank, context: AgentContext, frame: Frame, margin_m: float = 0.5) -> Scalar:

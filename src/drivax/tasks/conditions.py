@@ -66,7 +66,8 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
     for condition in conditions:
         name = condition.name
         if name not in options and name not in weights:
-            terms = [key for key, term in TERMS.items() if name == key or name == term.option in _OPTIONS]
+            options_of = {key: term.option for key, term in TERMS.items() if term.option in _OPTIONS}
+            terms = [key for key in TERMS if name in (key, options_of.get(key))]
             cure = f"give {terms[0]} a weight" if terms else did_you_mean(name, [*weights, *options])
             raise UsageError(f"condition {name}: not in the reward", cure=cure)
         if condition.high > options.get(name, math.inf):

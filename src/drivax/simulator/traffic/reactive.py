@@ -80,10 +80,11 @@ class IdmTraffic:
         travels = paths.log_arc[index, -1] - paths.log_arc[index, step] > agent_paths.TRAVELS_M
         reacts = (slot >= 0) & travels & (entry < bank.steps) & (self._driver_index(bank, index, slot) >= 0)
         drives = reacts & (entry <= step)
+        now = (paths.log_arc[index, log_step, row], paths.log_speed[index, log_step, row], drives)
         phase = jnp.where(reacts, jnp.where(drives, DRIVES, WAITS), REPLAYS).astype(jnp.int8)
-        now = paths.log_arc[index, log_step, row], paths.log_speed[index, log_step, row], drives
-        past = (jnp.broadcast_to(row, (PAST, *row.shape)) for row in now)
-        return Reactive(step, phase, entry.astype(jnp.int16), *past, paths.overlaps[index, log_step, row])
+        arc, speed, there = (jnp.broadcast_to(values, (PAST, *values.shape)) for values in now)
+        ignored = paths.overlaps[index, log_step, row]
+        return Reactive(step, phase, entry.astype(jnp.int16), arc, speed, there, ignored)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return rows of the moving slots ``back`` steps ago (at most 9): reacting agents simulated, others logged."""
@@ -116,9 +117,9 @@ class IdmTraffic:
         arc = jnp.where(drives, arc, movers.arc)
         speed = jnp.where(drives, speed, jnp.where(enters, _entry_speed(movers, ahead, driver), movers.speed))
         steps = ((state.arc, arc), (state.speed, speed), (state.there, phase == DRIVES))
-        past = (jnp.concatenate([rows[1:], row[None]]) for rows, row in steps)
+        arc, speed, there = (jnp.concatenate([rows[1:], row[None]]) for rows, row in steps)
         ignored = movers.ignored.astype(jnp.int16)
-        return Reactive(state.begin, phase.astype(jnp.int8), state.entry, *past, ignored)
+        return Reactive(state.begin, phase.astype(jnp.int8), state.entry, arc, speed, there, ignored)
 
     def _driver_index(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
         """Return the index in ``drivers`` of each vehicle's class; -1 for none."""
@@ -212,13 +213,14 @@ def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Fra
     entry = state.entry.astype(jnp.int32)
     ready = (state.phase == WAITS) & (context.step + 1 >= entry) & ~blocked
     late = context.step + 1 > entry
-    # By entry step, then by row; as floats, whose minima vectorise. Vehicles that are not ready come last.
+    # By entry step, then by row; as floats, whose minima vectorise.
     order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
-    order = jnp.where(ready, order, jnp.inf)
     radius = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     x, y = columns(movers.box)[:2]
     dx, dy = x[:, None] - x, y[:, None] - y
     near = dx * dx + dy * dy < (radius[:, None] + radius + 2 * _ENTRY_END_M) ** 2
+    # Vehicles that are not ready come last.
+    order = jnp.where(ready, order, jnp.inf)
     first = jnp.min(jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf), axis=1)
     return ready & (first >= order)
 
