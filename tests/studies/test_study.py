@@ -24,7 +24,7 @@ from drivax.studies.verdicts import (
     Strata,
     compare_rankings,
     decide_claims,
-    describe_needed,
+    describe_sample_size,
     detectable_differences,
     rates,
     rule_cost,
@@ -132,11 +132,11 @@ def test_p_values_are_adjusted_within_their_group():
 
 def test_what_is_undecided_says_what_would_decide():
     few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
-    seeds = int(describe_needed(few, 1).split()[0])
+    seeds = int(describe_sample_size(few, 1).split()[0])
     assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.75
-    assert int(describe_needed(few, 20).split()[0]) > seeds
-    assert describe_needed(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
-    assert "test recordings" in describe_needed(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
+    assert int(describe_sample_size(few, 20).split()[0]) > seeds
+    assert describe_sample_size(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
+    assert "test recordings" in describe_sample_size(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)
 
 
 def test_what_can_be_found_is_known_before_the_others_learn():

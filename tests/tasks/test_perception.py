@@ -13,7 +13,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.example_features import car_following, stop_line
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig, OwnGroup, observe
-from drivax.tasks.perception import Perception, in_view, lights_seen
+from drivax.tasks.perception import Perception, in_view, detect_lights
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
 
@@ -186,7 +186,7 @@ def test_range_and_dropout_by_distance(bank, seen):
     distance = jnp.array([1.0, 15.0, 40.0, 90.0])
 
     def look(perception):
-        return jax.vmap(lambda step: lights_seen(perception, bank, replace(context, step=step), distance))(
+        return jax.vmap(lambda step: detect_lights(perception, bank, replace(context, step=step), distance))(
             jnp.arange(4000)
         )
 

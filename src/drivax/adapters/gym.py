@@ -67,8 +67,8 @@ class Scenarios(Protocol):
         ...
 
 
-def _open(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:
-    """Return bank, ids and stored scenarios of loaded data, a set's folder, or a number of generated scenarios."""
+def _load(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:
+    """Return bank, ids and stored scenarios of loaded data, a set's folder, or a number of scenarios to generate."""
     if isinstance(data, int | str | Path):
         scenarios: Sequence[Scenario]
         if isinstance(data, int):
@@ -100,21 +100,21 @@ def _step(
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:
     """Return state, observation, and (reward, terminated, truncated)."""
     state, transition = simulator.step(bank, state, jnp.asarray(action))
-    ending = (transition.reward, transition.terminated, transition.truncated)
-    return state, _observe(simulator, bank, state), ending
+    outcome = (transition.reward, transition.terminated, transition.truncated)
+    return state, _observe(simulator, bank, state), outcome
 
 
 @partial(jax.jit, static_argnums=0)
 def _step_all(
     simulator: Simulator, bank: ScenarioBank, states: SimState, actions: Float[Any, "B D"],
-    begins: Bool[Any, " B"], rows: Any,
+    done: Bool[Any, " B"], rows: Any,
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
-    """Step a batch, or start the scenarios of ``rows`` with reward 0 where an episode ``begins``."""
-    begins = jnp.asarray(begins)
-    starts = map_where(begins, partial(simulator.new_episode, bank), jnp.asarray(rows))
+    """Step a batch; where the last episode is ``done``, begin one in the scenario of ``rows`` with reward 0."""
+    done = jnp.asarray(done)
+    starts = map_where(done, partial(simulator.new_episode, bank), jnp.asarray(rows))
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0))
-    states, transition = step(bank, states, jnp.asarray(actions), begins, starts)
-    reward = jnp.where(begins, 0.0, transition.reward)
+    states, transition = step(bank, states, jnp.asarray(actions), done, starts)
+    reward = jnp.where(done, 0.0, transition.reward)
     observations = jax.vmap(partial(_observe, simulator, bank))(states)
     return states, observations, (reward, transition.terminated, transition.truncated)
 
@@ -133,7 +133,7 @@ def _observe(simulator: Simulator, bank: ScenarioBank, state: SimState) -> dict[
     }
 
 
-#: Number of generated scenarios of an environment without data.
+#: Number of scenarios to generate for an environment without data.
 DEFAULT_SCENARIOS = 16
 #: Tasks by the name in their id, ``drivax/<name>-v0``.
 TASKS: dict[str, Task] = {name: Task(observation=preset) for name, preset in PRESETS.items()} | {
@@ -144,10 +144,10 @@ Observation = dict[str, Any]
 
 
 class _Backend:
-    """Scenarios on the CPU, simulator, and spaces of one environment; shared by both classes of environments."""
+    """Scenarios on the CPU, simulator and spaces of an environment; both classes of environments use it."""
 
     def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
-        bank, self.ids, self.scenarios = _open(data)
+        bank, self.ids, self.scenarios = _load(data)
         self.task = task or Task()
         if self.task.hold > 1:
             cure = "set hold to 1 and repeat the action"
@@ -160,7 +160,7 @@ class _Backend:
         self.observations = gymnasium.spaces.Dict({name: _space(leaf) for name, leaf in groups.items()})
 
     def check_row(self, scenario: Any) -> int:
-        """Return a row of the bank, checked to be in range."""
+        """Return ``scenario`` as a row of the bank, or raise an error if it is not one."""
         try:
             row = operator.index(scenario)
         except TypeError:
@@ -171,12 +171,12 @@ class _Backend:
         return row
 
     def convert_actions(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
-        """Check actions, and convert them to the form of the simulator."""
+        """Return checked actions ``[*lead, D]`` of the simulator; choices become the levels of ``Discrete``."""
         space = self.task.actions
         if isinstance(space, Discrete):
             choices = np.asarray(actions)
-            valid = choices.dtype.kind in "iu" and choices.shape == lead
-            if not valid or ((choices < 0) | (choices >= space.choices)).any():
+            is_index = choices.dtype.kind in "iu" and choices.shape == lead
+            if not is_index or ((choices < 0) | (choices >= space.choices)).any():
                 cure = f"give choices from 0 to {space.choices - 1}"
                 raise UsageError(f"{actions!r} is not an action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
@@ -185,10 +185,8 @@ class _Backend:
         values = np.asarray(actions, np.float32)
         shape = (*lead, space.size)
         if values.shape != shape or not np.isfinite(values).all():
-            numbers = " x ".join(map(str, shape))
-            raise UsageError(
-                f"{actions!r} is not an action", cure=f"give {numbers} finite numbers in [-1, 1]"
-            )
+            cure = f"give {' x '.join(map(str, shape))} finite numbers in [-1, 1]"
+            raise UsageError(f"{actions!r} is not an action", cure=cure)
         return values
 
 
@@ -241,7 +239,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
             self._row = backend.check_row(scenario)
         state, observation = _reset(backend.simulator, backend.bank, self._row)
         self._state, self._path = state, _ego_path(state.context)
-        return _plain(observation), {"scenario_id": backend.ids[self._row]}
+        return _to_numpy(observation), {"scenario_id": backend.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Step the simulation by 0.1 s.
@@ -253,20 +251,20 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
         backend, command = self._backend, self._backend.convert_actions(action, ())
-        state, observation, ending = _step(backend.simulator, backend.bank, self._state, command)
+        state, observation, outcome = _step(backend.simulator, backend.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
             self._path = _ego_path(state.context, self._path)
-        reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
+        reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(outcome))
         info: dict[str, Any] = {"scenario_id": backend.ids[self._row]}
         if terminated or truncated:
             metrics = jax.device_get(_metrics(backend.bank, state))
             info["metrics"] = {name: float(v.value) for name, v in metrics.items() if v.defined}
             self._state = None
-        return _plain(observation), reward, terminated, truncated, info
+        return _to_numpy(observation), reward, terminated, truncated, info
 
     def render(self) -> Any:
-        """Return the scenario from above as ``[height, width, 3]`` bytes, or None without a render mode."""
+        """Return a picture of the scenario from above, ``[height, width, 3]`` bytes; None without a render mode."""
         if self.render_mode is None:
             return None
         if not len(self._path):
@@ -323,8 +321,8 @@ class VectorDrivingEnv(VectorEnv):
             raise UsageError(problem, cure="give one per environment")
         self._done[:] = False
         self._state, observation = _reset_all(backend.simulator, backend.bank, self._rows)
-        self._record_paths(np.ones(self.num_envs, bool))
-        return _plain(observation), self._info()
+        self._extend_paths(np.ones(self.num_envs, bool))
+        return _to_numpy(observation), self._info()
 
     def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
         """Step every environment by 0.1 s; if its episode has ended, start the next one instead.
@@ -335,24 +333,25 @@ class VectorDrivingEnv(VectorEnv):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
-        backend, begins = self._backend, self._done
+        backend, done = self._backend, self._done
         commands = backend.convert_actions(actions, (self.num_envs,))
-        self._rows = np.where(begins, self._sample_rows(), self._rows)
-        arguments = (backend.bank, self._state, commands, begins, self._rows)
-        self._state, observation, ending = _step_all(backend.simulator, *arguments)
-        reward, terminated, truncated = (np.array(leaf) for leaf in jax.device_get(ending))
+        self._rows = np.where(done, self._sample_rows(), self._rows)
+        self._state, observation, outcome = _step_all(
+            backend.simulator, backend.bank, self._state, commands, done, self._rows
+        )
+        reward, terminated, truncated = (np.array(leaf) for leaf in jax.device_get(outcome))
         self._done = terminated | truncated
-        self._record_paths(begins)
+        self._extend_paths(done)
         info = self._info()
         if self._done.any():
             metrics = jax.device_get(_metrics_all(backend.bank, self._state))
             for env in np.flatnonzero(self._done):
                 values = {name: float(v.value[env]) for name, v in metrics.items() if v.defined[env]}
                 info = self._add_info(info, {"metrics": values}, int(env))
-        return _plain(observation), reward, terminated, truncated, info
+        return _to_numpy(observation), reward, terminated, truncated, info
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return every scenario from above, or None without a render mode."""
+        """Return a picture of every scenario from above; None without a render mode."""
         if self.render_mode is None:
             return None
         if not self._paths:
@@ -367,12 +366,12 @@ class VectorDrivingEnv(VectorEnv):
         ids = np.array([self._backend.ids[row] for row in self._rows], object)
         return {"scenario_id": ids, "_scenario_id": np.ones(self.num_envs, bool)}
 
-    def _record_paths(self, begins: Any) -> None:
-        """Extend the paths of all egos for rendering; start again where an episode ``begins``."""
+    def _extend_paths(self, is_new: Any) -> None:
+        """Extend the paths of all egos for rendering; those of new episodes start again."""
         if self.render_mode is None or self._state is None:
             return
         paths = self._paths or [None] * self.num_envs
-        previous = [None if start else path for path, start in zip(paths, begins, strict=True)]
+        previous = [None if new else path for path, new in zip(paths, is_new, strict=True)]
         context = self._state.context
         contexts = [jax.tree.map(operator.itemgetter(env), context) for env in range(self.num_envs)]
         self._paths = list(map(_ego_path, contexts, previous))
@@ -399,11 +398,12 @@ def _check_render_mode(render_mode: str | None) -> Any:
 
 
 def _option(options: Mapping[str, Any] | None, name: str) -> Any:
-    """Return the only known reset option, None if it is not given."""
-    unknown = sorted(set(options or {}) - {name})
+    """Return the value of the only reset option, or None."""
+    options = options or {}
+    unknown = sorted(set(options) - {name})
     if unknown:
         raise UsageError(f"there is no reset option {unknown[0]!r}", cure=f"the only one is {name!r}")
-    return (options or {}).get(name)
+    return options.get(name)
 
 
 def _action_space(task: Task) -> gymnasium.spaces.Space[Any]:
@@ -421,17 +421,8 @@ def _space(leaf: jax.ShapeDtypeStruct) -> gymnasium.spaces.Space[Any]:
     return gymnasium.spaces.Box(-LIMIT, LIMIT, leaf.shape, np.float32)
 
 
-def _plain(observation: Mapping[str, Array]) -> Observation:
+def _to_numpy(observation: Mapping[str, Array]) -> Observation:
     return {name: np.array(leaf) for name, leaf in observation.items()}
-
-
-for _name, _task in TASKS.items():
-    gymnasium.register(
-        f"drivax/{_name}-v0",
-        entry_point="drivax.adapters.gym:DrivingEnv",
-        vector_entry_point="drivax.adapters.gym:VectorDrivingEnv",
-        kwargs={"task": _task},
-    )
 
 
 def _ego_path(context: AgentContext, previous: Any = None) -> Any:
@@ -444,3 +435,12 @@ def _ego_path(context: AgentContext, previous: Any = None) -> Any:
         return np.concatenate([previous, history[-1:]])
     recent = history[-min(step + 1, len(history)) :]
     return np.concatenate([np.full((step + 1 - len(recent), 4), np.nan, np.float32), recent])
+
+
+for _name, _task in TASKS.items():
+    gymnasium.register(
+        f"drivax/{_name}-v0",
+        entry_point="drivax.adapters.gym:DrivingEnv",
+        vector_entry_point="drivax.adapters.gym:VectorDrivingEnv",
+        kwargs={"task": _task},
+    )

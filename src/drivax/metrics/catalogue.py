@@ -88,14 +88,14 @@ class EpisodeEnd:
 
 #: Values of a metric's inputs by name.
 Inputs = Mapping[str, Value]
-#: Weights of the two scores, and their gates.
+#: Weights and gates of the two scores.
 NUPLAN_WEIGHTS = {"ttc_ok": 5.0, "progress_ratio": 5.0, "speed_compliance": 4.0, "comfortable": 2.0}
 VMAX_WEIGHTS = {**NUPLAN_WEIGHTS, "lane_keeping": 3.0}
 NUPLAN_GATES = ("at_fault_collision", "offroad")
 VMAX_GATES = (*NUPLAN_GATES, "red_light")
-_PASSES = ("making_progress", "direction")
-NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_PASSES)
-VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_PASSES)
+_MULTIPLIERS = ("making_progress", "direction")
+NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_MULTIPLIERS)
+VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_MULTIPLIERS)
 #: Smallest safe time to collision, and mean speeding at which compliance is 0 (nuPlan).
 _SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
 
@@ -155,7 +155,7 @@ def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def _ttc_ok(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    # The time to collision of a car that never moves is undefined; the car is safe.
+    # A car that never moves is safe; its time to collision is undefined.
     min_ttc = inputs["min_ttc"]
     safe = jnp.where(min_ttc.defined, min_ttc.value, TTC_HORIZON_S) >= _SAFE_TTC_S
     return _boolean(safe, end.steps > 0)
@@ -196,10 +196,11 @@ def score(metrics: Inputs, weights: Mapping[str, float], gates: tuple[str, ...])
     total = weight.sum(axis=0)
     mean = (weight * terms).sum(axis=0) / jnp.maximum(total, 1e-9)
     complete = term_defined.all(axis=0)
-    factors = [(metrics[name].defined, 1.0 - metrics[name].value) for name in gates]
-    for defined, factor in factors + [(metrics[name].defined, metrics[name].value) for name in _PASSES]:
-        mean = mean * jnp.where(defined, factor, 1.0)
-        complete = complete & defined
+    factors = {name: 1.0 - metrics[name].value for name in gates}
+    factors |= {name: metrics[name].value for name in _MULTIPLIERS}
+    for name, factor in factors.items():
+        mean = mean * jnp.where(metrics[name].defined, factor, 1.0)
+        complete = complete & metrics[name].defined
     return Value(mean, complete), Value(mean, ~complete & (total > 0))
 
 

@@ -73,7 +73,7 @@ def _weights(window: int, order: int, derivative: int, position: float) -> np.nd
 
 @record
 class ComfortSteps:
-    """Comfort and measurements of consecutive steps, oldest first."""
+    """Comfort, jerk and lateral acceleration of consecutive steps, oldest first."""
 
     comfortable: Bool[Array, " steps"]
     jerk_mps3: Float[Array, " steps"]
@@ -83,7 +83,7 @@ class ComfortSteps:
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
     """Evaluate a trip (x, y, heading, speed; at least 23 rows) from row 11 on, the first row with centred windows.
 
-    This is for plots and tables. An episode evaluates the same steps one by one.
+    For plots and tables. An episode evaluates the same steps one by one.
     """
     windows = jnp.arange(len(motion) - _SAMPLES + 1)[:, None] + jnp.arange(_SAMPLES)
     steps = jax.vmap(check_comfort)(motion[windows])
@@ -93,7 +93,8 @@ def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
 def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
     """Evaluate the last twelve steps of a motion history (23 rows of x, y, heading, speed) against the limits.
 
-    The first of them, eleven steps back, is final. The others use SciPy's edge mode, as if the history ended here.
+    The value of the first, eleven steps back, is final. The others are those of an episode that ends at the last row,
+    by SciPy's edge mode.
     """
     speed = history[:, 3]
     heading_change = wrap(history[1:, 2] - history[:-1, 2])

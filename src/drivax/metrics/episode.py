@@ -21,7 +21,7 @@ from drivax.simulator.ahead import has_route
 from drivax.simulator.types import SimState, Situation
 
 _NEVER = 32767
-#: Steps of one second (semantics, ``wrong_way``).
+#: Steps in a second (semantics, ``wrong_way``).
 _SECOND = 10
 
 
@@ -85,17 +85,17 @@ def episode_start(metrics: MetricNames = "full") -> Episode:
 def episode_add(
     episode: Episode, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
 ) -> Episode:
-    """Add one step to an episode that began at ``start``; ``final`` marks its last step."""
+    """Return the accumulators after a step of an episode from step ``start`` on; ``final`` marks its last step."""
     selection, values = episode.selection, _entries(episode.selection)
     moment = _MomentValues(Moment(situation, start, final))
     total, count = moment.sums(values["total"])
     low, _ = moment.extremes(values["low"], jnp.min, jnp.inf)
     high, _ = moment.extremes(values["high"], jnp.max, -jnp.inf)
-    last, last_counts = moment.extremes(values["last"], jnp.max, -jnp.inf)
-    first, first_counts = moment.extremes(values["first"], jnp.max, -jnp.inf)
-    first_now = first_counts & ~(episode.first > 0)
+    last, last_defined = moment.extremes(values["last"], jnp.max, -jnp.inf)
+    first, first_defined = moment.extremes(values["first"], jnp.max, -jnp.inf)
+    is_first = first_defined & ~(episode.first > 0)
     event_values, _ = moment.extremes(tuple(STEP_VALUES[name] for name in selection.events), jnp.max, 0.0)
-    event_now = (event_values > 0) & (episode.event_step == _NEVER)
+    is_event = (event_values > 0) & (episode.event_step == _NEVER)
     window, _ = moment.sums(values["worst"])
     second = jnp.concatenate([episode.second[:, 1:], window[:, None]], axis=1)
     return Episode(
@@ -103,9 +103,9 @@ def episode_add(
         count=episode.count + count,
         low=jnp.minimum(episode.low, low),
         high=jnp.maximum(episode.high, high),
-        last=jnp.where(last_counts, last, episode.last),
-        first=jnp.where(first_now, first, episode.first),
-        event_step=jnp.where(event_now, situation.context.step.astype(jnp.int16), episode.event_step),
+        last=jnp.where(last_defined, last, episode.last),
+        first=jnp.where(is_first, first, episode.first),
+        event_step=jnp.where(is_event, situation.context.step.astype(jnp.int16), episode.event_step),
         second=second,
         worst=jnp.maximum(episode.worst, second.sum(axis=1)),
         selection=selection,
@@ -134,16 +134,16 @@ class _MomentValues:
         return _stack(total, jnp.float32), _stack(count, jnp.int16)
 
     def extremes(
-        self, values: Sequence[StepValue], reduce: Callable[[Array], Array], none: float
+        self, values: Sequence[StepValue], reduce: Callable[[Array], Array], default: float
     ) -> tuple[Float[Array, " R"], Bool[Array, " R"]]:
-        """Return the reduced defined values, ``none`` if there are none, and whether there are any."""
+        """Return the extreme defined values, ``default`` if none is defined, and whether any is."""
         pairs = [self._read(value) for value in values]
-        reduced = [reduce(jnp.where(defined, number, none)) for number, defined in pairs]
-        return _stack(reduced, jnp.float32), _stack([defined.any() for _, defined in pairs], jnp.bool_)
+        extremes = [reduce(jnp.where(defined, number, default)) for number, defined in pairs]
+        return _stack(extremes, jnp.float32), _stack([defined.any() for _, defined in pairs], jnp.bool_)
 
 
-def _stack(scalars: Sequence[Array], kind: type) -> Array:
-    return jnp.stack(scalars) if scalars else jnp.zeros(0, kind)
+def _stack(scalars: Sequence[Array], dtype: type) -> Array:
+    return jnp.stack(scalars) if scalars else jnp.zeros(0, dtype)
 
 
 def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
@@ -155,13 +155,13 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
         value = _accumulated_value(episode, metric)
         if metric.compute is not None:
             value = metric.compute(end, value, result)
-        defined = value.defined & _has(bank, state, metric.needs) & jnp.isfinite(value.value)
+        defined = value.defined & _meets(bank, state, metric.needs) & jnp.isfinite(value.value)
         result[name] = Value(jnp.where(defined, value.value, 0.0), defined)
     return {name: result[name] for name in episode.selection.names}
 
 
-def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
-    """Return whether the scenario has the flags that a metric needs, and the agent the route."""
+def _meets(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
+    """Return whether the scenario has all flags of ``needs``, and the agent the route if it is one of them."""
     required = jnp.uint32(int(needs & ~Flag.ROUTE))
     has_flags = (bank.flags[state.context.index] & required) == required
     return has_flags & ((Flag.ROUTE not in needs) | has_route(bank, state.context))

@@ -19,7 +19,7 @@ MetricNames = str | tuple[str, ...]
 
 @dataclass(frozen=True, eq=False)
 class MetricSelection:
-    """Selected metrics. :func:`select_metrics` caches selections, because compiled programs compare them by identity.
+    """Metrics of a task, cached by :func:`select_metrics`, since compiled programs compare selections by identity.
 
     Attributes:
         names: The requested metrics.

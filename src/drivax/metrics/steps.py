@@ -48,13 +48,13 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and a mask: the oldest step, or at the end of the episode all steps."""
+        """Comfort of the last twelve steps, and a mask of final values: the oldest, at the end of the episode all."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
 
 
-#: Reads a number, or several along one axis, and whether they are defined.
+#: From a moment to a number, or several along one axis, and whether they are defined.
 Read = Callable[[Moment], tuple[Array, Any]]
 
 
@@ -63,9 +63,9 @@ class StepValue:
     """A quantity of a step.
 
     Attributes:
-        name: Its name.
-        unit: Its unit, ``-`` for booleans and codes.
-        read: Function from a moment to the value and whether it is defined (a boolean, or a plain True).
+        name: Name of the quantity.
+        unit: Unit, ``-`` for booleans and codes.
+        read: From a moment to the value, and whether it is defined.
         reads: Names of the facts that ``read`` needs; all facts by default.
         delayed: Whether the value is computed several steps later, for several steps at once.
     """
@@ -81,7 +81,7 @@ def _fact(name: str, unit: str, fact: str, defined: str = "") -> StepValue:
     """Return the step value of a fact; ``defined`` names the fact that says whether it is defined."""
 
     def read(moment: Moment) -> tuple[Array, Any]:
-        return getattr(moment.facts, fact), not defined or getattr(moment.facts, defined)
+        return getattr(moment.facts, fact), getattr(moment.facts, defined) if defined else True
 
     return StepValue(name, unit, read, frozenset({fact, defined} if defined else {fact}))
 

@@ -1,4 +1,4 @@
-"""What a driver has ahead on its route: obstacles, lights that require a stop, desired speed, and the way to steer."""
+"""Look ahead along the route: nearest obstacle, lights that require a stop, desired speed, and pure pursuit."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 
-#: Spacing of the points ahead on the route, m; their number; and the number of rectangles around them.
+#: Points ahead on the route: spacing (m), number, and number of rectangles around them.
 _STEP_M, _POINTS, _RECTANGLES = 2.0, 46, 9
 _FALLBACK_LIMIT_MPS = 13.4
-#: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
+#: Free space next to the car, m; lateral acceleration in curves, m/s2; braking towards curves, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
-#: Agents further from the route than this and half of ego's width are ignored, m.
+#: Margin of the corridor on either side of ego, m; agents outside it are ignored.
 _NEAR_M = 0.4
 #: A yellow light counts as red for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
 #: Look-ahead of pure pursuit: at a standstill, m; per m/s, s; its bounds, m.
 _LOOKAHEAD_M, _LOOKAHEAD_S, _LOOKAHEAD_BOUNDS_M = 3.0, 0.8, (4.0, 20.0)
-#: Distance at which to stand before a stop line, m.
+#: Distance before a stop line at which cars stop, m.
 STOP_SHORT_M = 1.0
 
 
@@ -38,11 +38,11 @@ STOP_SHORT_M = 1.0
 class Ahead:
     """Inputs of a car-following driver."""
 
-    # Bumper to bumper to the nearest obstacle, or to a standing car behind the stop line of a light that requires a
-    # stop, placed so that the driver stands 1 m before the line, m; 10 km if free
+    # Gap to the nearest obstacle, bumper to bumper, m; 10 km if free. A stop line counts as a standing car at the
+    # distance that makes the driver stop 1 m before the line
     gap: Scalar
     leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light
-    desired: Scalar  # Limit (13.4 if unknown), or what curves ahead allow; 0 at the route's end, m/s
+    desired: Scalar  # Speed limit (13.4 if unknown), less before curves; 0 at the route's end, m/s
 
     def acceleration(self, speed: Scalar, parameters: IdmParameters) -> Scalar:
         """Return the IDM acceleration at a speed, m/s2."""
@@ -52,39 +52,44 @@ class Ahead:
 def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
     """Look 90 m ahead of the driven agent along its route.
 
-    ``min_gap_m`` is the gap that the driver keeps at standstill; it stops 1 m before a stop line.
+    ``min_gap_m`` is the gap that the driver keeps behind a standing leader.
     """
-    leader_m, leader_mps, (path, on_route, offsets) = _leader(bank, context, frame)
-    # The driver stands min_gap_m behind a leader, but only STOP_SHORT_M before a line.
+    route = _route_points(bank, context)
+    leader_m, leader_mps = _leader(frame, context.slot, *route)
+    # The driver stops min_gap_m behind a leader, but STOP_SHORT_M before a line.
     stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(leader_m, stop)
     leader = jnp.where(stop < leader_m, 0.0, leader_mps)
     # Without a second point the route ends within 2 m.
-    desired = jnp.where(on_route[1], desired_speed(path, on_route, offsets), 0.0)
+    desired = jnp.where(route[1][1], desired_speed(*route), 0.0)
     return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
 
 
 def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the gap to the nearest obstacle within 90 m on the route, m; infinite without one or without a route."""
-    return jnp.where(has_route(bank, context), _leader(bank, context, frame)[0], jnp.inf)
+    gap, _ = _leader(frame, context.slot, *_route_points(bank, context))
+    return jnp.where(has_route(bank, context), gap, jnp.inf)
+
+
+def _route_points(
+    bank: ScenarioBank, context: AgentContext
+) -> tuple[Float[Array, "K 7"], Bool[Array, " K"], Float[Array, " K"]]:
+    """Return points ahead on the route, whether the route reaches each, and their distances along it, m."""
+    offsets = jnp.arange(_POINTS) * _STEP_M
+    return *route_ahead(bank, context.row, context.route_m, offsets), offsets
 
 
 def _leader(
-    bank: ScenarioBank, context: AgentContext, frame: Frame
-) -> tuple[Scalar, Scalar, tuple[Array, Array, Array]]:
-    """Return the gap to the nearest obstacle on the route (m; infinite for none), its speed along it, and the route.
-
-    The route is a triple: points ahead, whether each is on the route, and their distances along it, m.
-    """
-    ego = frame.box[context.slot]
-    offsets = jnp.arange(_POINTS) * _STEP_M
-    path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
+    frame: Frame, slot: Array, path: Float[Array, "K 7"], on_route: Bool[Array, " K"], offsets: Float[Array, " K"]
+) -> tuple[Scalar, Scalar]:  # fmt: skip
+    """Return the gap to the nearest obstacle on a path (m; infinite without one), and its speed along the path."""
+    ego = frame.box[slot]
     # Only the closest agents near the route are measured against all of its points.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
     half_m = (ego[WIDTH : WIDTH + 1] / 2 + _NEAR_M)[None]
     near = reaching(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
-    slots, valid = closest(near & others_on_level(frame, context.slot), ego[None], boxes)
+    slots, valid = closest(near & others_on_level(frame, slot), ego[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
     along, lateral, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
     half_length = jnp.abs(cos) * box[:, LENGTH] / 2 + jnp.abs(sin) * box[:, WIDTH] / 2
@@ -93,28 +98,29 @@ def _leader(
     gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    return gaps[nearest], speed[nearest], (path, on_route, offsets)
+    return gaps[nearest], speed[nearest]
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the distance from the front bumper to the nearest stop line that requires a stop, m; infinite for none."""
     line, state = bank.light_line[context.index], frame.lights
     arc = line[LightRow.ARC + bank.ego_number(context.row)]
-    front = arc - context.route_m - frame.box[context.slot, LENGTH] / 2
+    distance = arc - context.route_m - frame.box[context.slot, LENGTH] / 2
     speed = context.history[-1, MOTION_SPEED]
-    can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
-    stops = (is_red(state) | (is_yellow(state) & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
-    return jnp.min(jnp.where(stops, front, jnp.inf))
+    can_stop = speed * speed / (2.0 * jnp.maximum(distance, 0.1)) < _YELLOW_BRAKING_MPS2
+    requires_stop = is_red(state) | (is_yellow(state) & can_stop)
+    counts = requires_stop & (distance > 0.0) & (distance < _POINTS * _STEP_M)
+    return jnp.min(jnp.where(counts, distance, jnp.inf))
 
 
 def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
-    """Return the present speed limit, or what the curves ahead allow with gentle braking, m/s."""
+    """Return the present speed limit, or the lower speed that the curves ahead require, m/s."""
     limit = jnp.where(path[0, RouteColumn.LIMIT] > 0, path[0, RouteColumn.LIMIT], _FALLBACK_LIMIT_MPS)
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
     curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M
     curvature = jnp.where(on_route[1:], curvature, 0.0)
-    # The square of the speed from which braking to that of the curve takes the distance to it.
+    # The square of the speed from which the car brakes to the curve's speed over the distance to it.
     squared = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
     return jnp.minimum(limit, jnp.sqrt(jnp.min(squared)))
 
@@ -123,7 +129,7 @@ def project(
     path: Float[Array, "K 7"], on_route: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
     heading: Float[Array, "S 2"],
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return arc length ahead and lateral offset of points on a path, and relative cosine and sine of headings.
+    """Project poses on a path: return arc length, lateral offset, and cosine and sine of the heading to the path.
 
     Beyond either end the path continues along its tangent; the lateral offset is infinite more than 4 m beyond it.
     """
@@ -140,7 +146,7 @@ def project(
 
 
 def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
-    """Whether the driven agent has a route on lanes; if not, the bank holds the logged path, which is privileged."""
+    """Return whether the driven agent has a route on lanes. Otherwise the bank holds its logged path: privileged."""
     return bank.on_lanes[context.row] & (context.slot == bank.ego_slot(context.row))
 
 
@@ -151,27 +157,27 @@ def lookahead_m(speed: Scalar) -> Scalar:
 
 def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) -> Scalar:
     """Return the curvature of pure pursuit to the route shifted left by ``offset_m``, 1/m."""
-    point, left = _route_aim(bank, context)
+    point, left = _pursuit_point(bank, context)
     return pursuit(jnp.array([0.0, 0.0, 1.0, 0.0]), point + offset_m * left)
 
 
 def offset_to_steer(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
-    """Return the offset that makes :func:`follow_route` steer a curvature, m; the nearest one if none does.
+    """Return the offset for which :func:`follow_route` returns a curvature, m; the closest offset if none does.
 
-    The arc of curvature k from the origin meets the line p + d n where k |p + d n|^2 = 2 (p + d n)_y.
+    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``.
     """
-    point, left = _route_aim(bank, context)
+    point, left = _pursuit_point(bank, context)
     linear = 2.0 * (curvature * jnp.sum(point * left) - left[1])
     constant = curvature * jnp.sum(point * point) - 2.0 * point[1]
     root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * curvature * constant, 0.0))
-    # The solution that stays finite for a straight line.
+    # The root that stays finite for k = 0.
     return 2.0 * constant / jnp.maximum(root - linear, 1e-3)
 
 
-def _route_aim(bank: ScenarioBank, context: AgentContext) -> tuple[Vector, Vector]:
-    """Return the route's point at the look-ahead and the direction to its left there, in the agent's frame.
+def _pursuit_point(bank: ScenarioBank, context: AgentContext) -> tuple[Vector, Vector]:
+    """Return the route's point at the look-ahead distance, and its normal to the left, in the agent's frame.
 
-    Beyond its end the route continues straight on. An agent without a route on lanes aims straight ahead.
+    The route continues straight beyond its end. Without a route on lanes the point is straight ahead.
     """
     motion, zero = context.history[-1], jnp.zeros(())
     distance_m = lookahead_m(motion[MOTION_SPEED])
@@ -182,6 +188,6 @@ def _route_aim(bank: ScenarioBank, context: AgentContext) -> tuple[Vector, Vecto
     xy = points[0, RouteColumn.XY] + (distance_m - on_route_m) * direction - motion[:2]
     cos, sin = jnp.cos(motion[MOTION_HEADING]), jnp.sin(motion[MOTION_HEADING])
     point, direction = rotate(xy, cos, -sin), rotate(direction, cos, -sin)
-    routed = has_route(bank, context)
-    point = jnp.where(routed, point, jnp.stack([distance_m, zero]))
-    return point, jnp.where(routed, jnp.stack([-direction[1], direction[0]]), jnp.array([0.0, 1.0]))
+    on_lanes = has_route(bank, context)
+    point = jnp.where(on_lanes, point, jnp.stack([distance_m, zero]))
+    return point, jnp.where(on_lanes, jnp.stack([-direction[1], direction[0]]), jnp.array([0.0, 1.0]))

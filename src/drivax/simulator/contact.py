@@ -1,4 +1,4 @@
-"""Contacts of one agent with the others: overlap, fault, kind of collision, time to collision, gap."""
+"""Contacts of one agent with the others: overlap, fault, type of collision, time to collision, gap."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivax.simulator.types import Frame
 TTC_HORIZON_S = 5.0
 #: Largest gap, m.
 FARTHEST_GAP_M = 50.0
-#: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
+#: Below this speed an agent is stopped (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
 #: Tangent of 30 and cosine of 45 degrees.
 _TAN_30, _COS_45 = 3.0**-0.5, 0.5**0.5
@@ -30,9 +30,9 @@ REAR_AXLE = 1.461 / 5.176
 class Contact(enum.IntEnum):
     """Contact of the evaluated agent with another.
 
-    ``IGNORED`` has overlapped since it appeared and does not count until it separates; ``HIT`` touches without the
-    evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, after a contact that keeps its fault;
-    ``GONE`` is absent after any of these three.
+    ``IGNORED``: has overlapped since it appeared and does not count until it separates; ``HIT``: overlaps without the
+    evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED``: separated again after ``HIT`` or ``AT_FAULT``;
+    ``GONE``: absent after any of these three.
     """
 
     ABSENT = 0
@@ -45,12 +45,12 @@ class Contact(enum.IntEnum):
 
 
 class CollisionType(enum.IntEnum):
-    """Kind of the first collision, seen from the evaluated agent.
+    """Type of the first collision, seen from the evaluated agent.
 
-    The first that fits, in this order: ``VULNERABLE``: a pedestrian or cyclist; ``STOPPED_OBJECT``: the agent's front
-    hits another agent that stands; ``HEAD_ON``: headings differ by more than 135 deg, unless it touches from behind;
-    ``REAR_END``: the front hits an agent whose heading differs by less than 45 deg; ``REAR_ENDED``: hit from behind;
-    ``SIDE_SWIPE``: everything else, crossing traffic included.
+    The first that applies, in this order: ``VULNERABLE``: with a pedestrian or cyclist; ``STOPPED_OBJECT``: the agent's
+    front hits a stopped agent; ``HEAD_ON``: headings differ by more than 135 deg, and the other agent is not behind
+    unless the front hits it; ``REAR_END``: the front hits an agent whose heading differs by less than 45 deg;
+    ``REAR_ENDED``: hit from behind; ``SIDE_SWIPE``: all others, crossing traffic included.
     """
 
     NONE = 0
@@ -69,12 +69,12 @@ def others_on_level(frame: Frame, slot: Integer) -> Bool[Array, " S"]:
 
 
 def overlaps(frame: Frame, slot: Integer) -> Bool[Array, " S"]:
-    """Mask of the other agents that overlap the agent now, on its level."""
+    """Mask of the other agents that overlap the agent, on its level."""
     return overlap(frame.box[slot], frame.box) & others_on_level(frame, slot)
 
 
 def first_contacts(before: Int[Array, " S"], touching: Bool[Array, " S"]) -> Bool[Array, " S"]:
-    """Mask of the overlaps that begin now and count: with agents that were apart and have never been hit."""
+    """Mask of the overlaps that begin at this step and count: with agents that were apart and were never hit."""
     return touching & (before == Contact.APART)
 
 
@@ -83,73 +83,73 @@ def next_contacts(
 ) -> Int[Array, " S"]:
     """Return the contact code of every slot, one step after ``before``.
 
-    ``fault`` tells for contacts that begin now whether they are the evaluated agent's fault.
+    ``fault`` marks the evaluated agent's fault in contacts that begin at this step.
     """
     c = Contact
     # A slot that overlaps as it appears is ignored. A second contact is never a new fault.
-    ignored = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
+    is_ignored = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
     code = jnp.where(before == c.PARTED, c.HIT, before)
     code = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), code)
-    contact = jnp.where(ignored, c.IGNORED, code)
-    hit = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
-    apart, absent = jnp.where(hit, c.PARTED, c.APART), jnp.where(hit, c.GONE, c.ABSENT)
+    contact = jnp.where(is_ignored, c.IGNORED, code)
+    was_hit = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
+    apart, absent = jnp.where(was_hit, c.PARTED, c.APART), jnp.where(was_hit, c.GONE, c.ABSENT)
     return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
 
 
 def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
     """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading in it."""
-    me = frame.box[slot]
-    dx, dy = frame.box[:, X] - me[X], frame.box[:, Y] - me[Y]
-    cos = frame.box[:, COS] * me[COS] + frame.box[:, SIN] * me[SIN]
-    sin = frame.box[:, SIN] * me[COS] - frame.box[:, COS] * me[SIN]
-    return dx * me[COS] + dy * me[SIN], dy * me[COS] - dx * me[SIN], cos, sin
+    ego = frame.box[slot]
+    dx, dy = frame.box[:, X] - ego[X], frame.box[:, Y] - ego[Y]
+    cos = frame.box[:, COS] * ego[COS] + frame.box[:, SIN] * ego[SIN]
+    sin = frame.box[:, SIN] * ego[COS] - frame.box[:, COS] * ego[SIN]
+    return dx * ego[COS] + dy * ego[SIN], dy * ego[COS] - dx * ego[SIN], cos, sin
 
 
 def classify_contacts(
-    frame: Frame, slot: Integer, fresh: Bool[Array, " S"], speed: Scalar, others_speed: Float[Array, " S"],
+    frame: Frame, slot: Integer, begins: Bool[Array, " S"], speed: Scalar, others_speed: Float[Array, " S"],
     unlawful: Bool[Array, ""],
 ) -> tuple[Bool[Array, " S"], Integer]:  # fmt: skip
-    """Return which of the contacts that began at this step (``fresh``) are at fault, and the type of the nearest one.
+    """Return which contacts that begin at this step (mask ``begins``) are at fault, and the type of the nearest one.
 
     Fault follows nuPlan's order: agent itself stopped: no; the other stopped: yes; the other behind: no; hit with the
     front: yes; sideways: yes when the agent is ``unlawful``, in several lanes or off the road. Speeds are the larger
     ones of before and after the step.
     """
-    me = frame.box[slot]
+    ego = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
-    # Its bearing from the rear axle is over 150 degrees.
-    behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * me[LENGTH])
-    x, y = me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN]
-    bumper = jnp.stack([x, y, me[COS], me[SIN], jnp.full((), _BUMPER_M), me[WIDTH]])
+    # Behind: at a bearing of more than 150 degrees from the rear axle.
+    behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * ego[LENGTH])
+    x, y = ego[X] + ego[LENGTH] / 2 * ego[COS], ego[Y] + ego[LENGTH] / 2 * ego[SIN]
+    bumper = jnp.stack([x, y, ego[COS], ego[SIN], jnp.full((), _BUMPER_M), ego[WIDTH]])
     front = overlap(bumper, frame.box)
     stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
     fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
-    head_on, same_way = cos < -_COS_45, cos > _COS_45
+    opposite, parallel = cos < -_COS_45, cos > _COS_45
     c = CollisionType
     cases = (
-        (vulnerable, c.VULNERABLE), (other_stopped & front, c.STOPPED_OBJECT), (head_on & (front | ~behind), c.HEAD_ON),
-        (front & same_way, c.REAR_END), (behind, c.REAR_ENDED),
+        (vulnerable, c.VULNERABLE), (other_stopped & front, c.STOPPED_OBJECT),
+        (opposite & (front | ~behind), c.HEAD_ON), (front & parallel, c.REAR_END), (behind, c.REAR_ENDED),
     )  # fmt: skip
     kind = jnp.full(front.shape, c.SIDE_SWIPE)
-    for case, name in reversed(cases):  # jnp.select, an argmax over all cases, is slower
-        kind = jnp.where(case, name, kind)
-    nearest = first_smallest(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
-    return fresh & fault, jnp.where(fresh.any(), kind[nearest], c.NONE).astype(jnp.int8)
+    for mask, case in reversed(cases):  # jnp.select, an argmax over all cases, is slower
+        kind = jnp.where(mask, case, kind)
+    nearest = first_smallest(jnp.where(begins, ahead**2 + left**2, jnp.inf))
+    return begins & fault, jnp.where(begins.any(), kind[nearest], c.NONE).astype(jnp.int8)
 
 
 def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the time to the first overlap at constant velocities and headings, s, at most 5 (semantics, ``ttc``).
 
-    Agents entirely behind the rear axle are followers and never count, nor do those in ``ignored``, such as one that
-    ran into the agent without its fault. All others count, in whatever direction: one that overlaps within the horizon
-    is ahead or comes into the lane that the agent sweeps.
+    Agents entirely behind the rear axle are followers and do not count, nor do those in ``ignored``, such as one that
+    ran into the agent without its fault. All others count, in any direction: one that overlaps within the horizon is
+    ahead or comes into the lane that the agent sweeps.
     """
-    me = frame.box[slot]
+    ego = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * me[LENGTH])
-    times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
+    counts = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * ego[LENGTH])
+    times = time_to_overlap(ego, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
 
 
@@ -159,6 +159,6 @@ def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scal
     Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
     """
     counts = others_on_level(frame, slot) & ~ignored
-    # Boxes of empty slots may hold anything; the agent's own box in their place keeps gradients finite.
+    # Boxes of empty slots are arbitrary; the agent's own box in their place keeps gradients finite.
     gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
     return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

@@ -23,12 +23,12 @@ from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, History, Motion
 
 #: Poses of a box centre or a rear axle: x, y (m), heading (rad).
 Poses = Float[Array, "n 3"]
-#: What the actuators do in a step: acceleration (m/s2), steering angle at its start (rad), steering rate (rad/s).
+#: Actuator states in a step: acceleration (m/s2), steering angle at its start (rad), steering rate (rad/s).
 Actuators = Float[Array, " 3"]
 ACCELERATION, STEERING, RATE = range(3)
-#: Weight of the first curvature, which a standing plan leaves open.
+#: Regularisation of the first curvature, which a plan without motion does not determine.
 _FIRST_CURVATURE = 1e-10
-#: Steps over which initial acceleration and steering are measured, and the distance below which a car stands, m.
+#: Steps over which initial acceleration and steering are measured; shorter distances over them are standstill, m.
 _RECENT, _STILL_M = 5, 0.5
 
 
@@ -41,7 +41,8 @@ class TrackingConfig:
         speed_weight, acceleration_weight: Costs of squared speed error and acceleration.
         lateral_weight, heading_weight, steering_weight, rate_weight: Costs of squared lateral error (m),
             heading error (rad), steering angle (rad) and steering rate (rad/s).
-        stopping_mps, stopping_gain: Below this speed a stopping car uses this gain, 1/s, instead.
+        stopping_mps, stopping_gain: Where actual and desired speed are below this speed, the acceleration is the speed
+            error times this gain, 1/s.
         acceleration_lag_s, steering_lag_s: Time constants of the actuators.
         most_steering: Largest steering angle, rad.
         wheelbase: Relative to the length (nuPlan's vehicle: 3.089 m of 5.176 m).
@@ -78,17 +79,16 @@ def steering_rate(
 ) -> Scalar:  # fmt: skip
     """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
 
-    x is (lateral error e, heading error h, steering angle d), and per step
-    ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z the state at the horizon for
-    ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``. Here x is ``error``, v ``speeds``,
-    k ``curvatures`` and L ``wheelbase``.
+    x = (lateral error e, heading error h, steering angle d) starts at ``error``. In a step with speed v, curvature k
+    and wheelbase L, ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z the state at
+    the horizon for ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``.
     """
     e, h, d = error
     be, bh, bd = (jnp.zeros(()) for _ in range(3))
     for step in range(config.horizon):
-        moved_m, k = speeds[step] * DT_S, curvatures[step]
-        e, h = e + moved_m * h, h + moved_m * (d / wheelbase - k)
-        be, bh, bd = be + moved_m * bh, bh + moved_m * bd / wheelbase, bd + DT_S
+        distance, k = speeds[step] * DT_S, curvatures[step]
+        e, h = e + distance * h, h + distance * (d / wheelbase - k)
+        be, bh, bd = be + distance * bh, bh + distance * bd / wheelbase, bd + DT_S
     h, d = wrap(h), wrap(d)
     q_e, q_h, q_d = config.lateral_weight, config.heading_weight, config.steering_weight
     gain = q_e * be * be + q_h * bh * bh + q_d * bd * bd + config.rate_weight
@@ -101,15 +101,15 @@ def fit_speeds(poses: Poses, config: TrackingConfig) -> Float[Array, " m"]:
     s is the displacement along the heading at the start of each step; ``v_k = v_0 + dt (a_0 + ... + a_(k-1))``, and the
     penalty is on ``(a_(k+1) - a_k)^2``. The solution is linear in s.
     """
-    moved, heading = jnp.diff(poses[:, :2], axis=0), poses[:-1, 2]
-    along = moved[:, 0] * jnp.cos(heading) + moved[:, 1] * jnp.sin(heading)
+    shift, heading = jnp.diff(poses[:, :2], axis=0), poses[:-1, 2]
+    along = shift[:, 0] * jnp.cos(heading) + shift[:, 1] * jnp.sin(heading)
     return jnp.asarray(_speed_fit(along.shape[0], config.jerk_penalty), along.dtype) @ along
 
 
 @functools.cache
 def _speed_fit(steps: int, penalty: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Matrix from displacements to fitted speeds."""
-    # Matrices that give the speeds and the changes of acceleration from the unknowns v_0, a_0, a_1, ...
+    """Return the matrix from displacements to fitted speeds."""
+    # Matrices from the unknowns v_0, a_0, a_1, ... to the speeds, and to the changes of acceleration.
     speeds = np.tri(steps) * DT_S
     speeds[:, 0] = 1.0
     jerk = np.diff(np.eye(steps)[1:], axis=0)
@@ -120,29 +120,30 @@ def _speed_fit(steps: int, penalty: float) -> np.ndarray[tuple[int, int], np.dty
 def fit_curvatures(poses: Poses, speeds: Float[Array, " m"], config: TrackingConfig) -> Float[Array, " m"]:
     """Curvatures k of the steps between poses: the least squares of ``dt v k - turn`` plus a penalty on their rate.
 
-    Written as ``k = c (1 - g) + u``, where u and g are what turns, and a first curvature of 1, leave for the later
-    curvatures (two tridiagonal systems), and c is the best first curvature: exact at any speed in single precision.
+    The solution is ``k = c (1 - g) + u``: u are the later curvatures for a first curvature of 0, ``1 - g`` their
+    derivative by the first one (two tridiagonal systems), and c is the first one. This elimination is exact at any
+    speed in single precision.
     """
-    turn, moved = wrap(jnp.diff(poses[:, 2])), speeds * DT_S
+    turn, distance = wrap(jnp.diff(poses[:, 2])), speeds * DT_S
     weight = config.curvature_rate_penalty / DT_S**2
-    size = moved.shape[0] - 1
-    diagonal = moved[1:] ** 2 + weight * jnp.where(jnp.arange(size) < size - 1, 2.0, 1.0)
+    size = distance.shape[0] - 1
+    diagonal = distance[1:] ** 2 + weight * jnp.where(jnp.arange(size) < size - 1, 2.0, 1.0)
     below, above = (jnp.full(size, -weight).at[end].set(0.0) for end in (0, -1))
-    right = jnp.stack([moved[1:] * turn[1:], moved[1:] ** 2], axis=-1)
-    u, g = jnp.pad(jax.lax.linalg.tridiagonal_solve(below, diagonal, above, right), ((1, 0), (0, 0))).T
-    first = jnp.sum(moved * (turn - moved * u)) / (jnp.sum(moved**2 * (1.0 - g)) + _FIRST_CURVATURE)
+    right_side = jnp.stack([distance[1:] * turn[1:], distance[1:] ** 2], axis=-1)
+    u, g = jnp.pad(jax.lax.linalg.tridiagonal_solve(below, diagonal, above, right_side), ((1, 0), (0, 0))).T
+    first = jnp.sum(distance * (turn - distance * u)) / (jnp.sum(distance**2 * (1.0 - g)) + _FIRST_CURVATURE)
     return first * (1.0 - g) + u
 
 
 def track(
     motion: Motion, plan: Poses, last: Actuators, length_m: Scalar, config: TrackingConfig
 ) -> Actuators:
-    """Return what the actuators do in the next step to follow a plan.
+    """Return the actuator states of the next step, in which the car follows a plan.
 
     Args:
         motion: Motion of the box centre.
-        plan: Planned poses of the box centre from now on, 0.1 s apart.
-        last: What the actuators did in the step before.
+        plan: Planned poses of the box centre from the present step on, 0.1 s apart.
+        last: Actuator states of the step before.
         length_m: Length of the car.
         config: Tracker and vehicle model.
     """
@@ -153,30 +154,28 @@ def track(
     curvatures = fit_curvatures(poses, speeds, config)
     curvatures = curvatures[np.minimum(np.arange(config.horizon), speeds.shape[0] - 1)]
     is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
-    gentle = config.stopping_gain * (desired - speed)
-    acceleration = jnp.where(is_stopping, gentle, acceleration_to(speed, desired, config))
+    stopping = config.stopping_gain * (desired - speed)
+    acceleration = jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config))
     cos, sin, offset = jnp.cos(poses[0, 2]), jnp.sin(poses[0, 2]), axle - poses[0]
     error = offset[1] * cos - offset[0] * sin, wrap(offset[2]), steering
     speeds_ahead = speed + acceleration * DT_S * np.arange(config.horizon)
     rate = steering_rate(error, speeds_ahead, curvatures, wheelbase, config)
     rate = jnp.where(is_stopping, 0.0, rate)
-    acceleration = last[ACCELERATION] + _lag_share(config.acceleration_lag_s) * (
-        acceleration - last[ACCELERATION]
-    )
-    acceleration = jnp.maximum(acceleration, -speed / DT_S)  # Never reverse.
+    change = _lag_share(config.acceleration_lag_s) * (acceleration - last[ACCELERATION])
+    acceleration = jnp.maximum(last[ACCELERATION] + change, -speed / DT_S)  # Never reverse.
     return jnp.stack([acceleration, steering, _lag_share(config.steering_lag_s) * rate])
 
 
 def recent_actuators(history: History, length_m: Scalar, config: TrackingConfig) -> Actuators:
     """Return mean acceleration and steering angle of the last half second of a motion, and no steering rate."""
     before, now = history[-1 - _RECENT], history[-1]
-    moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _RECENT * DT_S
-    turned = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
-    curvature = jnp.where(moved_m > _STILL_M, turned / jnp.maximum(moved_m, _STILL_M), 0.0)
+    distance_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _RECENT * DT_S
+    turn = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
+    curvature = jnp.where(distance_m > _STILL_M, turn / jnp.maximum(distance_m, _STILL_M), 0.0)
     steering = jnp.arctan(curvature * config.wheelbase * length_m)
     acceleration = (now[MOTION_SPEED] - before[MOTION_SPEED]) / (_RECENT * DT_S)
-    most = config.most_steering
-    return jnp.stack([acceleration, jnp.clip(steering, -most, most), jnp.zeros(())])
+    limit = config.most_steering
+    return jnp.stack([acceleration, jnp.clip(steering, -limit, limit), jnp.zeros(())])
 
 
 def steering_of(last: Actuators, config: TrackingConfig) -> Scalar:
@@ -186,22 +185,24 @@ def steering_of(last: Actuators, config: TrackingConfig) -> Scalar:
 
 def propagate(motion: Motion, actuators: Actuators, length_m: Scalar, config: TrackingConfig) -> Motion:
     """Return the motion of the box centre one step later: the rear axle moves at the present speed and steering."""
-    speed, moved = motion[MOTION_SPEED], motion[MOTION_SPEED] * DT_S
+    speed, distance = motion[MOTION_SPEED], motion[MOTION_SPEED] * DT_S
     x, y, heading = _rear_axle(motion[None, :3], length_m)[0]
-    turn = moved * jnp.tan(actuators[STEERING]) / (config.wheelbase * length_m)
-    x, y, heading = x + moved * jnp.cos(heading), y + moved * jnp.sin(heading), wrap(heading + turn)
-    ahead = REAR_AXLE * length_m
-    after = jnp.maximum(speed + actuators[ACCELERATION] * DT_S, 0.0)
-    return jnp.stack([x + ahead * jnp.cos(heading), y + ahead * jnp.sin(heading), heading, after])
+    turn = distance * jnp.tan(actuators[STEERING]) / (config.wheelbase * length_m)
+    x, y, heading = x + distance * jnp.cos(heading), y + distance * jnp.sin(heading), wrap(heading + turn)
+    to_centre = REAR_AXLE * length_m
+    next_speed = jnp.maximum(speed + actuators[ACCELERATION] * DT_S, 0.0)
+    return jnp.stack(
+        [x + to_centre * jnp.cos(heading), y + to_centre * jnp.sin(heading), heading, next_speed]
+    )
 
 
 def _rear_axle(poses: Poses, length_m: Scalar) -> Poses:
-    """Poses of the rear axle of box centres."""
+    """Return the poses of the rear axle from those of the box centre."""
     x, y, heading = poses.T
-    behind = REAR_AXLE * length_m
-    return jnp.stack([x - behind * jnp.cos(heading), y - behind * jnp.sin(heading), heading], axis=-1)
+    to_axle = REAR_AXLE * length_m
+    return jnp.stack([x - to_axle * jnp.cos(heading), y - to_axle * jnp.sin(heading), heading], axis=-1)
 
 
 def _lag_share(lag_s: float) -> float:
-    """Share of its error that an actuator with a time constant closes in a step."""
+    """Return the share of the error that a first-order lag closes in a step."""
     return DT_S / (DT_S + lag_s)

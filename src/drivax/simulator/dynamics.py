@@ -16,33 +16,41 @@ from drivax.simulator.types import Motion
 
 #: Grip limit |curvature| v^2, m/s2.
 GRIP_MPS2 = 8.0
-#: Shorter moves count as straight, m.
+#: Moves shorter than this are straight, m.
 _STILL_M = 0.1
-#: Least distance ahead of a point that pure pursuit steers to, m.
+#: Minimum distance ahead of a point that pure pursuit steers to, m.
 _MIN_PURSUIT_M = 1.0
-#: Gain on the along-track error when following a log, 1/s.
+#: Gain on the along-track error when following a log, 1/s2.
 _ALONG_GAIN = 1.0
 
 
 def bicycle(motion: Motion, acceleration: Scalar, curvature: Scalar) -> Motion:
     """Drive at an acceleration (m/s2) along an arc of a curvature (1/m, positive to the left).
 
-    A car that would reach a negative speed stops within the step after ``v^2 / (2 |a|)``: no creep, no reverse. Grip
-    limits the curvature at the present speed, ``|k| v^2 <= 8 m/s2``.
+    The position moves along the mean heading. Grip limits the curvature at the present speed, ``|k| v^2 <= 8 m/s2``.
     """
     x, y, heading, speed = motion[0], motion[1], motion[2], motion[3]
     limit = GRIP_MPS2 / jnp.maximum(speed * speed, 1e-3)
     curvature = jnp.clip(curvature, -limit, limit)
-    unclipped = speed + acceleration * DT_S
-    stops = unclipped < 0.0
-    after = jnp.where(stops, 0.0, unclipped)
-    braking = jnp.where(stops, -acceleration, 1.0)  # 1 if unused: gradients stay finite.
-    distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + after) / 2.0 * DT_S)
+    distance, next_speed = accelerate(speed, acceleration)
     turn = curvature * distance
     mean = heading + turn / 2.0
     return jnp.stack(
-        [x + distance * jnp.cos(mean), y + distance * jnp.sin(mean), wrap(heading + turn), after]
+        [x + distance * jnp.cos(mean), y + distance * jnp.sin(mean), wrap(heading + turn), next_speed]
     )
+
+
+def accelerate(speed: Float[Array, "*R"], acceleration: Float[Array, "*R"]) -> tuple[Array, Array]:
+    """Return the distance of a step at a constant acceleration (m), and the speed after it.
+
+    A car that would reach a negative speed stops within the step after ``v^2 / (2 |a|)``: no creep, no reverse.
+    """
+    unbounded = speed + acceleration * DT_S
+    stops = unbounded < 0.0
+    next_speed = jnp.where(stops, 0.0, unbounded)
+    braking = jnp.where(stops, -acceleration, 1.0)  # 1 if unused: gradients stay finite.
+    distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + next_speed) / 2.0 * DT_S)
+    return distance, next_speed
 
 
 def displace(motion: Motion, shift: Vector, turn: Scalar) -> Motion:
@@ -55,32 +63,32 @@ def displace(motion: Motion, shift: Vector, turn: Scalar) -> Motion:
 
 
 def displacement(motion: Motion, target: Motion) -> tuple[Vector, Scalar]:
-    """Return shift (ahead, left, m) and turn (rad) from a motion to another; the inverse of :func:`displace`."""
+    """Return shift (ahead, left, m) and turn (rad) from one motion to another; the inverse of :func:`displace`."""
     shift = rotate(target[:2] - motion[:2], jnp.cos(motion[2]), -jnp.sin(motion[2]))
     return shift, wrap(target[2] - motion[2])
 
 
 def command_between(before: Motion, now: Motion) -> tuple[Scalar, Scalar]:
-    """Return the acceleration and curvature by which :func:`bicycle` moved; below 0.1 m the move counts as straight."""
+    """Return the acceleration and curvature of :func:`bicycle` between two motions; moves below 0.1 m are straight."""
     distance = (before[3] + now[3]) / 2.0 * DT_S
     turn = wrap(now[2] - before[2])
     curvature = jnp.where(distance > _STILL_M, turn / jnp.maximum(distance, _STILL_M), 0.0)
     return (now[3] - before[3]) / DT_S, curvature
 
 
-def follow(motion: Motion, target: Motion, beyond: Motion) -> tuple[Scalar, Scalar]:
-    """Return acceleration and curvature that follow a log, from its motions one and two steps ahead.
+def follow(motion: Motion, target: Motion, next_target: Motion) -> tuple[Scalar, Scalar]:
+    """Return the acceleration and curvature that follow a log, from its motions one and two steps ahead.
 
-    The speed error is closed in one step, plus 1/s times the along-track error; the curvature is that of the circle
-    through the second position, straight below 0.1 m (semantics, ``expert_actions``).
+    The acceleration closes the speed error in one step, plus 1/s^2 times the along-track error; the curvature is that
+    of the circle through the second position, 0 for moves below 0.1 m (semantics, ``expert_actions``).
     """
     cos, sin = jnp.cos(motion[2]), jnp.sin(motion[2])
     # Position of the log relative to that of the car at the mean speed.
     ahead = target[:2] - motion[:2]
     along = ahead[0] * cos + ahead[1] * sin - (motion[3] + target[3]) / 2 * DT_S
     acceleration = (target[3] - motion[3]) / DT_S + _ALONG_GAIN * along
-    aim = beyond[:2] - motion[:2]
-    forward, left = aim[0] * cos + aim[1] * sin, aim[1] * cos - aim[0] * sin
+    offset = next_target[:2] - motion[:2]
+    forward, left = offset[0] * cos + offset[1] * sin, offset[1] * cos - offset[0] * sin
     squared = forward * forward + left * left
     curvature = jnp.where(squared > _STILL_M**2, 2.0 * left / jnp.maximum(squared, _STILL_M**2), 0.0)
     return acceleration, curvature
@@ -89,8 +97,8 @@ def follow(motion: Motion, target: Motion, beyond: Motion) -> tuple[Scalar, Scal
 def pursuit(pose: Float[Array, " pose"], offset: Float[Array, " 2"]) -> Scalar:
     """Return the curvature (1/m) of the arc from a pose to a point, 0 for a point less than 1 m ahead.
 
-    Pure pursuit (Coulter 1992): k = 2 y / L^2, for a point at (x, y) in the frame of the pose, at distance L. ``pose``
-    begins with x, y, cos and sin of the heading, as a box does; ``offset`` is that of the point from the pose.
+    Pure pursuit (Coulter 1992): ``k = 2 y / L^2`` for a point at (x, y) in the frame of the pose, at distance L.
+    ``pose`` begins with x, y, cos and sin of the heading, as a box does; ``offset`` points from the pose to the point.
     """
     forward = offset[0] * pose[2] + offset[1] * pose[3]
     left = offset[1] * pose[2] - offset[0] * pose[3]

@@ -12,19 +12,24 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 
-#: A stop before a right turn on red: slower than this, this near, within this many steps.
+#: A stop before a right turn on red: maximum speed, maximum distance to the line, and steps for which it is remembered.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
-#: Steps of the history in which a stop before the episode is looked for.
+#: Steps of the history that are searched for a stop before the episode.
 _LOOK_BACK_STEPS = 16
-#: Off the route, the heading of an agent this many steps after it crossed lines decides whose light counted.
+#: Steps after lines were crossed off the route at which the agent's heading decides which light counts.
 _DECISION_STEPS = 20
 
 
 def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "history 2"]:
     """Return the front bumper at every step of the context's history."""
     past = context.history
-    ahead = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
-    return past[:, :2] + ahead * length_m / 2
+    direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
+    return past[:, :2] + direction * length_m / 2
+
+
+def _pauses(speed: Float[Array, ""], distance_m: Float[Array, " L"]) -> Bool[Array, " L"]:
+    """Return a mask of the stop lines before which an agent stands, from its speed and the distances to the lines."""
+    return (speed < _PAUSE_MPS) & (distance_m >= 0.0) & (distance_m < _PAUSE_M)
 
 
 def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
@@ -35,34 +40,33 @@ def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
     fronts = _fronts(context, length)
     for age in range(_LOOK_BACK_STEPS - 1, -1, -1):
         front = fronts[-1 - age]
-        # Only the distance before each line is needed, not the crossing between two steps.
-        _, before_m = light_crossing(bank, context.index, front, front, ground)
-        stands = context.history[-1 - age, MOTION_SPEED] < _PAUSE_MPS
-        pause = jnp.where(stands & (before_m >= 0.0) & (before_m < _PAUSE_M), age, pause)
+        # With equal positions nothing crosses; the result is the distance to each line.
+        _, distance_m = light_crossing(bank, context.index, front, front, ground)
+        pause = jnp.where(_pauses(context.history[-1 - age, MOTION_SPEED], distance_m), age, pause)
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
 
 def forget_crossings(memory: LightMemory) -> LightMemory:
-    """Return the memory without lines that were crossed before the episode: they do not count in it."""
+    """Return the memory without the lines crossed before the episode, which do not count in it."""
     return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
 
 
 def check_lights(
-    bank: ScenarioBank, context: AgentContext, me: Float[Array, " 6"], ground: Float[Array, ""],
+    bank: ScenarioBank, context: AgentContext, ego: Float[Array, " 6"], ground: Float[Array, ""],
     on_route: Bool[Array, ""], memory: LightMemory,
 ) -> tuple[Bool[Array, ""], LightMemory]:  # fmt: skip
-    """Return whether a red-light violation was established at this step, and the new memory.
+    """Return whether a red-light violation is established at this step, and the new memory.
 
-    On the route only its own lights count, at once. Off it, of the lines crossed together the one counts whose lane
-    ends closest to the heading that the agent has two seconds later, or at the end of the log.
+    On the route only its own lights count, immediately. Off the route only one of the lines that are crossed together
+    counts: that whose lane ends closest to the agent's heading two seconds later, or at the end of the log.
     """
-    front_before, front = _fronts(context, me[LENGTH])[-2:]
-    crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
+    front_before, front = _fronts(context, ego[LENGTH])[-2:]
+    crossed, distance_m = light_crossing(bank, context.index, front_before, front, ground)
     last = bank.last_step[context.row]
     state = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
     state_before = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
     red = is_red(state) & is_red(state_before)
-    # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
+    # A right turn after a stop shortly before the line is lawful unless the light is a red arrow.
     arrow = (state == LightState.ARROW_STOP) | (state_before == LightState.ARROW_STOP)
     line = bank.light_line[context.index]
     red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
@@ -70,16 +74,15 @@ def check_lights(
     violation = (crossed & red & (arc < NEVER_M)).any() & on_route
 
     # Steps since a line was crossed off the route: positive if at red, else negative.
-    begins = crossed & ~on_route
-    age = jnp.where(begins, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
+    age = jnp.where(crossed & ~on_route, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
     # Crossings that are undecided when the log ends are decided then.
     due = (jnp.abs(age) > _DECISION_STEPS) | ((age != 0) & (context.step >= last))
     # Cosine of the angle to the end of the line's lane; -2 is below any cosine.
-    fit = jnp.where(due, line[LightRow.EXIT_COS] * me[COS] + line[LightRow.EXIT_SIN] * me[SIN], -2.0)
+    fit = jnp.where(due, line[LightRow.EXIT_COS] * ego[COS] + line[LightRow.EXIT_SIN] * ego[SIN], -2.0)
     violation |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
     age = jnp.where(due, 0, age)
-    stands = (context.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
-    pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
+    pauses = _pauses(context.history[-1, MOTION_SPEED], distance_m)
+    pause = jnp.where(pauses, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
     return violation, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
 
 

@@ -18,7 +18,7 @@ from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.simulator.contact import others_on_level
 from drivax.simulator.types import AgentContext, Frame
 
-#: Width of the transition where two faces of a box, or two signs of an angle, take over from each other (m, 1).
+#: Width of the smooth transitions in the maximum over separating axes (m), and in absolute sines and cosines.
 _BLEND_M, _BLEND_TURN = 0.03, 0.01
 #: Reach of edge queries, m.
 _EDGES_M = 3.0
@@ -34,7 +34,7 @@ def separation(box: Float[Array, " 6"], others: Float[Array, "S 6"]) -> Float[Ar
     dx, dy = others[:, X] - box[X], others[:, Y] - box[Y]
     cos = box[COS] * others[:, COS] + box[SIN] * others[:, SIN]
     sin = box[COS] * others[:, SIN] - box[SIN] * others[:, COS]
-    cos, sin = _magnitude(cos), _magnitude(sin)
+    cos, sin = _smooth_abs(cos), _smooth_abs(sin)
     (la, wa), (lb, wb) = (box[LENGTH] / 2, box[WIDTH] / 2), (others[:, LENGTH] / 2, others[:, WIDTH] / 2)
     along_a = (dx * box[COS] + dy * box[SIN], la + lb * cos + wb * sin)
     across_a = (dy * box[COS] - dx * box[SIN], wa + lb * sin + wb * cos)
@@ -48,21 +48,21 @@ def separation(box: Float[Array, " 6"], others: Float[Array, "S 6"]) -> Float[Ar
 def collision_potential(frame: Frame, slot: Integer, margin_m: float = 0.5) -> Float[Array, " S"]:
     """Return the potential of every other agent for the agent in ``slot``; gradients flow to all agents.
 
-    Positive where the boxes overlap (``contact.overlaps``); zero where one of the separating axes keeps them apart by
-    the margin (1.5 margins of distance always do), for the agent itself, for absent agents and on another level. The
+    Positive where the boxes overlap (``contact.overlaps``); zero where a separating axis has a gap of the margin or
+    more (always at a distance of 1.5 margins), for the agent itself, for absent agents and on another level. The
     margin must be at least 0.3 m, more for boxes longer than 20 m.
     """
-    potentials = _rise(separation(frame.box[slot], frame.box), margin_m)
+    potentials = _squared_hinge(separation(frame.box[slot], frame.box), margin_m)
     return jnp.where(others_on_level(frame, slot), potentials, 0.0)
 
 
 def offroad_potential(
     bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], ground: Scalar, margin_m: float = 0.5
 ) -> Scalar:
-    """Return the potential of the road edges for a box on ground of a height (m): the sum over its corners.
+    """Return the potential of the road edges: the sum over the corners of a box, whose ground is at a height, m.
 
-    Positive where a corner is off the road (0.3 m beyond an edge, as in the metric), zero where every corner is further
-    than the margin from that and where nothing is mapped. Further than 3 m beyond every edge it is constant.
+    Positive where a corner is off the road (0.3 m beyond an edge, as in the metric); zero where every corner is on the
+    road by the margin or more, and without a map; constant further than 3 m beyond every edge.
 
     Raises:
         UsageError: The margin is wider than 3 m, the reach of edge queries.
@@ -71,22 +71,23 @@ def offroad_potential(
         raise UsageError(f"margin_m is {margin_m:g}", cure=f"use at most {_EDGES_M:g}")
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
-    beyond = offroad_distance(bank, index, box[:2], points, near, ground)
-    return jnp.where(is_mapped(bank, index), _rise(OFFROAD_TOLERANCE_M - beyond, margin_m).sum(), 0.0)
+    offroad_m = offroad_distance(bank, index, box[:2], points, near, ground)
+    has_map = is_mapped(bank, index)
+    return jnp.where(has_map, _squared_hinge(OFFROAD_TOLERANCE_M - offroad_m, margin_m).sum(), 0.0)
 
 
 def fault_potential(bank: ScenarioBank, context: AgentContext, frame: Frame, margin_m: float = 0.5) -> Scalar:
-    """Return the sum of both potentials of the driven agent; ``frame`` holds all agents (``Simulator.frame``)."""
+    """Return the sum of the driven agent's potentials; ``frame`` holds all agents (``Simulator.frame``)."""
     ground = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
     offroad = offroad_potential(bank, context.index, frame.box[context.slot], ground, margin_m)
     return offroad + collision_potential(frame, context.slot, margin_m).sum()
 
 
-def _rise(distance: Float[Array, " K"], margin_m: float) -> Float[Array, " K"]:
-    """Return the potential of a distance: 0 from the margin on, 1 at 0, more below."""
+def _squared_hinge(distance: Float[Array, " K"], margin_m: float) -> Float[Array, " K"]:
+    """Return ``max(0, 1 - distance / margin)^2``."""
     return jnp.maximum(1.0 - distance / margin_m, 0.0) ** 2
 
 
-def _magnitude(value: Float[Array, " S"]) -> Float[Array, " S"]:
-    """Return the absolute value with a rounded tip; never larger, and smaller by at most the blend."""
+def _smooth_abs(value: Float[Array, " S"]) -> Float[Array, " S"]:
+    """Return a smooth lower bound of the absolute value, at most ``_BLEND_TURN`` below it."""
     return jnp.sqrt(value * value + _BLEND_TURN**2) - _BLEND_TURN

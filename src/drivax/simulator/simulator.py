@@ -32,15 +32,15 @@ from drivax.simulator.types import (
     Transition,
 )
 
-#: Elements that :func:`map_where` computes at a time: in most steps fewer episodes start, and vectors are filled.
+#: Elements that :func:`map_where` computes at a time: few steps start more episodes, and 8 floats fill a vector.
 AT_ONCE = 8
-#: The next state, and the step to it.
+#: The next state, and the transition to it.
 Step = tuple[SimState, Transition]
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """Simulate a task with a traffic model and a start; holds configuration only.
+    """Simulator of a task with a traffic model and a start; it holds configuration only.
 
     Functions are unbatched: ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
     :meth:`step_or_reset` is for collectors.
@@ -59,12 +59,12 @@ class Simulator:
 
     def _initial_state(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext) -> SimState:
         """Return the first state of an episode."""
-        now = self.frame(bank, context, driven, 0)
+        frame = self.frame(bank, context, driven, 0)
         # Overlaps at the start are ignored until they separate, as if all agents had just appeared. No fault is
         # classified, so no previous frame is needed.
-        contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
+        contacts = jnp.full(frame.valid.shape, int(Contact.ABSENT), jnp.int8)
         lights = remember_lights(bank, context)
-        situation, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
+        situation, contacts, lights = measure(bank, context, frame, frame, contacts, lights, self.task.reads)
         episode, step = self.task.episode_start(), situation.context.step
         return SimState(situation.context, situation.facts, contacts, forget_crossings(lights), episode, step)
 
@@ -81,7 +81,7 @@ class Simulator:
         context = AgentContext(index, step, slot, history, action, route_m, z, traffic, route, conditions)
         if isinstance(self.start, LogStart):
             return context
-        # Other starts avoid the agents around, whose rows the traffic model gives for the logged context.
+        # Other starts avoid the agents around ego; the traffic model returns their rows for the logged context.
         agents = self.traffic.agents(bank, context, 0)
         history, route_m = self.start.begin(bank, index, step, slot, agents, key)
         action = self.task.first_action(history, bank.length_m(index, slot))
@@ -98,15 +98,15 @@ class Simulator:
         self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int,
         slots: Int[Array, " S"] | None = None,
     ) -> Frame:  # fmt: skip
-        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses.
+        """Return the frame ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses.
 
-        ``slots`` selects agents.
+        ``slots`` selects agents; the default is all.
         """
         agents = self.traffic.agents(bank, context, back)
         return frame_of(bank, context.index, context.step, agents, driven, back, slots)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
-        """Return all agents now, around one driven agent."""
+        """Return the present frame of a single driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
     def step(self, bank: ScenarioBank, state: SimState, action: Action) -> Step:
@@ -114,7 +114,7 @@ class Simulator:
         return self._drive(bank, state, action, None)
 
     def replay(self, bank: ScenarioBank, state: SimState, motion: Motion, action: Action) -> Step:
-        """Move the agent to ``motion`` without dynamics (exact expert); ``action`` is only recorded."""
+        """Move the agent to ``motion`` without dynamics (exact expert); the transition records ``action``."""
         return self._drive(bank, state, action, motion)
 
     def reset_together(
@@ -129,30 +129,30 @@ class Simulator:
         return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)
 
     def step_together(
-        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None,
-        fresh: EpisodeStart | None = None,
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], done: Any = None,
+        starts: EpisodeStart | None = None,
     ) -> Step:  # fmt: skip
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
-        Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``over`` is the
-        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. Given ``fresh``, the
-        stacked :meth:`new_episode` of K agents, all start these once all are over; see :meth:`step_or_reset`.
+        Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``done`` is the
+        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. Once all are done, all
+        begin the episodes ``starts`` (stacked :meth:`new_episode` of K agents); see :meth:`step_or_reset`.
         """
-        over = jnp.zeros(actions.shape[0], bool) if over is None else over
+        done = jnp.zeros(actions.shape[0], bool) if done is None else done
         first = _first(states.context)
-        seen = self.frame(bank, first, states.context, 0)
-        traffic = self.traffic.advance(bank, first, seen)
-        moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
-        if fresh is not None:
-            moved = jax.tree.map(partial(jnp.where, over.all()), fresh.context, moved)
-            states = jax.vmap(_forget, (0, 0, None))(states, fresh, over.all())
-        finish = jax.vmap(lambda s, m, a: self._finish_step(bank, s, m, moved, seen, a))
-        after, transition = finish(states, moved, actions)
-        counts = is_driven(bank, after) & ~over
-        choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
-        after = replace(after, episode=choose(counts, after.episode, states.episode))
-        if fresh is not None:
-            after = jax.vmap(self._restart, (0, None))(after, over.all())
+        frame = self.frame(bank, first, states.context, 0)
+        traffic = self.traffic.advance(bank, first, frame)
+        contexts = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
+        if starts is not None:
+            contexts = jax.tree.map(partial(jnp.where, done.all()), starts.context, contexts)
+            states = jax.vmap(_clear_memory, (0, 0, None))(states, starts, done.all())
+        finish = jax.vmap(lambda s, c, a: self._finish_step(bank, s, c, contexts, frame, a))
+        after, transition = finish(states, contexts, actions)
+        counts = is_driven(bank, after) & ~done
+        select = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
+        after = replace(after, episode=select(counts, after.episode, states.episode))
+        if starts is not None:
+            after = jax.vmap(self._start_metrics, (0, None))(after, done.all())
         terms = {name: jnp.where(counts, term, 0.0) for name, term in transition.reward_terms.items()}
         ends = {name: getattr(transition, name) & counts for name in ("terminated", "truncated")}
         reward = jnp.where(counts, transition.reward, 0.0)
@@ -180,44 +180,44 @@ class Simulator:
         return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_reset(
-        self, bank: ScenarioBank, state: SimState, action: Action, over: Bool[Array, ""],
-        fresh: EpisodeStart, seen: Frame | None = None,
+        self, bank: ScenarioBank, state: SimState, action: Action, done: Bool[Array, ""],
+        start: EpisodeStart, frame: Frame | None = None,
     ) -> Step:  # fmt: skip
-        """Step, or start a new episode where the current one is ``over``.
+        """Step, or begin the episode ``start`` where the current one is ``done``.
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
         exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
-        ``fresh`` (:meth:`new_episode`) is read only where ``over``, so :func:`map_where` need not compute the others.
-        ``seen`` is ``now(bank, state.context)``, if already computed.
+        ``start`` (:meth:`new_episode`) is read only where ``done``, so :func:`map_where` need not compute the others.
+        ``frame`` is ``now(bank, state.context)``, if already computed.
         """
-        seen = self.now(bank, state.context) if seen is None else seen
-        traffic = self.traffic.advance(bank, state.context, seen)
-        moved = self._move_agent(bank, state.context, action, None, traffic)
-        context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
-        before = _forget(state, fresh, over)
-        after, transition = self._finish_step(bank, before, context, alone(context), seen, action)
-        after = self._restart(after, over)
-        flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
+        frame = self.now(bank, state.context) if frame is None else frame
+        traffic = self.traffic.advance(bank, state.context, frame)
+        context = self._move_agent(bank, state.context, action, None, traffic)
+        context = jax.tree.map(partial(jnp.where, done), start.context, context)
+        before = _clear_memory(state, start, done)
+        after, transition = self._finish_step(bank, before, context, alone(context), frame, action)
+        after = self._start_metrics(after, done)
+        flags = {name: getattr(transition, name) & ~done for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
-    def _restart(self, after: SimState, over: Bool[Array, ""]) -> SimState:
-        """Return the state after a step, as the first of a new episode where the last one is ``over``."""
+    def _start_metrics(self, after: SimState, done: Bool[Array, ""]) -> SimState:
+        """Clear the metrics and the crossed stop lines where the previous episode is ``done``."""
         first = self.task.episode_start()
-        episode = jax.tree.map(partial(jnp.where, over), first, after.episode)
-        lights = jax.tree.map(partial(jnp.where, over), forget_crossings(after.lights), after.lights)
+        episode = jax.tree.map(partial(jnp.where, done), first, after.episode)
+        lights = jax.tree.map(partial(jnp.where, done), forget_crossings(after.lights), after.lights)
         return replace(after, episode=episode, lights=lights)
 
     def _drive(self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None) -> Step:
-        """Drive one step by ``action``, or to ``motion`` if that is given."""
-        seen = self.now(bank, state.context)
-        traffic = self.traffic.advance(bank, state.context, seen)
-        moved = self._move_agent(bank, state.context, action, motion, traffic)
-        return self._finish_step(bank, state, moved, alone(moved), seen, action)
+        """Drive one step by ``action``, or to ``motion`` unless it is None."""
+        frame = self.now(bank, state.context)
+        traffic = self.traffic.advance(bank, state.context, frame)
+        context = self._move_agent(bank, state.context, action, motion, traffic)
+        return self._finish_step(bank, state, context, alone(context), frame, action)
 
     def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
     ) -> AgentContext:
-        """Move the driven agent one step, given traffic that has already moved."""
+        """Return the context of the driven agent one step later; ``traffic`` is the traffic state of that step."""
         if motion is None:
             action = self.task.actuate(bank, context, action)
             length_m = bank.length_m(context.index, context.slot)
@@ -226,20 +226,28 @@ class Simulator:
         return replace(context, step=context.step + 1, history=history, action=action, traffic=traffic)
 
     def _finish_step(
-        self, bank: ScenarioBank, before: SimState, moved: AgentContext, driven: AgentContext, seen: Frame,
-        action: Array,
+        self, bank: ScenarioBank, before: SimState, context: AgentContext, driven: AgentContext,
+        previous: Frame, action: Array,
     ) -> Step:  # fmt: skip
         """Measure an agent after all agents have moved, and build the transition.
 
-        ``driven`` stacks the contexts of all driven agents; ``seen`` is the frame before the step.
+        ``context`` is the agent's after the step; ``driven`` stacks those of all driven agents; ``previous`` is the
+        frame before the step.
         """
-        now = self.frame(bank, _first(driven), driven, 0)
+        frame = self.frame(bank, _first(driven), driven, 0)
         situation, contacts, lights = measure(
-            bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
+            bank,
+            context,
+            frame,
+            previous,
+            before.contacts,
+            before.lights,
+            self.task.reads,
+            before.facts.strand,
         )
         terminated, truncated = self.task.check_end(bank, situation.context, situation.facts)
-        terms = self.task.reward(before.facts, situation.facts, situation.surroundings, moved.conditions)
-        final = terminated | truncated | (moved.step >= bank.last_step[moved.row])
+        terms = self.task.reward(before.facts, situation.facts, situation.surroundings, context.conditions)
+        final = terminated | truncated | (context.step >= bank.last_step[context.row])
         episode = self.task.episode_add(before.episode, situation, before.start, final)
         after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
@@ -247,27 +255,30 @@ class Simulator:
 
 
 def _first(driven: AgentContext) -> AgentContext:
-    """Return the context of the first driven agent, whose frame is that of all: computed once where they are mapped."""
+    """Return the context of the first driven agent.
+
+    All share its frame, which is then independent of the agent: ``vmap`` over agents computes it once.
+    """
     return jax.tree.map(lambda leaf: leaf[0], driven)
 
 
-def _forget(state: SimState, fresh: EpisodeStart, over: Bool[Array, ""]) -> SimState:
-    """Return the state before a step, without what may not reach the episode that starts where it is ``over``."""
+def _clear_memory(state: SimState, start: EpisodeStart, done: Bool[Array, ""]) -> SimState:
+    """Replace the memory of an episode that is ``done`` by that of the next, which begins at ``start``."""
     return replace(
         state,
-        facts=forget_strand(state.facts, over),
-        contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
-        lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
-        start=jnp.where(over, fresh.context.step, state.start),
+        facts=forget_strand(state.facts, done),
+        contacts=jnp.where(done, jnp.int8(Contact.ABSENT), state.contacts),
+        lights=jax.tree.map(partial(jnp.where, done), start.lights, state.lights),
+        start=jnp.where(done, start.context.step, state.start),
     )
 
 
 def slots_of(
     bank: ScenarioBank, index: Any, mask: Bool[Array, " A"], count: int, step: Any = CURRENT_STEP
 ) -> Int[Array, " K"]:
-    """Return ``count`` slots of the moving agents of a mask that the log has at ``step``.
+    """Return the slots of the first ``count`` moving agents in a mask that the log has at ``step``.
 
-    Missing ones are padded with A (an empty slot); further agents are left to traffic.
+    If there are fewer, the result is padded with A, an empty slot.
     """
     present = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
     return jnp.nonzero(present, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
@@ -278,21 +289,21 @@ def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
     return states.context.slot < bank.agents.shape[2]
 
 
-def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
-    """``jax.vmap(function)`` where ``requested``, zeros elsewhere; cost grows with the number requested.
+def map_where(mask: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Apply ``jax.vmap(function)`` where ``mask`` is true; results elsewhere are zero.
 
-    ``function`` maps one element of each argument (pytrees of arrays ``[B, ...]``) to a pytree of arrays. A loop
-    computes 8 elements at a time; it has no reverse-mode derivative.
+    ``function`` maps one element of each argument (pytrees of arrays ``[B, ...]``) to a pytree of arrays. The cost
+    grows with the number of true elements: a loop computes 8 at a time. It has no reverse-mode derivative.
     """
-    count, batched = requested.shape[0], jax.vmap(function)
+    count, batched = mask.shape[0], jax.vmap(function)
     chunk = min(AT_ONCE, count)
     element = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], arguments))
     zeros = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), element)
-    # The first requested element ranks highest; top_k of floats is the cheapest way to find a few of them.
+    # The first element ranks highest; top_k of floats is the cheapest way to find the first few.
     rank = jnp.arange(count, 0, -1).astype(jnp.float32)
 
     def compute(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        """Compute the next elements; those that fill up the last chunk have index ``count``, which is dropped."""
+        """Compute the next chunk; the index ``count`` pads the last one, and its results are dropped."""
         remaining, results = carry
         top_rank, index = jax.lax.top_k(jnp.where(remaining, rank, 0.0), chunk)
         index = jnp.where(top_rank > 0.0, index, count)
@@ -300,4 +311,4 @@ def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *argum
         results = jax.tree.map(lambda total, value: total.at[index].set(value, mode="drop"), results, values)
         return remaining.at[index].set(False, mode="drop"), results
 
-    return jax.lax.while_loop(lambda carry: carry[0].any(), compute, (requested, zeros))[1]
+    return jax.lax.while_loop(lambda carry: carry[0].any(), compute, (mask, zeros))[1]

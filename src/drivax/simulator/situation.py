@@ -34,11 +34,11 @@ from drivax.simulator.types import (
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
-#: How far back a lane change at the start of an episode is looked for, steps.
+#: Steps before the start of an episode in which a lane change may begin.
 _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
-#: Steps in a second; a log that moves less than this stands, m (semantics, ``progress_ratio``).
+#: Steps in a second; distance below which a log stands still, m (semantics, ``progress_ratio``).
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that compare with the log's schedule.
 _SCHEDULE = frozenset({"late_m", "early_m", "completed"})
@@ -57,27 +57,26 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    ``context`` has the present step and motion, but ``route_m`` and ``z`` of the step before; ``contacts`` and
-    ``lights`` are those of the step before. ``frame`` and ``previous`` are all agents now and one step ago. ``strand``
-    is the previous fact of that name (None at the start of an episode). Facts that ``reads`` does not name are None and
-    not computed.
+    ``context`` has the present step and motion; its ``route_m`` and ``z``, ``contacts``, ``lights`` and the fact
+    ``strand`` (None at the start of an episode) are those of the step before. ``frame`` and ``previous`` are all agents
+    now and one step before. Facts that ``reads`` does not name are None and not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
     """
     around = surroundings(bank, context, frame)
-    lanes, route, me = around.lanes, around.route, frame.box[context.slot]
+    lanes, route, ego = around.lanes, around.route, frame.box[context.slot]
     ground = _ground(bank, context, frame)
-    offroad_m, left_map, offroad = off_the_road(bank, context.index, me, ground, lanes)
+    offroad_m, left_map, offroad = measure_offroad(bank, context.index, ego, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
-    # Not ``offroad``: a lateral hit is a fault in a scenario without a map, too.
+    # Not ``offroad``, which is false without a map: there, too, a lateral hit is a fault.
     unlawful = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
     codes, fault, kind, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
     routed = has_route(bank, context)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
-        red, lights = check_lights(bank, context, me, ground, on_route, lights)
+        red, lights = check_lights(bank, context, ego, ground, on_route, lights)
     now, logged = context.history[-1], bank.agents[context.index, context.step, context.slot]
     acceleration, jerk, lateral = _rates(context.history)
     facts = Facts(
@@ -108,14 +107,14 @@ def measure(
         jerk_mps3=jerk,
         **_requested_facts(bank, context, frame, codes, reads, strand),
     )
-    return Situation(context, _drop_unread(facts, reads), around), codes, lights
+    return Situation(context, _select_facts(facts, reads), around), codes, lights
 
 
-def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
-    """Set the ``strand`` fact, if it is measured, to -1 (none) where the episode is ``over``."""
+def forget_strand(facts: Facts, done: Bool[Array, ""]) -> Facts:
+    """Set the ``strand`` fact, if it is measured, to -1 (none) where the episode is ``done``."""
 
     def forget(path: tuple[Any, ...], fact: Array) -> Array:
-        return jnp.where(over, jnp.int16(-1), fact) if path[0].name == "strand" else fact
+        return jnp.where(done, jnp.int16(-1), fact) if path[0].name == "strand" else fact
 
     # As a tree: facts that are not read are None, which the constructor refuses under type checks.
     return jax.tree_util.tree_map_with_path(forget, facts)
@@ -123,24 +122,22 @@ def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
 
 def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Surroundings:
     """Return all agents, the lanes around the driven agent, and its position on its route."""
-    me = frame.box[context.slot]
-    ground = _ground(bank, context, frame)
-    routed, pose = context.slot == bank.ego_slot(context.row), (me[:2], me[2:4], corners(me))
-    lanes = queries.around_lanes(bank, context.index, *pose, ground, routed, context.row)
-    # Room for the step itself and for the way along a bend, which is longer on the route.
+    ego, ground = frame.box[context.slot], _ground(bank, context, frame)
+    is_ego, pose = context.slot == bank.ego_slot(context.row), (ego[:2], ego[2:4], corners(ego))
+    lanes = queries.around_lanes(bank, context.index, *pose, ground, is_ego, context.row)
+    # A step may be longer along the route, on the outside of a bend.
     ahead_m = 1.5 * _step_length(context) + 2.0
-    return Surroundings(
-        frame, lanes, queries.project_on_route(bank, context.row, me[:2], context.route_m, ahead_m)
-    )
+    route = queries.project_on_route(bank, context.row, ego[:2], context.route_m, ahead_m)
+    return Surroundings(frame, lanes, route)
 
 
 def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
-    """Height of the ground under the driven agent, m."""
+    """Return the height of the ground under the driven agent, m."""
     return frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
 
 
 def _step_length(context: AgentContext) -> Scalar:
-    """Distance that the driven agent moved in the last step, m."""
+    """Return the distance of the driven agent's last step, m."""
     return norm(context.history[-1, :2] - context.history[-2, :2])
 
 
@@ -150,28 +147,27 @@ def _measure_contacts(
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
     """Return contact codes, whether a new contact is at fault, its type, and time to collision.
 
-    Values that ``reads`` does not need are zero; without any of them codes stay unchanged.
+    Values that ``reads`` does not need are zero; if it needs no contacts, the codes stay unchanged.
     """
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
         return contacts, fault.any(), kind, ttc
     touching = contact.overlaps(frame, context.slot)
     if reads & _FAULTS:
-        fresh = contact.first_contacts(contacts, touching)
+        begins = contact.first_contacts(contacts, touching)
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
         others_speed = jnp.where(previous.valid, _speeds(previous), 0.0)
         others_speed = jnp.maximum(_speeds(frame), others_speed)
-        fault, kind = contact.classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
+        fault, kind = contact.classify_contacts(frame, context.slot, begins, speed, others_speed, unlawful)
     codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ttc = contact.time_to_collision(
-            frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT)
-        )
+        ignored = (codes == Contact.IGNORED) | (codes == Contact.HIT)
+        ttc = contact.time_to_collision(frame, context.slot, ignored)
     return codes, fault.any(), kind, ttc
 
 
 def _speeds(frame: Frame) -> Float[Array, " S"]:
-    # By coordinate: XLA sums slowly over an axis of two.
+    """Return the speed of every slot, by coordinate: XLA sums slowly over an axis of two."""
     return root(frame.velocity[:, 0] ** 2 + frame.velocity[:, 1] ** 2)
 
 
@@ -180,67 +176,71 @@ def _requested_facts(
     strand: Any,
 ) -> dict[str, Array]:  # fmt: skip
     """Return the facts measured on request; those outside ``reads`` are zero."""
-    facts: dict[str, Array] = dict.fromkeys(("gap_m", "lag_m", "time_gap_s"), jnp.zeros(()))
-    facts |= dict.fromkeys(_SCHEDULE, jnp.zeros(()))
-    if reads & _SCHEDULE:
-        facts |= _schedule(bank, context)
+    facts: dict[str, Array] = dict.fromkeys(ON_REQUEST, jnp.zeros(()))
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
+    if reads & _SCHEDULE:
+        facts |= _schedule_facts(bank, context)
     if "gap_m" in reads:
         facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "time_gap_s" in reads:
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], STOPPED_MPS)
         facts["time_gap_s"] = jnp.clip(leader_gap(bank, context, frame) / speed, 0.0, LONGEST_GAP_S)
     if "lag_m" in reads:
-        me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
-        facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
+        ego, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
+        facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - ego[:2]) * ego[2:4])
     if reads & _PASSAGES:
-        ground, me = _ground(bank, context, frame), frame.box[context.slot]
-        if strand is None:
-            # An agent that changes lanes at the start comes from its pose 15 steps ago.
-            x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
-            heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
-            strand = queries.lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
-        passage = queries.lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
-        facts |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
+        facts |= _passage_facts(bank, context, frame, strand)
     return facts
 
 
-def _schedule(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
-    """Return the facts that compare the way on the route with that of the log at the same time."""
-    way, last = bank.log_progress[context.row], bank.last_step[context.row]
+def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, strand: Any) -> dict[str, Array]:
+    """Return the facts of lane passages; ``strand`` is that of the step before, None at the start of an episode."""
+    ego, ground = frame.box[context.slot], _ground(bank, context, frame)
+    if strand is None:
+        # An agent that changes lanes at the start comes from its pose 15 steps ago.
+        x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
+        heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
+        strand = queries.lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
+    passage = queries.lane_passage(bank, context.index, ego[:2], ego[2:4], ground, strand)
+    return {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
+
+
+def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
+    """Return the facts that compare the progress on the route with that of the log at the same step."""
+    log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
     step = jnp.minimum(context.step + _SECOND, last)
-    final = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]
+    velocity = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]
     # After its end the log continues at its last speed.
-    later = way[step] + norm(final) * (context.step + _SECOND - step) * DT_S
-    whole, done = way[last] - way[CURRENT_STEP], context.route_m - way[CURRENT_STEP]
-    moves = whole >= _STANDS_M
-    completed = jnp.where(moves, jnp.clip(done / jnp.where(moves, whole, 1.0), 0.0, 1.0), 1.0)
-    late_m, early_m = way[context.step] - context.route_m, context.route_m - later
+    later_m = log_m[step] + norm(velocity) * (context.step + _SECOND - step) * DT_S
+    log_gain, gain = log_m[last] - log_m[CURRENT_STEP], context.route_m - log_m[CURRENT_STEP]
+    moves = log_gain >= _STANDS_M
+    completed = jnp.where(moves, jnp.clip(gain / jnp.where(moves, log_gain, 1.0), 0.0, 1.0), 1.0)
+    late_m, early_m = log_m[context.step] - context.route_m, context.route_m - later_m
     return {"late_m": late_m, "early_m": early_m, "completed": completed}
 
 
-def _drop_unread(facts: Facts, reads: frozenset[str]) -> Facts:
-    """Return the facts with None in place of those that are not requested."""
-    # The next passage is evaluated from the strand of this one.
-    desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
+def _select_facts(facts: Facts, reads: frozenset[str]) -> Facts:
+    """Replace facts that are not requested by None."""
+    # The next step's lane passage starts from the strand of this one.
+    names = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
-    def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
-        """Return the fact if it is read; as a tree, for the reason in :func:`forget_strand`."""
-        return fact if path[0].name in desired else None
+    def select(path: tuple[Any, ...], fact: Array) -> Array | None:
+        return fact if path[0].name in names else None
 
-    return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
+    # As a tree, for the reason in :func:`forget_strand`.
+    return facts if names >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(select, facts)
 
 
-def off_the_road(
-    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
+def measure_offroad(
+    bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], ground: Scalar, lanes: queries.LaneHits
 ) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """Return how far the worst corner of a box is off the road (m), whether the box left the map, and the road.
+    """Return the largest distance of a corner beyond the road's edge (m), and the facts ``left_map`` and ``offroad``.
 
-    Without a map it left neither, whatever the distance.
+    Without a map both facts are false, whatever the distance.
     """
-    offroad_m = queries.offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
-    off = (offroad_m > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
-    return offroad_m, queries.left_the_map(bank, index, me[:2]), off
+    offroad_m = queries.offroad_distance(bank, index, box[:2], corners(box), lanes.points_near, ground).max()
+    offroad = (offroad_m > queries.OFFROAD_TOLERANCE_M) & queries.is_mapped(bank, index)
+    return offroad_m, queries.left_the_map(bank, index, box[:2]), offroad
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
@@ -248,6 +248,6 @@ def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
     speed, heading = history[:, MOTION_SPEED], history[:, MOTION_HEADING]
     n, span_s = _RATE_STEPS, _RATE_STEPS * DT_S
     acceleration = (speed[-1] - speed[-1 - n]) / span_s
-    before = (speed[-1 - n] - speed[-1 - 2 * n]) / span_s
+    previous = (speed[-1 - n] - speed[-1 - 2 * n]) / span_s
     yaw_rate = wrap(heading[-1] - heading[-1 - n]) / span_s
-    return acceleration, (acceleration - before) / span_s, yaw_rate * speed[-1]
+    return acceleration, (acceleration - previous) / span_s, yaw_rate * speed[-1]

@@ -19,7 +19,7 @@ from drivax.scenario.bank.queries import around_lanes, project_on_route
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
-from drivax.simulator.situation import off_the_road
+from drivax.simulator.situation import measure_offroad
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
 from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, History
 
@@ -28,11 +28,11 @@ Rows = Float[Array, "A 8"]
 
 #: Acceleration (m/s2) and curvature (1/m) of an action of 1 in the published description.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
-#: Share of the acceleration when strong; mild is anything from 0 to the upper end.
+#: Range of a strong acceleration, relative to an action of 1; a mild one is between 0 and the upper end.
 _STRONG_ACCELERATION = (0.54, 0.6)
-#: Share of the curvature's bound when strong; mild is anything from 0 to 1.
+#: Range of a strong curvature, relative to its bound; a mild one is between 0 and 1.
 _STRONG_CURVATURE = (0.9, 1.0)
-#: The curvature's bound falls linearly from the first at 0 m/s to the second at this speed.
+#: The curvature's bound falls linearly from the first value at standstill to the second at this speed.
 _BOUND, _BOUND_MPS = (0.4, 0.03), 40.0 / 3.6
 
 
@@ -66,9 +66,10 @@ class NoisyStart:
     """Start after one second of driving with one perturbed action (V-Max, ``noisy_init``).
 
     Three quarters of the draws are strong (acceleration 3.24 to 3.6 m/s2, nearly the largest curvature), the others
-    mild (uniform up to that), left or right with equal odds. The largest curvature is 0.12 1/m at a standstill and
-    0.009 1/m from 40 km/h on. A draw that ends in a collision, off the road or off the map is rejected; if all tries
-    fail, the episode starts as logged. Unlike the publication, the steps before the start count for no metric.
+    mild (uniform from 0 to the strong maximum), left or right with equal odds. The largest curvature is 0.12 1/m at
+    standstill and 0.009 1/m from 40 km/h on. A draw that ends in a collision, off the road or off the map is rejected;
+    if all draws are, the episode starts as logged. Unlike in the publication, no metric counts the steps before the
+    start.
 
     Attributes:
         steps: Perturbed steps; fewer where the log starts later.
@@ -96,23 +97,23 @@ class NoisyStart:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
         # Only steps at which the log has the agent are replaced.
         back = jnp.arange(1, self.steps + 1)
-        known = bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0
-        known &= back <= step
-        count = jnp.cumprod(known.astype(jnp.int32)).sum()
+        in_log = bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0
+        in_log &= back <= step
+        count = jnp.cumprod(in_log.astype(jnp.int32)).sum()
         base = logged_history(bank, index, step - count, slot)
 
         def draw_history(key: Array) -> tuple[History, Bool[Array, ""]]:
-            """Draw a history and whether it is acceptable."""
+            """Draw a history, and return whether it is acceptable."""
             history = self._unroll(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
-            return history, _acceptable(bank, index, step, slot, agents, history)
+            return history, _is_acceptable(bank, index, step, slot, agents, history)
 
-        histories, good = jax.vmap(draw_history)(jax.random.split(key, self.tries))
-        logged, logged_m = LogStart().begin(bank, index, step, slot)
-        history = jnp.where(good.any(), histories[jnp.argmax(good)], logged)
+        histories, acceptable = jax.vmap(draw_history)(jax.random.split(key, self.tries))
+        log_history, log_route_m = LogStart().begin(bank, index, step, slot)
+        history = jnp.where(acceptable.any(), histories[jnp.argmax(acceptable)], log_history)
         row = bank.row_of(index, slot)
-        near_m = bank.log_progress[row, step - count]
-        along_m = project_on_route(bank, row, history[-1, :2], near_m).along_m
-        return history, jnp.where(good.any(), jnp.maximum(along_m, near_m), logged_m)
+        base_m = bank.log_progress[row, step - count]
+        along_m = project_on_route(bank, row, history[-1, :2], base_m).along_m
+        return history, jnp.where(acceptable.any(), jnp.maximum(along_m, base_m), log_route_m)
 
     def draw(self, key: Array, speed: Scalar) -> tuple[Scalar, Scalar]:
         """Draw an acceleration (m/s2) and a curvature (1/m) for a speed."""
@@ -127,24 +128,24 @@ class NoisyStart:
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
     def _unroll(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
-        """Return a history after ``count`` steps of one action."""
+        """Return the history after ``count`` steps of one action."""
 
         def advance(history: Array, step: Array) -> tuple[Array, None]:
             """Append a motion, unless ``count`` steps are done."""
-            later = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
-            return jnp.where(step < count, later, history), None
+            next_history = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
+            return jnp.where(step < count, next_history, history), None
 
         return jax.lax.scan(advance, history, jnp.arange(self.steps))[0]
 
 
-def _acceptable(
+def _is_acceptable(
     bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, history: History
 ) -> Bool[Array, ""]:
-    """Whether an agent with this history touches none of the others and is on the road at ``step``."""
+    """Return whether an agent with this history overlaps no other agent and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
     context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())
     frame = frame_of(bank, index, step, agents, alone(context), 0)
     box, ground = frame.box[slot], z - bank.height_m(index, slot) / 2
     lanes = around_lanes(bank, index, box[:2], box[2:4], corners(box), ground)
-    _, left_map, off = off_the_road(bank, index, box, ground, lanes)
-    return ~(overlaps(frame, slot).any() | off | left_map)
+    _, left_map, offroad = measure_offroad(bank, index, box, ground, lanes)
+    return ~(overlaps(frame, slot).any() | offroad | left_map)

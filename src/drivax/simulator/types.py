@@ -19,26 +19,26 @@ Motion = Float[Array, " 4"]
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 #: Motions of the last 23 steps, the present one last.
 History = Float[Array, "history 4"]
-#: D numbers of an action space.
+#: Action of a task, with D components.
 Action = Float[Array, " D"]
 
 
 @record
 class AgentContext:
-    """Everything an observation depends on besides the bank; stored in replay buffers.
+    """Everything that an observation depends on, except the bank; stored in replay buffers.
 
     Attributes:
         index: Row of the bank.
         step: Time step t in the log.
         slot: Slot of the driven agent (0: ego).
-        history: x, y, heading, speed of the driven agent over the last 23 steps; the last row is now.
-        action: Last executed action, within bounds and actuator rates; D numbers (2 by default).
+        history: x, y, heading, speed of the driven agent over the last 23 steps; the last row is the present step.
+        action: Last executed action, within bounds and actuator rates; D components (2 by default).
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple for log replay.
         route: Row of the agent's route in the bank (:meth:`ScenarioBank.row_of`); None in banks with one ego per
-            scenario, where it is ``index``.
-        conditions: Numbers ``[*batch, C]`` of ``Task.conditions``; an empty tuple without any.
+            scenario, where it equals ``index``.
+        conditions: Values ``[*batch, C]`` of ``Task.conditions``; an empty tuple for a task without conditions.
     """
 
     index: Int[Array, "*batch"]
@@ -60,7 +60,7 @@ class AgentContext:
 
 @record
 class Frame:
-    """All agents and lights at one step: S slots with a moving agent, a parked agent or none, and L lights.
+    """All agents and lights at one step: S slots, each with a moving agent, a parked agent or none, and L lights.
 
     Attributes:
         box: x, y, cos, sin, length, width.
@@ -79,25 +79,25 @@ class Frame:
     lights: Int[Array, "*batch L"]
 
     def at(self, slots: Int[Array, " K"]) -> Frame:
-        """Return the frame of some slots, unbatched."""
+        """Return the frame of the given slots, unbatched."""
         agents = {name: getattr(self, name)[slots] for name in ("box", "velocity", "z", "valid", "kind")}
         return Frame(**agents, lights=self.lights)
 
 
 @record
 class Facts:
-    """Scalar measurements at one pose, kept in the state. Units in names; definitions in the semantics.
+    """Scalar measurements of an agent at one step, kept in the state. Names carry units; the semantics define them.
 
-    ``ttc_defined`` is false at a standstill; ``limit_mps`` is -1 if unknown; ``routed``: the agent has a route (ego, on
-    lanes), without which progress and ``off_route`` are undefined; ``logged``: the log has the agent at this step;
-    ``ignored`` counts ignored overlaps. Facts outside ``Task.reads`` are None and not computed.
+    Facts outside ``Task.reads`` are None and not computed. ``ttc_defined`` is false at standstill; ``limit_mps`` is -1
+    if unknown; ``routed``: the agent has a route on lanes, without which progress and ``off_route`` are undefined;
+    ``logged``: the log has the agent at this step; ``ignored`` counts ignored overlaps.
 
-    The others are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
-    behind the log along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and
-    ``early_m`` ahead of where the log is a second later (both negative in between); ``completed``: share of the log's
-    way from the current step to its end, in [0, 1], 1 if that is below 0.5 m; ``time_gap_s`` to the nearest obstacle
-    ahead on the route (bumper to bumper, over the agent's speed), at most 10 s; the lane ``strand`` of the agent
-    (``scenario.bank.queries.lane_passage``), and whether it changed lanes or merged in this step.
+    Measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m`` behind the log
+    along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and ``early_m`` ahead
+    of where the log is a second later (both negative in between); ``completed``: share of the log's path from the
+    current step to its end, in [0, 1], 1 if that path is shorter than 0.5 m; ``time_gap_s`` to the nearest obstacle
+    ahead on the route (bumper to bumper, over the agent's speed), at most 10 s; ``strand`` of the agent's lane
+    (``scenario.bank.queries.lane_passage``); ``lane_changed`` and ``merged``, at this step.
     """
 
     collision: Bool[Array, "*batch"]
@@ -146,7 +146,7 @@ FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
 
 @record
 class Surroundings:
-    """Frame, lanes and route position around a pose; never carried between steps."""
+    """Frame, nearby lanes and route position of an agent; never carried between steps."""
 
     frame: Frame
     lanes: LaneHits
@@ -167,8 +167,8 @@ class LightMemory:
     """Memory of stop lines."""
 
     pause: Int[Array, "*batch L"]  # Steps since the agent last stood before the line; saturates
-    # Steps since the agent crossed the line off its route, until evaluation: positive at red, negative otherwise, 0
-    # for none
+    # Steps since the agent crossed the line off its route, until the crossing is decided: positive at red, negative
+    # otherwise, 0 without a crossing
     crossed: Int[Array, "*batch L"]
 
 
@@ -240,7 +240,7 @@ class Traffic(Protocol):
         ...
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Any:
-        """Return the traffic state one step later, given the present frame."""
+        """Return the traffic state one step later; ``frame`` is the present frame."""
         ...
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
@@ -274,7 +274,7 @@ class Task(Protocol):
         ...
 
     def draw_conditions(self, slot: Any, key: Any) -> Any:
-        """Return the conditions of an agent's episode, drawn by ``key`` if there is one."""
+        """Return the conditions of an agent's episode: drawn by ``key``, or those of evaluation if it is None."""
         ...
 
     def observe(

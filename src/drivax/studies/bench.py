@@ -135,15 +135,14 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
 
 def metric_rows(speeds: Mapping[tuple[str, int], float]) -> list[dict[str, Any]]:
     """Return the rows of :func:`bench_metrics` from steps per second by set of metrics and batch size."""
-    base = speeds["full", BATCHES[0]]
-    rows = []
+    base, rows = speeds["full", BATCHES[0]], []
     for metrics in METRIC_SETS:
-        sizes = [batch for name, batch in speeds if name == metrics]
-        best = max(sizes, key=lambda batch: speeds[metrics, batch])
+        by_batch = {batch: speed for (name, batch), speed in speeds.items() if name == metrics}
+        best = max(by_batch, key=by_batch.__getitem__)
         for batch in dict.fromkeys((*BATCHES, best)):
-            value = speeds[metrics, batch]
             row = {"metrics": metrics, "batch": batch, "best": batch == best}
-            rows.append(row | {"steps_per_second": round(value), "relative": round(value / base, 2)})
+            speed = by_batch[batch]
+            rows.append(row | {"steps_per_second": round(speed), "relative": round(speed / base, 2)})
     return rows
 
 
@@ -176,14 +175,13 @@ def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
     program = _jit_sharded(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
     seconds = time.perf_counter() - start
     memory = program.memory_analysis()
+    temporary_bytes = 0 if memory is None else memory.temp_size_in_bytes * jax.device_count()
     return Program(
         run=lambda: program(bank, carry, keys),
         steps=int(program(bank, carry, keys)[1].sum()),
         compile_seconds=seconds,
         state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
-        temporary_bytes=0
-        if memory is None
-        else memory.temp_size_in_bytes * jax.device_count() // config.batch,
+        temporary_bytes=temporary_bytes // config.batch,
     )
 
 
@@ -366,12 +364,8 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Return the time of a part in microseconds per environment and step."""
     program = _repeat_part(config, part)
-    return (
-        _median_seconds(lambda: program(bank, states, None), config.repeats)
-        / config.steps
-        / config.batch
-        * 1e6
-    )
+    seconds = _median_seconds(lambda: program(bank, states, None), config.repeats)
+    return seconds / config.steps / config.batch * 1e6
 
 
 def _repeat_part(config: BenchConfig, part: Part) -> Any:
@@ -380,9 +374,7 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
     def run(bank: ScenarioBank, states: SimState, _: Any) -> Array:
         def iteration(shift: Array, _: None) -> tuple[Array, None]:
             """Compute the part in shifted states."""
-            totals = jax.vmap(lambda state, distance: _total(part, bank, _shift(state, distance)))(
-                states, shift
-            )
+            totals = jax.vmap(lambda state, shift: _total(part, bank, _shift(state, shift)))(states, shift)
             # Each iteration depends on the last one, which keeps the compiler from hoisting work out of the loop.
             return shift + _NEGLIGIBLE * jnp.where(jnp.isfinite(totals), totals, 0.0), None
 

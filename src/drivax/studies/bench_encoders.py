@@ -128,13 +128,11 @@ def encoder_sizes(config: EncoderConfig, spec: GroupSpec) -> dict[str, int]:
 
 def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
     """Return observations of normal noise with about half of the rows valid."""
-    rng = np.random.default_rng(0)
-    noise = {
-        name: rng.normal(size=(batch, *shape)).astype(np.float32) for name, shape in sorted(spec.items())
-    }
-    return {
-        name: jnp.asarray(values > 0 if name.endswith("_mask") else values) for name, values in noise.items()
-    }
+    rng, groups = np.random.default_rng(0), {}
+    for name, shape in sorted(spec.items()):
+        values = rng.normal(size=(batch, *shape)).astype(np.float32)
+        groups[name] = jnp.asarray(values > 0 if name.endswith("_mask") else values)
+    return groups
 
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
@@ -155,12 +153,10 @@ def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[
         return jnp.mean(encode(parameters, groups) ** 2)
 
     forward, gradient = jax.jit(encode), jax.jit(jax.grad(loss))
-    by_batch = {}
+    by_batch, groups = {}, {}
     for batch in bench.batches:
-        by_batch[str(batch)] = _microseconds(
-            forward, parameters, random_observations(spec, batch), bench.repeats
-        )
-    groups = random_observations(spec, bench.batches[-1])
+        groups = random_observations(spec, batch)
+        by_batch[str(batch)] = _microseconds(forward, parameters, groups, bench.repeats)
     return {"forward_us": by_batch, "gradient_us": _microseconds(gradient, parameters, groups, bench.repeats)}
 
 

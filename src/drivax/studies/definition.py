@@ -116,8 +116,8 @@ class StudyDefinition:
         groups: Heading of each group of claims.
         arms: The arms.
         claims: The claims.
-        checkpoints_by: Training metric for another checkpoint rule, its maximum; the report has the cost of the rule
-            for the first baseline.
+        checkpoints_by: Training metric whose maximum chooses checkpoints by another rule; the report has the cost of
+            this rule for the first baseline.
     """
 
     title: str
@@ -133,20 +133,20 @@ class StudyDefinition:
         if len(self.baselines) < 2:
             raise ValueError("a study needs two baselines")
         methods = [arm.method for arm in self.arms.values()]
-        names_by_kind = {
+        choices = {
             "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
             "metric": (self.metrics, METRICS), "method": (methods, METHODS),
         }  # fmt: skip
-        for kind, (names, available) in names_by_kind.items():
+        for kind, (names, available) in choices.items():
             for name in names:
                 if name not in available:
                     raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
         for claim in self.claims:
-            names_of_claim = (
+            claim_choices = (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
                 (claim.metric, self.metrics),
             )  # fmt: skip
-            for name, available in names_of_claim:
+            for name, available in claim_choices:
                 if name not in available:
                     raise ValueError(f"the claim {claim.words!r} names {name!r}, which the study lacks")
 

@@ -1,7 +1,7 @@
 """The study runner: score, train, evaluate, test the claims, write the report.
 
 Arms differ in how they draw logged steps. Each arm is trained with several seeds and the same budget, and evaluated on
-one test set. Claims compare arms scenario by scenario. An interrupted study resumes without repeating finished work.
+one test set. Claims compare arms scenario by scenario. An interrupted study resumes without repeating finished jobs.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def run_study(
         study: The study.
         cores: Number of parallel training runs; None: one per core.
         anyway: Continue even if the baselines do not meet their conditions; the report says so.
-        log: Called with one line per step.
+        log: Called with one line per stage.
 
     Returns:
         The contents of ``results.json``.
@@ -114,20 +114,8 @@ def run_study(
     edited = is_edited_allowed()
     jobs = [Job(study, arm, seed, usable, edited) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
-    baseline_conditions, strata = _conditions(study, definition.baselines), _strata(study, test)
-    first_group = next(iter(definition.groups))
-    claim_count = sum(claim.group == first_group for claim in study.claims)
-    first, second = (_episodes(study, name) for name in definition.baselines[:2])
-    smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
-    for condition in baseline_conditions:
-        log(str(condition))
-    log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
-    if not all(condition.met for condition in baseline_conditions) and not anyway:
-        raise UsageError(
-            "the baseline does not drive well enough for a comparison",
-            file=study.folder,
-            cure="train longer or with other settings in another --out, or pass --anyway",
-        )
+    strata = _strata(study, test)
+    smallest = _check_baselines(study, strata, anyway, log)
     _train_and_evaluate(jobs, cores, log)
     results = _results(study, test, strata, tables, usable) | {
         "conditions": [asdict(condition) for condition in _conditions(study, config.arms)],
@@ -139,6 +127,25 @@ def run_study(
     _write_pages(study, data, results, tables)
     log(f"wrote {study.folder / 'report.html'}")
     return results
+
+
+def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> dict[str, float]:
+    """Check the conditions of the baselines, unless ``anyway``; return the smallest detectable differences."""
+    definition, conditions = study.definition, _conditions(study, study.definition.baselines)
+    first_group = next(iter(definition.groups))
+    claim_count = sum(claim.group == first_group for claim in study.claims)
+    first, second = (_episodes(study, name) for name in definition.baselines[:2])
+    smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
+    for condition in conditions:
+        log(str(condition))
+    log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
+    if not all(condition.met for condition in conditions) and not anyway:
+        raise UsageError(
+            "the baseline does not drive well enough for a comparison",
+            file=study.folder,
+            cure="train longer or with other settings in another --out, or pass --anyway",
+        )
+    return smallest
 
 
 def _write_pages(
@@ -162,18 +169,18 @@ def _write_pages(
 
 
 def _open_folder(study: Study) -> None:
-    """Create the folder of a study, or check that it holds this study."""
+    """Create the folder of a study, or check that it contains this study."""
     sets = study.sets
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
     if not study.folder.exists() or not any(study.folder.iterdir()):
-        unlabelled_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
-        if len(unlabelled_arms) < len(study.arms) and not event_kinds(data[0]).any():
+        other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
+        if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
             raise UsageError(
                 "has no labelled events, which the oracle and its control need",
                 file=sets.train,
-                cure=f"pass --arms [{','.join(unlabelled_arms)}]",
+                cure=f"pass --arms [{','.join(other_arms)}]",
             )
         RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
         return
@@ -194,7 +201,7 @@ def _open_folder(study: Study) -> None:
 
 
 def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
-    """Return the score tables of the training set by method; compute those without a file."""
+    """Return the score tables of the training set by method; compute those that have no file."""
     data, tables = ScenarioSet.open(study.sets.train), {}
     for method in dict.fromkeys(arm.method for arm in study.arms.values()):
         file = study.scores(method)
@@ -225,7 +232,7 @@ def _test_set(study: Study) -> ScenarioSet:
 
 
 def _strata(study: Study, test: ScenarioSet) -> Strata:
-    """Return the rare test scenarios (labelled, else the most critical), and their share of ordinary traffic."""
+    """Return the strata of the test set; scenarios without labels are rare if they are among the most critical."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
     has_labels = bool(rare.any())
@@ -246,33 +253,45 @@ def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> Non
     """Run the unfinished jobs, each on one core."""
     pending = [job for job in jobs if not _is_finished(job)]
     for number, (job, seconds) in enumerate(one_core_each(_run_job, pending, cores), start=1):
-        log(
-            f"trained and evaluated {job.arm}, seed {job.seed} in {seconds:.0f} s ({number} of {len(pending)})"
-        )
+        count = f"{number} of {len(pending)}"
+        log(f"trained and evaluated {job.arm}, seed {job.seed} in {seconds:.0f} s ({count})")
 
 
 def _is_finished(job: Job) -> bool:
-    """Return whether an arm is trained and evaluated; refuse a run with other settings and outdated evaluations."""
+    """Return whether an arm is trained and evaluated.
+
+    Raises:
+        UsageError: The run has other settings or weights than the study, or is newer than an evaluation.
+    """
     run = job.study.run(job.arm, job.seed)
     if not (run / "config.yaml").is_file():
         return False
     folder = RunFolder.open(run)
-    evaluations = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
     job_hashes = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
     config = job.study.train_config(job.arm, job.seed)
     if folder.config(TrainConfig, trust=settings.modules_of(config)) != config or any(
         folder.info.get(name) != value for name, value in job_hashes.items()
     ):
+        evaluations = " and ".join(map(str, _evaluation_folders(job.study, job.arm, job.seed)))
         raise UsageError(
-            "was trained with other settings or weights than those of this study", file=run,
-            cure=f"remove it and {' and '.join(map(str, evaluations))}, and run the study again",
-        )  # fmt: skip
+            "was trained with other settings or weights than those of this study",
+            file=run,
+            cure=f"remove it and {evaluations}, and run the study again",
+        )
     return is_evaluated(job.study, job.arm, job.seed)
 
 
+def _evaluation_folders(study: Study, arm: str, seed: int) -> list[Path]:
+    return [study.evaluation(name, seed) for name in study.evaluations(arm)]
+
+
 def is_evaluated(study: Study, arm: str, seed: int) -> bool:
-    """Return whether an arm has all its evaluations; refuse those that are older than the run."""
-    folders = [study.evaluation(name, seed) for name in study.evaluations(arm)]
+    """Return whether an arm has all its evaluations.
+
+    Raises:
+        UsageError: An evaluation is older than the run.
+    """
+    folders = _evaluation_folders(study, arm, seed)
     existing = [folder for folder in folders if folder.is_dir()]
     for folder in existing:
         if _start_time(folder) < _start_time(study.run(arm, seed)):
@@ -315,15 +334,13 @@ def _train_and_evaluate_arm(job: Job) -> float:
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
-    """Check that a run with evaluations has checkpoints: training again would mix two training runs."""
-    folders = [job.study.evaluation(name, job.seed) for name in job.study.evaluations(job.arm)]
-    evaluations = [folder for folder in folders if folder.is_dir()]
+    """Check that a run without checkpoints has no evaluations: they would be of another training run."""
+    folders = _evaluation_folders(job.study, job.arm, job.seed)
+    evaluations = [str(folder) for folder in folders if folder.is_dir()]
     if not steps and evaluations:
         run = job.study.run(job.arm, job.seed)
         raise UsageError(
-            "has evaluations, but no checkpoints",
-            file=run,
-            cure=f"remove {' and '.join(map(str, evaluations))}",
+            "has evaluations, but no checkpoints", file=run, cure=f"remove {' and '.join(evaluations)}"
         )
 
 
@@ -339,7 +356,7 @@ def _best_step(job: Job) -> int:
 
 
 def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
-    """Return the validation results of arms that are trained."""
+    """Return the validation results of trained arms."""
     config = study.config
     return [Condition.of(arm, _validations(study, arm), config.progress, config.flat) for arm in arms]
 

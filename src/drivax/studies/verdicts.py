@@ -43,7 +43,7 @@ class Strata:
     Attributes:
         recordings: Recording of every scenario; scenarios of one recording are dependent.
         rare: Mask of the rare scenarios.
-        share: Share of rare scenarios in ordinary traffic; None if it is that of the test set.
+        share: Share of rare scenarios in ordinary traffic; None if it equals that of the test set.
     """
 
     recordings: Sequence[str]
@@ -54,8 +54,8 @@ class Strata:
         """Return the weight of every scenario.
 
         Args:
-            stratum: ``common`` or ``rare`` for these scenarios alone, ``ordinary`` for all: rare scenarios are weighted
-                by their share of ordinary traffic, since the test set may hold more.
+            stratum: ``common`` or ``rare``: these scenarios have weight 1. ``ordinary``: rare and common scenarios have
+                the total weights of their shares of ordinary traffic, which may differ from those of the test set.
         """
         if stratum != "ordinary":
             return (self.rare if stratum == "rare" else ~self.rare).astype(np.float64)
@@ -64,14 +64,14 @@ class Strata:
         return np.where(self.rare, self.share / self.rare.sum(), (1.0 - self.share) / (~self.rare).sum())
 
     def is_comparable(self, values: Values, weights: Weights) -> bool:
-        """Return whether at least two recordings have scenarios with a weight and without undefined values."""
+        """Return whether two recordings or more have scenarios with positive weight and defined values."""
         labels = np.asarray(self.recordings)
         return np.unique(labels[(weights > 0.0) & ~np.isnan(values).any(axis=0)]).size > 1
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Result of an arm on the validation set, which decides whether to compare arms.
+    """Result of an arm on the validation set; those of the baselines decide whether arms are compared.
 
     Attributes:
         arm: Name of the arm.
@@ -186,21 +186,22 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
 
 
 def _decide(result: ClaimResult, claims: int) -> ClaimResult:
-    """Return the result with its verdict; ``claims`` are adjusted together."""
+    """Return the result with its verdict; ``claims`` claims are adjusted together."""
     if result.effect is None or result.adjusted_p is None:
-        reason = "fewer than two recordings define it"
-        if result.difference is not None:
-            reason = "the mean of an arm is 0: no ratio"
+        has_difference = result.difference is not None
+        reason = (
+            "the mean of an arm is 0: no ratio" if has_difference else "fewer than two recordings define it"
+        )
         return replace(result, needed=reason)
     if result.adjusted_p >= _LEVEL:
-        return replace(result, needed=describe_needed(result.effect, claims))
+        return replace(result, needed=describe_sample_size(result.effect, claims))
     lower_is_better = METRICS[result.claim.metric].better == "low"
     better = (result.effect.difference < 0) == lower_is_better
     return replace(result, verdict="supported" if better else "contradicted")
 
 
-def describe_needed(effect: CrossedEffect, claims: int) -> str:
-    """Describe the number of seeds or recordings that would decide, at the strictest level of ``claims`` claims."""
+def describe_sample_size(effect: CrossedEffect, claims: int) -> str:
+    """Describe the seeds or recordings that would decide a claim, at the strictest level among ``claims`` claims."""
     confidence = confidence_level(claims)
     seeds = effect.seeds_needed(confidence=confidence)
     recordings = effect.clusters_needed(confidence=confidence)
@@ -222,7 +223,7 @@ def detectable_differences(
     """Estimate the smallest differences in ordinary traffic that the study detects with a power of 80 %.
 
     Assumes that the seeds of every arm vary like those of the ``first`` baseline, and that arms differ by scenario like
-    the two baselines. ``claims`` are adjusted together. Metrics that are undefined in the test are skipped.
+    the two baselines. ``claims`` claims are adjusted together. Metrics that are undefined in the test are skipped.
     """
     weights, smallest = strata.weights("ordinary"), {}
     for name in metrics:
@@ -239,7 +240,7 @@ def rates(
 ) -> dict[Stratum, dict[str, dict[str, float | int | None]]]:
     """Return an arm's mean over seeds and scenarios with its interval, by stratum and metric.
 
-    Skips metrics that fewer than two recordings define.
+    Skips metrics that are defined in fewer than two recordings.
     """
     means: dict[Stratum, dict[str, dict[str, float | int | None]]] = {}
     for stratum in ("ordinary", "common", "rare"):
@@ -261,7 +262,7 @@ def rule_cost(
 ) -> dict[str, dict[str, Any]]:
     """Return the cost of another checkpoint rule in ordinary traffic: paired differences by metric.
 
-    ``rule`` are the values of every seed with the rule's checkpoint, ``best`` those with the best checkpoint.
+    ``rule`` has the values of every seed at the rule's checkpoint, ``best`` those at the best checkpoint.
     """
     weights, costs = strata.weights("ordinary"), {}
     for name in metrics:
@@ -275,7 +276,7 @@ def rule_cost(
 def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
     """Compare the methods' rankings of scenarios: rank correlation, overlap of the top 5 %, and a verdict.
 
-    ``recordings`` is that of every scenario; the interval resamples recordings.
+    ``recordings`` has the recording of every scenario; the interval resamples recordings.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):

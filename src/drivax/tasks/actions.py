@@ -1,9 +1,9 @@
-"""Action spaces: meaning and bounds of actions, the dynamics that they drive, and expert actions.
+"""Action spaces: meaning and bounds of actions, their dynamics, and expert actions.
 
 :class:`Physical` (default), :class:`Published` and :class:`Discrete` drive the kinematic bicycle by acceleration and
 curvature, :class:`Route` by acceleration and lateral offset from the route. :class:`DeltaLocal` displaces the agent,
-:class:`DirectState` sets its state, :class:`Trajectory` has a controller follow planned poses. Except for the last two,
-actions are in [-1, 1] and zero means zero.
+:class:`DirectState` sets its state, :class:`Trajectory` has planned poses, which a controller tracks. Except for the
+last two, actions are in [-1, 1], and a component of 0 is a quantity of 0.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from drivax.simulator.types import Action, AgentContext, History, Motion
 
 #: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
 _WHEELBASE = 0.6
-#: Tolerance of rounding outside [-1, 1].
+#: Tolerance of the bounds [-1, 1].
 _ROUNDING = 1e-4
-#: Lower bound of lengths in divisions, m: empty slots have length 0.
+#: Lower bound of lengths in divisors, m: empty slots have length 0.
 _LEAST_LENGTH_M = 1.0
 
 
@@ -61,9 +61,9 @@ class Physical:
         """Return the action of an acceleration and a curvature, not clipped."""
         return self._action(acceleration, self._steering(curvature, length_m))
 
-    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Vector:
+    def expert(self, motion: Motion, target: Motion, next_target: Motion, length_m: Any) -> Vector:
         """Return the action that follows the log, from its motions one and two steps ahead; not clipped."""
-        return self.action(motion, *follow(motion, target, beyond), length_m)
+        return self.action(motion, *follow(motion, target, next_target), length_m)
 
     def exceeds_bounds(self, action: Vector) -> Bool[Array, ""]:
         """Whether an action is outside the bounds."""
@@ -81,11 +81,8 @@ class Physical:
         last_acceleration, last_steering = self._quantities(last)
         last_acceleration = jnp.where(motion[3] > 0.0, last_acceleration, jnp.maximum(last_acceleration, 0.0))
         if self.jerk_mps3 is not None:
-            acceleration = jnp.clip(
-                acceleration,
-                last_acceleration - self.jerk_mps3 * DT_S,
-                last_acceleration + self.jerk_mps3 * DT_S,
-            )
+            limit = self.jerk_mps3 * DT_S
+            acceleration = jnp.clip(acceleration, last_acceleration - limit, last_acceleration + limit)
         if self.steering_rate is not None:
             limit = self.steering_rate * DT_S
             steering = jnp.clip(steering, last_steering - limit, last_steering + limit)
@@ -117,11 +114,11 @@ class Physical:
         return jnp.stack([acceleration / scale, steering / self.steering])
 
     def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
-        """Return the curvature of a steering, 1/m: the same in this action space."""
+        """Return the curvature of a steering command, 1/m: the command itself in this action space."""
         return steering
 
     def _steering(self, curvature: Scalar, length_m: Any) -> Scalar:
-        """Return the steering of a curvature; the inverse of :meth:`_curvature`."""
+        """Return the steering command of a curvature; the inverse of :meth:`_curvature`."""
         return curvature
 
 
@@ -154,7 +151,7 @@ class Discrete(Physical):
 
     Attributes:
         accelerations, curvatures: Number of levels of each action; odd, to include zero.
-        density: Exponent by which levels are denser near zero; 1 is evenly spaced.
+        density: Exponent of the levels: 1 spaces them evenly, more makes them denser near zero.
     """
 
     accelerations: int = 7
@@ -164,9 +161,8 @@ class Discrete(Physical):
     def __post_init__(self) -> None:
         counts = (self.accelerations, self.curvatures)
         if min(counts) < 3 or any(count % 2 == 0 for count in counts):
-            raise UsageError(
-                f"{self.accelerations} x {self.curvatures} levels", cure="use odd numbers, at least 3"
-            )
+            problem = f"{self.accelerations} x {self.curvatures} levels"
+            raise UsageError(problem, cure="use odd numbers, at least 3")
         if self.density < 1.0:
             raise UsageError(f"density is {self.density:g}", cure="use 1 (even) or more (denser near zero)")
 
@@ -199,8 +195,8 @@ class Discrete(Physical):
 class Route(Physical):
     """Acceleration, and lateral offset from the route on lanes, to which pure pursuit steers the bicycle.
 
-    A policy in this space plans along a route that it is given; it does not steer. Zero keeps speed and route. Without
-    a route on lanes the offset is that from the line straight ahead. The executed action is that of :class:`Physical`.
+    A policy in this space plans along the route; it does not steer. Zero keeps speed and route. Without a route on
+    lanes the offset is from the line straight ahead. The executed action is one of :class:`Physical`.
 
     Attributes:
         offset_m: Offset at 1 of the second action, to the left, m.
@@ -209,13 +205,13 @@ class Route(Physical):
     offset_m: float = 3.5
 
     def steer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
-        """Return the action of :class:`Physical` that follows an action; clips the offset."""
+        """Return the action of :class:`Physical` that steers to the offset of an action, clipped to its bounds."""
         offset_m = self.offset_m * jnp.clip(action[1], -1.0, 1.0)
         curvature = follow_route(bank, context, offset_m)
         return jnp.stack([action[0], curvature / self.steering])
 
     def unsteer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
-        """Return the action that is steered as an action of :class:`Physical`, not clipped."""
+        """Return the action that :meth:`steer` turns into an action of :class:`Physical`, not clipped."""
         offset_m = offset_to_steer(bank, context, action[1] * self.steering)
         return jnp.stack([action[0], offset_m / self.offset_m])
 
@@ -228,7 +224,7 @@ def _levels(count: int, density: float) -> Float[Array, " count"]:
 
 @dataclass(frozen=True)
 class DeltaLocal:
-    """Displacement in the agent's frame: ahead, left, turn. Never backwards; without grip limit.
+    """Displacement in the agent's frame: ahead (never backwards), left, turn; without grip limit.
 
     Attributes:
         ahead_m, left_m: Displacements at 1 of the first two actions.
@@ -248,7 +244,9 @@ class DeltaLocal:
         turn = curvature * distance
         return self._action(distance * jnp.stack([jnp.cos(turn / 2), jnp.sin(turn / 2)]), turn)
 
-    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Float[Array, " 3"]:
+    def expert(
+        self, motion: Motion, target: Motion, next_target: Motion, length_m: Any
+    ) -> Float[Array, " 3"]:
         """Return the displacement to the logged motion one step ahead; not clipped."""
         return self._action(*displacement(motion, target))
 
@@ -293,7 +291,7 @@ class DirectState:
         """Return the motion of the bicycle one step later."""
         return bicycle(motion, acceleration, curvature)
 
-    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Motion:
+    def expert(self, motion: Motion, target: Motion, next_target: Motion, length_m: Any) -> Motion:
         """Return the logged motion one step ahead."""
         return target
 
@@ -322,8 +320,8 @@ class DirectState:
 class Trajectory:
     """Planned poses of the box centre (x, y in m, heading in rad, in the scenario's frame), tracked by a controller.
 
-    An action is the pose for now and those of the next ``steps`` steps of 0.1 s, one after the other. The executed
-    action has as many numbers: what the actuators did (``simulator.controller.Actuators``), then zeros.
+    An action has the present pose and those of the next ``steps`` steps of 0.1 s. The executed action has the same
+    size: the actuator states (``simulator.controller.Actuators``), then zeros.
 
     Attributes:
         steps: Horizon of a plan, steps.
@@ -345,21 +343,20 @@ class Trajectory:
         return 3 * (self.steps + 1)
 
     def plan(self, poses: Float[Array, "n 3"]) -> Float[Array, " D"]:
-        """Return the action of two or more poses from now on.
+        """Return the action of two or more poses from the present step on.
 
-        After the last one the car keeps its velocity; poses that exceed the horizon are dropped.
+        The last velocity continues after the last pose; poses beyond the horizon are dropped.
         """
-        moved = poses[-1, :2] - poses[-2, :2]
+        shift = poses[-1, :2] - poses[-2, :2]
         step = jnp.arange(1, max(self.steps + 2 - len(poses), 1))[:, None]
-        extension = jnp.concatenate(
-            [poses[-1, :2] + step * moved, jnp.full_like(step, poses[-1, 2], poses.dtype)], axis=1
-        )
+        xy, heading = poses[-1, :2] + step * shift, jnp.full_like(step, poses[-1, 2], poses.dtype)
+        extension = jnp.concatenate([xy, heading], axis=1)
         return jnp.concatenate([poses, extension])[: self.steps + 1].reshape(-1)
 
     def action(
         self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any
     ) -> Float[Array, " D"]:
-        """Return the plan of the bicycle at this acceleration and curvature."""
+        """Return the plan of a bicycle with this acceleration and curvature."""
 
         def step(motion: Motion, _: None) -> tuple[Motion, Motion]:
             motion = bicycle(motion, acceleration, curvature)
@@ -368,9 +365,11 @@ class Trajectory:
         motions = jax.lax.scan(step, motion, None, self.steps)[1]
         return self.plan(jnp.concatenate([motion[None], motions])[:, :3])
 
-    def expert(self, motion: Motion, target: Motion, beyond: Motion, length_m: Any) -> Float[Array, " D"]:
-        """Return the plan through the present and two logged poses; ``expert_action`` plans the whole log."""
-        return self.plan(jnp.stack([motion, target, beyond])[:, :3])
+    def expert(
+        self, motion: Motion, target: Motion, next_target: Motion, length_m: Any
+    ) -> Float[Array, " D"]:
+        """Return the plan of the present and two logged poses; ``expert_action`` plans the whole log."""
+        return self.plan(jnp.stack([motion, target, next_target])[:, :3])
 
     def exceeds_bounds(self, action: Float[Array, " D"]) -> Bool[Array, ""]:
         """Return False."""
@@ -379,7 +378,7 @@ class Trajectory:
     def actuate(
         self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Any
     ) -> Float[Array, " D"]:
-        """Return what the actuators do to follow the plan."""
+        """Return the actuator states of the next step of the plan."""
         length_m = jnp.maximum(length_m, _LEAST_LENGTH_M)
         actuators = controller.track(motion, action.reshape(-1, 3), last[:3], length_m, self.controller)
         return jnp.zeros(self.size).at[:3].set(actuators)
@@ -414,7 +413,7 @@ DELTA_LOCAL, DIRECT_STATE = DeltaLocal(), DirectState()
 
 
 def execute(actions: ActionSpace, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
-    """Return the executed action for a requested one, within bounds and actuator rates."""
+    """Return the executed action for a requested action, within bounds and actuator rates."""
     if isinstance(actions, Route):
         action = actions.steer(bank, context, action)
     length_m = bank.length_m(context.index, context.slot)
@@ -431,14 +430,14 @@ def action_of(
 
 
 def follow_log(
-    actions: ActionSpace, bank: ScenarioBank, context: AgentContext, target: Motion, beyond: Motion
+    actions: ActionSpace, bank: ScenarioBank, context: AgentContext, target: Motion, next_target: Motion
 ) -> Action:
     """Return the action that follows motions one and two steps ahead (``actions.expert``), not clipped."""
     length_m = bank.length_m(context.index, context.slot)
-    action = actions.expert(context.history[-1], target, beyond, length_m)
+    action = actions.expert(context.history[-1], target, next_target, length_m)
     return _request(actions, bank, context, action)
 
 
 def _request(actions: ActionSpace, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
-    """Return what to request so that an action is executed: in the space ``route`` an offset."""
+    """Return the requested action for an executed one, not clipped: in the space ``route`` an offset."""
     return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action

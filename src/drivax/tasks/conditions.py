@@ -17,7 +17,7 @@ from drivax.tasks.rewards import OPTIONS, TERMS, RewardConfig
 
 #: Separates the draws of conditions from those of starts, which split the same key.
 _STREAM = 0x636F6E64
-#: Bounds of options that conditions replace; the margin of collisions also decides which facts are measured.
+#: Bounds of the options that a condition may replace. The collision margin is not one: it decides which facts are read.
 _OPTIONS = {name: bound for name, bound in OPTIONS.items() if name != "collision_margin_m"}
 
 
@@ -31,7 +31,7 @@ class Condition:
         name: A term of the reward, built-in or the user's; or an option: ``desired_speed``, ``time_gap_s``, ``ttc_s``
             or ``close_m``.
         low, high: Range of the draws.
-        value: The number in evaluation.
+        value: Value in evaluation.
         fixed: Whether training uses ``value`` too.
     """
 
@@ -55,7 +55,7 @@ Conditions = tuple[Condition, ...]
 
 
 def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
-    """Check that each condition changes the reward, once.
+    """Check that each condition has an effect on the reward and occurs once.
 
     Raises:
         UsageError: A condition has no effect, is beyond the bound of its option, or occurs twice.
@@ -63,21 +63,23 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
     weights, names = rewards.weights(), [condition.name for condition in conditions]
     active = [term.option for name, term in TERMS.items() if name in weights]
     options = {name: bound for name, bound in _OPTIONS.items() if name in active}
-    for name, high in ((condition.name, condition.high) for condition in conditions):
+    for condition in conditions:
+        name = condition.name
         if name not in options and name not in weights:
-            terms = [
-                t for t, term in TERMS.items() if name == t or (name == term.option and name in _OPTIONS)
-            ]
+            options_of = {key: term.option for key, term in TERMS.items() if term.option in _OPTIONS}
+            terms = [key for key in TERMS if name in (key, options_of.get(key))]
             cure = f"give {terms[0]} a weight" if terms else did_you_mean(name, [*weights, *options])
             raise UsageError(f"condition {name}: not in the reward", cure=cure)
-        if high > options.get(name, math.inf):
-            raise UsageError(f"condition {name}: high is {high}", cure=f"use at most {options[name]:g}")
+        if condition.high > options.get(name, math.inf):
+            raise UsageError(
+                f"condition {name}: high is {condition.high}", cure=f"use at most {options[name]:g}"
+            )
         if names.count(name) > 1:
             raise UsageError(f"condition {name} occurs twice", cure="name it once")
 
 
 def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
-    """Draw the numbers of an agent's episode; without a key they are those of evaluation."""
+    """Draw the values of an agent's episode; without a key they are those of evaluation."""
     if not conditions:
         return ()
     values = jnp.array([condition.value for condition in conditions], jnp.float32)
@@ -90,26 +92,26 @@ def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | 
 
 
 def scale_conditions(conditions: Conditions, values: Float[Array, " C"]) -> Float[Array, " C"]:
-    """Scale numbers to [-1, 1] by their ranges."""
+    """Scale values to [-1, 1] by their ranges."""
     low, high = _ranges(conditions)
     return (2.0 * values - low - high) / (high - low)
 
 
 def _ranges(conditions: Conditions) -> Float[Array, "2 C"]:
-    """Return the lower and upper ends of the ranges."""
+    """Return the lower and upper bounds."""
     return jnp.array([(c.low, c.high) for c in conditions], jnp.float32).T
 
 
 def by_name(conditions: Conditions, values: Any) -> dict[str, Scalar]:
-    """Return the numbers by name."""
+    """Return the values by name."""
     return {condition.name: values[column] for column, condition in enumerate(conditions)}
 
 
 def fix_conditions(conditions: Conditions, values: Mapping[str, float] | None = None) -> Conditions:
-    """Return the conditions without draws, with some numbers changed.
+    """Return the conditions without draws, at ``values`` by name or else at their own.
 
     Raises:
-        UsageError: A number is out of range, or has no condition.
+        UsageError: A value is out of range, or there is no condition of its name.
     """
     values = values or {}
     names = [condition.name for condition in conditions]

@@ -1,4 +1,4 @@
-"""Example features for custom observation groups, ready to use.
+"""Ready-made features for custom observation groups.
 
 In YAML ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, from Python
 ``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, context and frames; ``frames(k)`` is
@@ -25,9 +25,9 @@ from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
 
 #: Number of agents with a relative velocity; spacing (m) and number of route points.
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
-#: Largest distance of a lane piece, m; least cosine of the angle to it; metres per sine of the angle in its rank.
+#: Lane pieces: maximum distance, m; minimum cosine of the angle to ego; weight of the sine of the angle, m.
 _LANE_M, _LANE_COS, _M_PER_SINE = 2.5, 0.5, 4.0
-#: Half the width of the strip ahead in which a leader drives, m; cap of time gaps, s.
+#: Half the width of the strip ahead in which a leader drives, m; maximum of time gaps, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
 #: Look-ahead of a car-following driver, m.
 _FARTHEST_M = 90.0
@@ -55,8 +55,8 @@ def relative_velocity(
 def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the curvature of ego's lane in units of 0.1 1/m (left positive), and whether ego is on a lane.
 
-    The lane piece within 2.5 m and 60 degrees that fits position and heading best counts; a metre weighs as much as 15
-    degrees. Needs no route. Levels of bridges are not distinguished.
+    The lane is the piece within 2.5 m and 60 degrees that fits position and heading best, where 1 m weighs as much as
+    15 degrees. Needs no route. Does not distinguish levels.
     """
     view = View.of(context)
     rows, layer = bank.road[context.index], bank.road_at[context.index, 2]
@@ -103,8 +103,8 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:
     """Return the inputs of a car-following driver along the route.
 
-    Gap to the leader or a light to stop at (at most 90 m, in 50 m); approach speed and speed of the leader (15 m/s);
-    whether there is one; the speed that limit and curves ahead allow (15 m/s). Without a leader both speeds are 0.
+    Gap to the leader or a light that requires a stop, at most 90 m, in 50 m; closing speed and speed of the leader, in
+    15 m/s (0 without one); whether there is one; speed by the limit and the curves ahead, in 15 m/s.
     """
     speed = context.history[-1, MOTION_SPEED]
     inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)
@@ -115,7 +115,7 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
-    """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether any.
+    """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether one exists.
 
     Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
     """

@@ -1,4 +1,4 @@
-"""Features of observation groups: names, columns, order, frame and units, and the computation of the optional ones.
+"""Features of observation groups: names, columns, order, frame and units; functions of the optional features.
 
 The columns of a group follow the order of :data:`COLUMNS`, not that of a configuration.
 """
@@ -26,20 +26,22 @@ from drivax.simulator.types import AgentContext, Frame
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Unit of curvature, 1/m: a turn of 10 m radius is 1.
 CURVATURE_PM = 0.1
-#: Cap of curvatures, in these units.
+#: Maximum of curvatures, in these units.
 _MAX_CURVATURE = 3.0
-#: Points of the route to which agents are related: behind ego, m; spacing, m; number. Largest distance to a side, m.
-_ROUTE_BEHIND_M, _ROUTE_STEP_M, _ROUTE_POINTS, _ROUTE_SIDE_M = -30.0, 2.0, 61, 20.0
+#: Points of the route on which agents are projected: position of the first relative to ego, m; spacing, m; number.
+_ROUTE_START_M, _ROUTE_STEP_M, _ROUTE_POINTS = -30.0, 2.0, 61
+#: Maximum distance of an agent to either side of the route, m.
+_ROUTE_SIDE_M = 20.0
 #: Horizon of times to overlap, s.
 _OVERLAP_S = 8.0
 #: Half the distance over which the curvature of the route is measured, m.
-_ARM_M = 2.0
+_HALF_WINDOW_M = 2.0
 
-_PLACE = {"position": ("x", "y"), "heading": ("sin", "cos"), "velocity": ("ahead", "left")}
+_MOTION = {"position": ("x", "y"), "heading": ("sin", "cos"), "velocity": ("ahead", "left")}
 #: Columns of each feature of each group; "" for a feature with one column.
 COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
-        "ego": {**_PLACE, "time": ("",)},
+        "ego": {**_MOTION, "time": ("",)},
         # The last action has as many columns as the action space has dimensions.
         "ego_static": {
             "length": ("",),
@@ -49,11 +51,11 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "route": ("left", "sin"),
         },
         "agents": {
-            **_PLACE,
+            **_MOTION,
             "relative_velocity": ("ahead", "left"),
             **dict.fromkeys(("time", "length", "width", "height"), ("",)),
             "type": ("vehicle", "pedestrian", "cyclist", "other"),
-            # Of the present step, repeated at past ones.
+            # The last three have their present values at all steps.
             "route": ("along", "left", "sin", "cos"),
             **dict.fromkeys(("closing_speed", "time_to_overlap"), ("",)),
         },
@@ -98,9 +100,9 @@ class View:
         return rotate(xy - self.xy, self.cos, -self.sin)
 
     def rotate(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Transform the components of a direction, velocity or offset: ahead and left.
+        """Transform the components of a direction, velocity or offset to ahead and left.
 
-        The order of the terms keeps the rounding of :meth:`point` and :meth:`vector`, where products are fused.
+        The terms are ordered to round like :meth:`point` and :meth:`vector`, where products are fused.
         """
         return x * self.cos + y * self.sin, -(x * self.sin - y * self.cos)
 
@@ -155,22 +157,18 @@ def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> di
             names[group] = tuple(str(column) for column in range(shape[-1]))
             continue
         columns = [(name, COLUMNS[group][name]) for name in getattr(features, group)]
-        # ``last_action`` has no fixed columns: it gets the others, numbered.
-        others = shape[-1] - sum(len(parts) for _, parts in columns)
-        columns = [(name, parts or tuple(map(str, range(others)))) for name, parts in columns]
-        names[group] = tuple(f"{name} {part}".strip() for name, parts in columns for part in parts)
+        # ``last_action`` has no fixed columns: it has the remaining ones, numbered.
+        remaining = shape[-1] - sum(len(suffixes) for _, suffixes in columns)
+        columns = [(name, suffixes or tuple(map(str, range(remaining)))) for name, suffixes in columns]
+        names[group] = tuple(f"{name} {suffix}".strip() for name, suffixes in columns for suffix in suffixes)
     return names
 
 
 def concatenate_features(
-    selected: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
+    selected: Sequence[str], columns: Mapping[str, Callable[[], Array]]
 ) -> Float[Array, "... F"]:
-    """Concatenate the columns of the selected features, computed by ``parts`` (``[*rows, columns]`` each).
-
-    Selected features that ``parts`` lacks are skipped; other features are not computed.
-    """
-    columns = [parts[name]() for name in selected if name in parts]
-    return jnp.concatenate(columns, axis=-1) if columns else jnp.zeros((*rows, 0))
+    """Compute and concatenate the columns of the selected features; others are not computed."""
+    return jnp.concatenate([columns[name]() for name in selected], axis=-1)
 
 
 def columns_of(group: str, selected: Sequence[str]) -> list[int]:
@@ -191,11 +189,12 @@ def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
 def route_coordinates(
     bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"]
 ) -> list[Float[Array, " K"]]:
-    """Return positions of agents along the route from ego and left of it, and sine and cosine of their heading to it.
+    """Return positions of agents along the route (from ego) and left of it, and sine and cosine of the heading to it.
 
-    Positions in units of 50 m and 5 m; 20 m left if the agent is not alongside the route. Zeros without a route.
+    Positions are in units of 50 m and 5 m; 20 m left for an agent that is not alongside the route. Zeros without a
+    route.
     """
-    offsets = _ROUTE_BEHIND_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
+    offsets = _ROUTE_START_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
     path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
     on_route &= context.route_m + offsets >= 0.0
     along, left, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
@@ -217,7 +216,7 @@ def closing_speed(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], age
     return -jnp.sum(offset * velocity, axis=-1) / jnp.maximum(norm(offset), 1.0) / SPEED_MPS
 
 
-def overlap_soon(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> Array:
+def overlap_imminence(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> Array:
     """Return 1 - t / 8 s for the time t until agents overlap ego at constant velocity and heading; 0 from 8 s on."""
     return 1.0 - time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, _OVERLAP_S) / _OVERLAP_S
 
@@ -230,13 +229,13 @@ def route_curvature(
     The window is shorter at the ends of the route.
     """
     last = (bank.route_points[row] - 1).astype(jnp.float32)
-    start_m, end_m = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
-    zero = jnp.zeros(())
+    start_m = jnp.clip(along_m - _HALF_WINDOW_M, 0.0, last)
+    end_m, zero = jnp.clip(along_m + _HALF_WINDOW_M, 0.0, last), jnp.zeros(())
     start, _ = route_ahead(bank, row, zero, start_m)
     end, _ = route_ahead(bank, row, zero, end_m)
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
     distance = end_m - start_m
-    # Without a route, rows are zero and have no angle.
+    # Without a route the rows are zero, and the angle is undefined.
     angle = jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(distance > 0, c0 * c1 + s0 * s1, 1.0))
     turn = jnp.where(distance > 0, angle, 0.0)
     return turn / jnp.maximum(distance, 1.0)
@@ -257,7 +256,8 @@ def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:
     offsets = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
     position, direction, length = rows[:, None, :2], rows[:, None, 2:4], rows[:, None, 4:5]
     middle = position + direction * length * (PIECE_M / POSITION_M) * offsets
-    shape = (*middle.shape[:2], rows.shape[1] - 5)
-    parts = [middle, jnp.broadcast_to(direction, middle.shape)]
-    parts += [jnp.broadcast_to(length / count, (*shape[:2], 1)), jnp.broadcast_to(rows[:, None, 5:], shape)]
-    return jnp.concatenate(parts, axis=-1).reshape(-1, rows.shape[1])
+    columns = [
+        jnp.broadcast_to(column, (*middle.shape[:2], column.shape[-1]))
+        for column in (middle, direction, length / count, rows[:, None, 5:])
+    ]
+    return jnp.concatenate(columns, axis=-1).reshape(-1, rows.shape[1])

@@ -34,11 +34,11 @@ from drivax.tasks.perception import (
     position_errors,
 )
 
-#: Block size of the running count.
+#: Block size of :func:`running_count`.
 _BLOCK = 8
-#: A stop line this far behind the ego is passed, m. Lights off the route rank after those on it by this distance, m.
-_PASSED_M, _OFF_ROUTE_M = 5.0, 1e4
-#: Kinds of the columns of the feature ``type`` of agents.
+#: Stop lines further behind ego than this are omitted, m. Added to the distance of lights off the route, m.
+_BEHIND_M, _OFF_ROUTE_M = 5.0, 1e4
+#: Agent kinds in the order of the columns of ``type``.
 _TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
 Observation = dict[str, Array]
 #: Names of the groups of this module.
@@ -52,9 +52,9 @@ class OwnGroup:
     """A user's observation group.
 
     Attributes:
-        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
-            boolean mask ``[...]`` of the valid rows; ``testing.check_feature`` checks it.
-        name: Name of the group; the function's own by default.
+        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to these rows and a boolean
+            mask ``[...]`` of the valid ones; ``testing.check_feature`` checks it.
+        name: Name of the group; by default that of the function.
     """
 
     feature: Feature
@@ -83,7 +83,7 @@ class ObservationConfig:
         road: Rows of the road group; 0 omits it.
         lanes, edges, crosswalks: Layers of the road group.
         road_ahead_m, road_behind_m, road_side_m: Range of the road group ahead, behind and to each side.
-        road_cut: Number of equal rows into which each road piece (of at most 10 m) is cut along its chord.
+        road_cut: Number of rows per road piece (of at most 10 m), which is cut along its chord into equal parts.
         lights: Number of the nearest lights on or near the route.
         route: Points of the route, ``route_step_m`` apart.
         features: Columns of each group.
@@ -181,7 +181,7 @@ def observe(
 
 
 def _masked_group(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
-    """Return a group, with zeros in masked rows, and its mask."""
+    """Return a group and its mask; masked rows are zero."""
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
@@ -199,7 +199,7 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
     past = context.history[HISTORY - config.steps :]
     direction = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
     size = bank.agent_box[context.index, context.slot, : SizeColumn.KIND] / SIZE_M
-    moving = {
+    motion = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: direction[:, ::-1],
         "velocity": lambda: direction * past[:, 3:4] / SPEED_MPS,
@@ -212,12 +212,16 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, v
         "last_action": lambda: context.action,
         "route": lambda: features.ego_on_route(bank, context, view),
     }
-    groups = (("ego", config.features.ego, moving), ("ego_static", config.features.ego_static, static))
-    return {name: features.concatenate_features(names, parts, ()) for name, names, parts in groups if names}
+    groups = {"ego": (config.features.ego, motion), "ego_static": (config.features.ego_static, static)}
+    return {
+        group: features.concatenate_features(selected, columns)
+        for group, (selected, columns) in groups.items()
+        if selected
+    }
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
-    """Return the indices of the smallest entries, nearest first; padded with 0."""
+    """Return the indices of the smallest distances in ascending order, padded with 0."""
     indices = jax.lax.top_k(-distance, min(count, distance.shape[0]))[1]
     return jnp.pad(indices, (0, count - indices.shape[0]))
 
@@ -225,15 +229,15 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
 def _agents(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, frames: Frames
 ) -> Observation:
-    """Return the group ``agents`` [agents, steps, F]: the agents that are nearest now, nearest first."""
+    """Return the group ``agents`` [agents, steps, F]: the nearest agents at the present step, nearest first."""
     now = frames(0)
     slots = now.valid.shape[0]
-    visible = now.valid & (jnp.arange(slots) != context.slot)
+    others = now.valid & (jnp.arange(slots) != context.slot)
     dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
-    nearest = _nearest(jnp.where(visible, dx * dx + dy * dy, jnp.inf), config.agents)
-    exists = visible[nearest] & (jnp.arange(config.agents) < slots)
+    nearest = _nearest(jnp.where(others, dx * dx + dy * dy, jnp.inf), config.agents)
+    exists = others[nearest] & (jnp.arange(config.agents) < slots)
     steps = range(config.steps - 1, -1, -1)
-    # Of the past only the rows of these agents are read.
+    # Past frames have only the rows of these agents.
     past = [frames(back, nearest) for back in steps]
     mask = jnp.stack([frame.valid for frame in past]) & exists
     # One array [steps, K] per column.
@@ -246,12 +250,12 @@ def _agents(
     def scale(unit: float, *columns: Array) -> list[Array]:
         return [column / unit for column in columns]
 
-    me, me_velocity = now.box[context.slot], now.velocity[context.slot]
-    related = now.at(nearest)
-    parts = {
-        "route": lambda: features.route_coordinates(bank, context, related.box),
-        "closing_speed": lambda: [features.closing_speed(me, me_velocity, related)],
-        "time_to_overlap": lambda: [features.overlap_soon(me, me_velocity, related)],
+    ego_box, ego_velocity = now.box[context.slot], now.velocity[context.slot]
+    agents = now.at(nearest)
+    columns = {
+        "route": lambda: features.route_coordinates(bank, context, agents.box),
+        "closing_speed": lambda: [features.closing_speed(ego_box, ego_velocity, agents)],
+        "time_to_overlap": lambda: [features.overlap_imminence(ego_box, ego_velocity, agents)],
         "position": lambda: scale(POSITION_M, *view.rotate(x - view.xy[0], y - view.xy[1])),
         "heading": lambda: view.rotate(cos, sin)[::-1],
         "velocity": lambda: scale(SPEED_MPS, *view.rotate(vx, vy)),
@@ -262,8 +266,8 @@ def _agents(
         "height": lambda: scale(SIZE_M, bank.agent_box[context.index, nearest, SizeColumn.HEIGHT]),
         "type": lambda: [(past[-1].kind == kind).astype(jnp.float32) for kind in _TYPES],
     }
-    columns = [column for name in config.features.agents for column in parts[name]()]
-    group = _masked_columns("agents", columns, mask)
+    selected = [column for name in config.features.agents for column in columns[name]()]
+    group = _masked_columns("agents", selected, mask)
     return {name: jnp.moveaxis(values, 0, 1) for name, values in group.items()}
 
 
@@ -271,19 +275,19 @@ def _road_group(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
 ) -> Observation:
     """Return the road group: pieces cut into rows, with noise, in the selected columns."""
-    selected, noisy = config.features.road, config.perception.noise_m > 0
+    selected, has_noise = config.features.road, config.perception.noise_m > 0
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
     group = _road(pieces, bank, context, view)
-    if config.road_cut == 1 and selected == Features().road and not noisy:
+    if config.road_cut == 1 and selected == Features().road and not has_noise:
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
         rows, mask = features.cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
-    if noisy:
+    if has_noise:
         errors = position_errors(config.perception, bank, context, ROAD_NOISE_STREAM, config.road)
         rows = rows.at[:, :2].add(errors / POSITION_M)
     columns = features.columns_of("road", selected)
-    # Curvature is no default feature; :func:`_road` appends it.
+    # Curvature is not a default feature; :func:`_road` appends it.
     columns += [rows.shape[-1] - 1] if "curvature" in selected else []
     return _masked_group("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
@@ -301,10 +305,10 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
     inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
     kinds = (RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA)
-    for included, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
-        inside &= included or layer != kind
-    # Compact without sorting: the running count is the target index of each row inside. Others, and those that do not
-    # fit, get indices beyond the end and are dropped.
+    for is_included, kind in zip((config.lanes, config.edges, config.crosswalks), kinds, strict=True):
+        inside &= is_included or layer != kind
+    # Compact without sorting: the running count is the target index of each row inside. Rows outside, and those that do
+    # not fit, get indices beyond the end, which are dropped.
     running = running_count(inside)
     target = jnp.where(inside, running - 1, config.road)
     source = jnp.zeros(config.road, jnp.int32).at[target].set(jnp.arange(len(inside)), mode="drop")
@@ -332,7 +336,7 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     in_block = [positions[0]]
     for row in positions[1:]:
         in_block.append(in_block[-1] + row)
-    # Exact in any matrix precision: factors are at most eight.
+    # Exact at any precision of matrix products: the factors are at most eight.
     block_start = in_block[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
     return jnp.stack([row + block_start for row in in_block], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
@@ -343,8 +347,7 @@ def _lights(
     """Return the group ``lights``: those on the route first, then the others, each by distance."""
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
-    # Ignore lights whose line is well behind ego.
-    relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
+    relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_BEHIND_M)
     perception = config.perception
     on_route = line[LightRow.ARC + bank.ego_number(context.row)] < NEVER_M
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
@@ -358,12 +361,12 @@ def _lights(
             xy = xy + errors[first]
         return xy / POSITION_M
 
-    parts = {
+    columns = {
         "position": position,
         "state": lambda: _colour(state[first]),
         "on_route": lambda: on_route[first, None].astype(jnp.float32),
     }
-    return _masked_group("lights", features.concatenate_features(config.features.lights, parts, ()), exists)
+    return _masked_group("lights", features.concatenate_features(config.features.lights, columns), exists)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
@@ -384,7 +387,7 @@ def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext,
         return features.route_curvature(bank, context.row, context.route_m + offsets)[:, None]
 
     goal = bank.goal[context.row]
-    parts = {
+    columns = {
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
@@ -392,4 +395,4 @@ def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext,
         "recommended_speed": lambda: features.recommended_speed(curvature()) / SPEED_MPS,
         "goal": lambda: jnp.broadcast_to(features.goal_ahead(view.point(goal)), (config.route, 2)),
     }
-    return _masked_group("route", features.concatenate_features(config.features.route, parts, ()), exists)
+    return _masked_group("route", features.concatenate_features(config.features.route, columns), exists)

@@ -1,11 +1,11 @@
 """Perception of ego: range, occlusion, drop-out and noise. It affects observations only; metrics use the true state.
 
 At every step a sensor on ego detects the agents in range, in view and not dropped, each with that step's position
-error; a tracker keeps the detections. A past step of an agent is therefore the same in every observation that holds it;
-steps without a detection are masked, and an agent that is not detected now is absent with its history.
+error; a tracker stores the detections. A past step of an agent is therefore the same in every observation. Steps
+without a detection are masked; an agent without a detection at the present step is masked with its history.
 
-Random numbers follow from the state: the key is the seed with the scenario's identity, step, driven slot and the
-agent's slot folded in. A replayed observation equals the live one, and nothing is carried.
+Random numbers are functions of the state: seed, scenario, step, driven slot and the agent's slot are folded into the
+key. Nothing is carried, and a replayed observation equals the live one.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
-#: Added to step numbers: keys fold in numbers from 0 on, and the history begins before step 0.
+#: Added to step numbers, which are negative in a history from before step 0; keys fold in numbers from 0 on.
 _STEP_OFFSET = 16
-#: Numbers folded into the key of a step, by what is drawn.
+#: Numbers folded into the key of a step for each kind of draw.
 _DROPOUT_STREAM, _NOISE_STREAM, _LIGHT_DROPOUT_STREAM, LIGHT_NOISE_STREAM, ROAD_NOISE_STREAM = range(5)
 
 
@@ -38,9 +38,9 @@ class Perception:
     """Errors of perception; all are off by default and then cost nothing.
 
     Attributes:
-        range_m: Range beyond which agents and stop lines are not seen, m.
+        range_m: Range of the detection of agents and stop lines, m.
         occlusion: Whether vehicles hide agents behind them (:func:`in_view`).
-        dropout_m: Agents and lights are seen with probability exp(-distance / dropout_m), drawn at each step;
+        dropout_m: Agents and lights are detected with probability exp(-distance / dropout_m), drawn at each step;
             published: 200 m.
         noise_m: Standard deviation of the position error of agents, stop lines and road pieces in each direction,
             drawn at each step, m; published: 0.1 m.
@@ -80,8 +80,8 @@ def perceive(
 
     Ego itself is exact. ``frames`` returns the true frame of all agents some steps ago.
     """
-    perceived = cache(lambda back: _add_errors(config, bank, context, frames(back), back))
-    return lambda back, slots=None: perceived(back) if slots is None else perceived(back).at(slots)
+    all_agents = cache(lambda back: _add_errors(config, bank, context, frames(back), back))
+    return lambda back, slots=None: all_agents(back) if slots is None else all_agents(back).at(slots)
 
 
 def _add_errors(
@@ -92,7 +92,7 @@ def _add_errors(
     others, detected, xy = slots != context.slot, frame.valid, frame.box[:, :2]
     distance = norm(xy - ego_motion[:2])
     key = _key(config, bank, context, back)
-    detected &= _is_detected(config, jax.random.fold_in(key, _DROPOUT_STREAM), distance)
+    detected &= _detect(config, jax.random.fold_in(key, _DROPOUT_STREAM), distance)
     if config.occlusion:
         same_level = jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
         is_thin = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
@@ -105,19 +105,17 @@ def _add_errors(
     box = jnp.concatenate([xy, frame.box[:, 2:]], axis=-1)
     lights = frame.lights
     if config.of_lights:
-        line = bank.light_line[context.index, LightRow.XY]
-        lights = jnp.where(
-            lights_seen(config, bank, context, norm(line.T - ego_motion[:2]), back), lights, -1
-        )
+        distance = norm(bank.light_line[context.index, LightRow.XY].T - ego_motion[:2])
+        lights = jnp.where(detect_lights(config, bank, context, distance, back), lights, -1)
     return replace(frame, box=box, valid=jnp.where(others, detected, frame.valid), lights=lights)
 
 
 def in_view(
     eye: Float[Array, " 2"], box: Float[Array, "S 6"], blocks: Bool[Array, " S"]
 ) -> Bool[Array, " S"]:
-    """Return a mask of agents whose centre or a corner is visible from a point.
+    """Return a mask of the agents whose centre or a corner is visible from a point.
 
-    Boxes in ``blocks`` occlude lines of sight through their interior, but not those that touch them. No box occludes
+    Boxes in ``blocks`` occlude lines of sight through their interior, but not along their sides. No box occludes
     itself, and a box around the eye occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
     dx, dy = eye[0] - box[:, X], eye[1] - box[:, Y]
@@ -126,23 +124,23 @@ def in_view(
     points = jnp.concatenate([corners(box), box[:, None, :2]], axis=1)
     enters, leaves = passage(eye, points[:, :, None], box)
     others = ~jnp.eye(len(box), dtype=bool)
-    blocked = (enters < leaves) & (blocks & ~inside) & others[:, None]
-    return ~blocked.any(axis=2).all(axis=1)
+    occludes = (enters < leaves) & (blocks & ~inside) & others[:, None]
+    return ~occludes.any(axis=2).all(axis=1)
 
 
-def lights_seen(
+def detect_lights(
     config: Perception, bank: ScenarioBank, context: AgentContext, distance_m: Float[Array, " L"],
     back: int = 0,
 ) -> Bool[Array, " L"]:  # fmt: skip
-    """Return a mask of the stop lines that were detected ``back`` steps ago, given their distances."""
+    """Return a mask of the stop lines detected ``back`` steps ago, from their distances."""
     key = jax.random.fold_in(_key(config, bank, context, back), _LIGHT_DROPOUT_STREAM)
-    return _is_detected(config, key, distance_m)
+    return _detect(config, key, distance_m)
 
 
 def position_errors(
     config: Perception, bank: ScenarioBank, context: AgentContext, stream: int, count: int
 ) -> Float[Array, "count 2"]:
-    """Return position errors of ``LIGHT_NOISE_STREAM`` or ``ROAD_NOISE_STREAM`` in the ego frame, m."""
+    """Return position errors of lights or road pieces (``stream``) in the ego frame, m."""
     return config.noise_m * _normal_per_slot(jax.random.fold_in(_key(config, bank, context), stream), count)
 
 
@@ -154,8 +152,8 @@ def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: in
     return key
 
 
-def _is_detected(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
-    """Return a mask of the agents in range that are not dropped at random."""
+def _detect(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
+    """Return a mask of the slots in range that are not dropped at random."""
     detected = jnp.ones(distance_m.shape, bool)
     if config.range_m is not None:
         detected &= distance_m <= config.range_m

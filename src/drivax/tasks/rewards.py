@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, make_dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
@@ -23,21 +23,21 @@ from drivax.tasks.own import check_unique, name_of
 
 Term = Callable[[Facts, Facts, Surroundings], Scalar]
 
-#: Progress of one step with the full progress reward, at 12 m/s.
+#: Progress in one step, at 12 m/s, for which ``progress`` is 1.
 _PROGRESS_SCALE_M = 12.0 * DT_S
 #: Speeding by more than this is penalised, m/s (5 mph).
 _SPEEDING_MPS = 2.23
-#: Time to collision below which ``ttc_shortfall`` is positive, s (the published aggressive driver).
+#: Time to collision below which ``ttc_shortfall`` is positive, s (published aggressive driver).
 _MIN_TTC_S = 1.0
 #: nuPlan's limits of jerk and lateral acceleration; their sum is the unpublished "max" of the published comfort.
 _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
 #: nuPlan's limits of braking and of acceleration.
 _BRAKING_MPS2, _ACCELERATION_MPS2 = 4.05, 2.40
-#: Scales of ``pace`` behind and ahead of the log, m; how far ahead costs nothing, m.
+#: Length scales of ``pace`` behind and ahead of the log, m; distance ahead without a penalty, m.
 _LATE_M, _EARLY_M, _EARLY_SLACK_M = 2.0, 8.0, 1.0
 #: Distance from the route at which ``route_offset`` is 1, m; time to collision at which ``urgency`` is 0, s.
 _ROUTE_OFFSET_M, _URGENT_S = 1.0, 2.0
-#: Cap of distances from the log, m.
+#: Maximum of distances from the log, m.
 _MAX_LOG_DISTANCE_M = 10.0
 #: The goal is reached within this distance, m (semantics, ``reached_goal``).
 _GOAL_M = 3.0
@@ -50,12 +50,12 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """A built-in term: a function of the facts that it ``reads``.
+    """A built-in term.
 
     Attributes:
-        function: Returns the term.
-        reads: Facts that it reads.
-        option: Field of :class:`RewardConfig` that it takes as a fourth argument, if any.
+        function: Function of the facts before and now, and the surroundings.
+        reads: Facts that the function reads.
+        option: Field of :class:`RewardConfig` that it takes as a fourth argument.
         softened: Whether the term is multiplied by :data:`SOFT_FACTORS`.
     """
 
@@ -65,19 +65,18 @@ class RewardTerm:
     softened: bool = False
 
     def __call__(self, before: Facts, now: Facts, around: Surroundings, *option: Any) -> Scalar:
-        """Return the term."""
+        """Return the value of the term."""
         return self.function(before, now, around, *option)
 
 
-#: All built-in terms by name, in the order of their definition.
+#: Built-in terms by name, in the order of their definition.
 TERMS: dict[str, RewardTerm] = {}
 
 
 def reward_term(*reads: str, option: str | None = None, softened: bool = False) -> Callable[[Any], Any]:
-    """Register a function as the built-in term of its name that reads these facts."""
+    """Register a function, which reads these facts, as the built-in term of its name."""
 
     def register(function: Any) -> Any:
-        """Add a function to ``TERMS`` and return it unchanged."""
         TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option, softened)
         return function
 
@@ -100,7 +99,7 @@ def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
-# 1 while a corner is off the road; at the step that runs a red light; while off the corridor of the route.
+# 1 while a corner is off the road; at a step that runs a red light; while off the corridor of the route.
 _event_term("offroad", "offroad")
 _event_term("red_light", "red_light")
 _event_term("off_route", "off_route")
@@ -205,8 +204,8 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at the step that enters a neighbouring lane of the same direction; at the step that leaves a lane that ends within
-# 100 m, or joins another (``scenario.bank.queries.lane_passage``).
+# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane that ends within
+# 100 m or joins another (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
@@ -215,8 +214,8 @@ _event_term("merge", "merged")
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Adherence to the log's schedule along the route, in [0, 1].
 
-    1 from where the log is now to where it is a second later. Behind that 1 / (1 + late / 2 m), which pays to catch up
-    from any distance; ahead exp(-early / 8 m), with 1 m free. A log that stands asks for standing.
+    1 between the log's present position and that a second later. Behind, 1 / (1 + late / 2 m), which rewards catching
+    up from any distance; ahead, exp(-early / 8 m) after the first metre.
     """
     late_m, early_m = jnp.maximum(now.late_m, 0.0), jnp.maximum(now.early_m - _EARLY_SLACK_M, 0.0)
     return jnp.exp(-early_m / _EARLY_M) / (1.0 + late_m / _LATE_M)
@@ -224,7 +223,7 @@ def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
 @reward_term("completed", softened=True)
 def completion(before: Facts, now: Facts, around: Surroundings) -> Scalar:
-    """Gain of the completed share of the log's way, in [0, 1] (CaRL, arXiv 2504.17838)."""
+    """Gain of the completed share of the log's path, in [0, 1] (CaRL, arXiv 2504.17838)."""
     return jnp.maximum(now.completed - before.completed, 0.0)
 
 
@@ -255,10 +254,10 @@ def time_gap_shortfall(before: Facts, now: Facts, around: Surroundings, time_gap
     return now.ttc_defined * shortfall
 
 
-# 1 at the step at which a collision begins that is the agent's fault.
+# 1 at a step at which a collision begins that is the agent's fault.
 _event_term("at_fault_collision", "at_fault")
 
-#: Terms that lower a softened term, and the share of it that each takes at 1; together they leave at least 0.36.
+#: Terms that lower a softened term, and the share by which each lowers it at 1; at least 0.36 of the term remains.
 SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.2}
 
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
@@ -269,13 +268,10 @@ AGGRESSIVE = PUBLISHED | {"ttc_shortfall": -0.5, "speed_ratio": 0.3, "lane_chang
 FAILURES = {"collision": -3.0, "offroad": -3.0, "red_light": -3.0}
 PACE, COMPLETION = FAILURES | {"pace": 0.1}, FAILURES | {"completion": 8.0}
 Preset = Literal["safety", "navigation", "behaviour", "published", "aggressive", "pace", "completion"]
-PRESETS: dict[str, dict[str, float]] = dict(
-    zip(
-        get_args(Preset),
-        (SAFETY, NAVIGATION, BEHAVIOUR, PUBLISHED, AGGRESSIVE, PACE, COMPLETION),
-        strict=True,
-    )
-)
+PRESETS: dict[str, dict[str, float]] = {
+    "safety": SAFETY, "navigation": NAVIGATION, "behaviour": BEHAVIOUR, "published": PUBLISHED,
+    "aggressive": AGGRESSIVE, "pace": PACE, "completion": COMPLETION,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -312,9 +308,9 @@ class RewardConfig(_Weights):
 
     Attributes:
         preset: ``safety``, ``navigation`` and ``behaviour`` each include the previous; ``published`` has the form and
-            weights of the published description, ``aggressive`` those of its aggressive driver. ``pace`` pays for
-            the log's schedule along the route, ``completion`` for the completed share of its way, both times
-            :data:`SOFT_FACTORS`, and fine failures.
+            weights of the published description, ``aggressive`` those of its aggressive driver. ``pace`` rewards the
+            log's schedule along the route, ``completion`` the completed share of the log's path; both are softened by
+            :data:`SOFT_FACTORS` and have larger penalties for failures.
         collision_margin_m: Gap below which ``collision`` counts (published safety margin: 0.5).
         ttc_s: Time to collision below which ``ttc`` counts (published safety margin: 0.95).
         close_m: Gap below which ``close`` counts.
@@ -341,19 +337,19 @@ class RewardConfig(_Weights):
             raise ValueError(f"scale is {self.scale}; choose a number above 0")
 
     def weights(self) -> dict[str, float]:
-        """Return the nonzero weights by term, before ``scale``."""
+        """Return the nonzero weights by term, without ``scale``."""
         overrides = {name: weight for name in TERMS if (weight := getattr(self, name)) is not None}
         weights = PRESETS[self.preset] | overrides | {term.name: term.weight for term in self.own}
         return {name: weight for name, weight in weights.items() if weight}
 
     @property
     def penalties(self) -> dict[str, float]:
-        """Size of the weights below 0 by term, with ``scale``."""
+        """Absolute values of the negative weights by term, with ``scale``."""
         return {name: -self.scale * weight for name, weight in self.weights().items() if weight < 0.0}
 
     @property
     def reads(self) -> frozenset[str]:
-        """Facts that the terms read; user-defined terms read all but those on request."""
+        """Facts that the terms read; user-defined terms read all that are not on request."""
         reads = {name: term.reads for name, term in TERMS.items()}
         reads |= {term.name: FACTS.union(term.reads) for term in self.own}
         if self.collision_margin_m:
@@ -365,21 +361,23 @@ class RewardConfig(_Weights):
     def weigh(
         self, before: Facts, now: Facts, around: Surroundings, conditions: Mapping[str, Scalar] | None = None
     ) -> dict[str, Scalar]:
-        """Return the weighted and scaled terms by name, and what each soft factor takes from a term as ``TERM/FACTOR``.
+        """Return the weighted and scaled terms by name, and the loss by each soft factor as ``TERM/FACTOR``.
 
         The reward is the sum of all. ``conditions`` are factors of terms and replacements of options, by name.
         """
         conditions = conditions or {}
-        own_terms = {term.name: term.term for term in self.own}
+        # A user's term has no option, and is not softened.
+        terms = TERMS | {term.name: RewardTerm(term.term, frozenset()) for term in self.own}
         result = {}
         for name, weight in self.weights().items():
-            term = TERMS.get(name)
-            option = None if term is None else term.option
-            options = () if option is None else (conditions.get(option, getattr(self, option)),)
-            value = self.scale * weight * (term or own_terms[name])(before, now, around, *options)
+            term = terms[name]
+            options = (
+                () if term.option is None else (conditions.get(term.option, getattr(self, term.option)),)
+            )
+            value = self.scale * weight * term(before, now, around, *options)
             value = conditions[name] * value if name in conditions else value
             result[name] = value
-            for factor, share in SOFT_FACTORS.items() if term is not None and term.softened else ():
+            for factor, share in (SOFT_FACTORS if term.softened else {}).items():
                 loss = value * share * TERMS[factor](before, now, around)
                 result[f"{name}/{factor}"] = -loss
                 value = value - loss

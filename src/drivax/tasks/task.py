@@ -50,8 +50,8 @@ class Task:
         metrics: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted names of custom metrics. Others
             are neither measured nor carried.
         ends: Failures that terminate an episode.
-        conditions: Numbers of the reward that training draws for each agent and episode, observed as group
-            ``conditions``; weights and options of the reward that it does not name are the same in all episodes.
+        conditions: Weights and options of the reward that training draws for each agent and episode, observed as group
+            ``conditions``; all others are the same in all episodes.
         to_the_end: Whether episodes continue to the end of the log after a failure, as in evaluation.
     """
 
@@ -102,7 +102,7 @@ class Task:
         """Return the observation of a context; ``frames`` returns earlier frames, ``frame`` is the present one."""
 
         def frames_with_present(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
-            """Return a frame; the present one is not computed again."""
+            """Return an earlier frame, or the present one without computing it again."""
             if back:
                 return frames(back, slots)
             return frame if slots is None else frame.at(slots)

@@ -1,6 +1,6 @@
 """Paths of reacting agents: geometry along the log and beyond, speed limits, and stop lines.
 
-Computed once per bank with numpy (:func:`with_paths`); a step only looks up rows.
+Computed once per bank with numpy (:func:`with_paths`); a simulation step only reads rows.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data
 
 #: Points of a path, equally far apart along it.
 PATH_POINTS = 96
-#: Columns read by the look-ahead are stored apart: half as many cache lines for most of the reads.
+#: Columns of paths. Those that the look-ahead reads are a separate array: most reads touch half as many cache lines.
 PATH_X, PATH_Y, PATH_COS, PATH_SIN = range(4)
 PROFILE_Z, PROFILE_SPEED = range(2)
-#: How far a path goes on beyond the last logged pose, m (semantics, Traffic), and the stored points' distance.
+#: Length of a path beyond the last logged pose (semantics, Traffic), and spacing of its points, m.
 EXTENSION_M, _EXTENSION_STEP_M = 60.0, 4.0
 #: An agent reacts if it travels further than this in the rest of its log, m.
 TRAVELS_M = 2.0
 #: Overlapping agents stored per step.
 OVERLAPS = 2
-#: Logged positions nearer to each other than this do not shape a path, m: a standing car's boxes jitter.
+#: Minimum distance between key positions, m. Others do not shape a path: the boxes of a standing car jitter.
 _KEY_M = 1.0
-#: A log that moves backwards further than this belongs to a reversing vehicle, m.
+#: A vehicle whose log moves backwards further than this reverses, m.
 _BACKWARDS_M = 1.5
-#: A last pose further ahead than this of the last one that shapes the path shapes it too, m.
-_ONWARD_M = 0.2
+#: The last pose shapes the path, too, if it is further ahead of the last key position than this, m.
+_LAST_POSE_M = 0.2
 #: Lateral acceleration in curves and braking towards them, m/s2.
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
-#: Half the stretch over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
+#: Half the length over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
 _CURVE_M, _CURVE_S = 2.5, 0.25
-#: Stop lines of a path that are kept, the first ones.
+#: Stop lines stored per path, the first ones.
 STOPS = 4
-#: Stop lines that a path crosses this close to each other are one place to stop, m.
-_ONE_PLACE_M = 3.0
-#: Of the lights at one place that one counts whose lane ends closest to the path's heading this far beyond, m.
+#: Stop lines that a path crosses within this distance are one stop, m.
+_ONE_STOP_M = 3.0
+#: Of the lights of a stop that one counts whose lane ends closest to the path's heading this far beyond, m.
 _EVALUATED_AFTER_M = 20.0
-#: A line counts for paths that cross it within this angle of its lane's heading.
-_ASKEW_COS = 0.5
+#: Minimum cosine of the angle between a path and the lane of a line that it crosses.
+_MIN_COS = 0.5
 Numbers = np.ndarray[Any, Any]
 
 
@@ -95,12 +95,12 @@ class _Logs:
 def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHICLE),)) -> ScenarioBank:
     """Return the bank with paths of all agents of ``kinds`` that drive forward more than 2 m in their log.
 
-    A path is the logged line, thinned to a metre, with logged headings, extended by 60 m along the agent's last lane.
-    Its speed limit is the log's peak, 2.5 m/s2 of lateral acceleration, and 1.5 m/s2 of braking towards curves. A bank
-    that already has such paths is returned unchanged.
+    A path has the logged positions, at least 1 m apart, with their headings, and 60 m along the agent's last lane. Its
+    speed limit follows from the log's peak speed, 2.5 m/s2 of lateral acceleration, and 1.5 m/s2 of braking towards
+    curves. A bank that already has these paths is returned unchanged.
     """
-    known = find_data(bank, AgentPaths)
-    if known is not None and known.kinds == kinds:
+    previous = find_data(bank, AgentPaths)
+    if previous is not None and previous.kinds == kinds:
         return bank
     logs = _candidates(bank, kinds)
     lines, log_arc = _lines(bank, logs)
@@ -115,11 +115,10 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
         result[logs.scenario, row] = values
         return jnp.asarray(result)
 
-    points, profile, spacing = _sample_paths(
-        lines, np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
-    )
-    at_points = np.concatenate([points, profile], axis=-1)
-    stop_arc, stop_light = _light_arcs(bank, logs.scenario, at_points, spacing)
+    peak = np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
+    points, profile, spacing = _sample_paths(lines, peak)
+    columns = np.concatenate([points, profile], axis=-1)
+    stop_arc, stop_light = _light_arcs(bank, logs.scenario, columns, spacing)
     paths = AgentPaths(
         slot=spread(logs.slot, -1, np.int16),
         points=spread(points, 0.0, np.float32),
@@ -140,39 +139,50 @@ def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
     """Return the logs of the agents that may react: of these kinds, moving more than 2 m, and not reversing."""
     agents = np.asarray(bank.agents, np.float64)
     kind = np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND])
-    valid = agents[..., AgentColumn.VALID] > 0
-    scenario, slot = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1)).T
+    has_agent = (agents[..., AgentColumn.VALID] > 0).any(axis=1)
+    scenario, slot = np.argwhere(np.isin(kind, kinds) & has_agent).T
     rows = agents[scenario, :, slot]
-    heading = np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS])
-    along = rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
-    along += rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
-    xy, z, observed = rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], valid[scenario, :, slot]
-    extension = np.asarray(bank.extension, np.float64)[scenario, slot]
-    logs = _Logs(scenario, slot, xy, z, heading, along, observed, extension)
-    # Moves between key steps: a standing car's jitter does not count. The first key step has no move before it.
-    key = _keys(logs.xy, logs.valid)
+    speed = rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
+    speed += rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
+    logs = _Logs(
+        scenario,
+        slot,
+        xy=rows[..., AgentColumn.XY],
+        z=rows[..., AgentColumn.Z],
+        heading=np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS]),
+        speed=speed,
+        valid=rows[..., AgentColumn.VALID] > 0,
+        extension=np.asarray(bank.extension, np.float64)[scenario, slot],
+    )
+    return logs.part(_travels_forward(logs))
+
+
+def _travels_forward(logs: _Logs) -> Bool[np.ndarray, " V"]:
+    """Mask of the agents that move more than 2 m and do not reverse."""
+    # Moves between key steps: the jitter of a standing car does not count. The first key step has no move before it.
+    key = _key_steps(logs.xy, logs.valid)
     last = _last_key(key)
     xy, heading = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
     move = np.diff(xy, axis=1) * key[:, 1:, None] * (np.cumsum(key, axis=1)[:, 1:, None] > 1)
-    moved = np.hypot(move[..., 0], move[..., 1])
+    distance = np.hypot(move[..., 0], move[..., 1])
     ahead = move[..., 0] * np.cos(heading[:, :-1, 0]) + move[..., 1] * np.sin(heading[:, :-1, 0])
     flips = np.abs(wrap(np.diff(heading[..., 0], axis=1))) > np.pi / 2
-    forward = (np.where(ahead < 0, moved, 0.0).sum(1) < _BACKWARDS_M) & ~flips.any(1)
-    return logs.part((moved.sum(1) > TRAVELS_M) & forward)
+    reverses = (np.where(ahead < 0, distance, 0.0).sum(1) >= _BACKWARDS_M) | flips.any(1)
+    return (distance.sum(1) > TRAVELS_M) & ~reverses
 
 
-def _keys(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -> Bool[np.ndarray, "V T"]:
-    """Mask of the steps that shape a path: the first valid one, and each that is a metre away from the one before."""
+def _key_steps(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -> Bool[np.ndarray, "V T"]:
+    """Mask of the steps that shape a path: the first valid one, and each that is 1 m or more from the last of them."""
     key, last = np.zeros_like(valid), np.full_like(xy[:, 0], np.inf)
     for step in range(valid.shape[1]):
-        away = xy[:, step] - last
-        key[:, step] = valid[:, step] & (np.hypot(away[:, 0], away[:, 1]) >= _KEY_M)
+        offset = xy[:, step] - last
+        key[:, step] = valid[:, step] & (np.hypot(offset[:, 0], offset[:, 1]) >= _KEY_M)
         last = np.where(key[:, step, None], xy[:, step], last)
     return key
 
 
 def _last_key(key: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
-    """Return the last key step at or before each step; the first one where there is none."""
+    """Return the last key step at or before each step; the first key step before it."""
     last = np.maximum.accumulate(np.where(key, np.arange(key.shape[1]), -1), axis=1)
     return np.where(last < 0, np.argmax(key, axis=1)[:, None], last)
 
@@ -180,23 +190,23 @@ def _last_key(key: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
 def _next_step(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
     """Return the first valid step at or after each step; T where there is none."""
     steps = valid.shape[1]
-    at = np.where(valid, np.arange(steps), steps)
-    return np.minimum.accumulate(at[:, ::-1], axis=1)[:, ::-1]
+    step = np.where(valid, np.arange(steps), steps)
+    return np.minimum.accumulate(step[:, ::-1], axis=1)[:, ::-1]
 
 
 def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray, "V T"]]:
     """Return the line of every agent (x, y, z, unwrapped heading), and the arc length of its log at each step."""
     count, steps = logs.valid.shape
-    key = _keys(logs.xy, logs.valid)
+    key = _key_steps(logs.xy, logs.valid)
     agent = np.arange(count)
     end = steps - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
     final, final_heading = logs.xy[agent, end], logs.heading[agent, end]
-    ahead = final - logs.xy[agent, _last_key(key)[:, -1]]
-    # The last pose shapes the path too, unless a standing car's jitter put it behind.
-    onward = ahead[:, 0] * np.cos(final_heading) + ahead[:, 1] * np.sin(final_heading) > _ONWARD_M
+    offset = final - logs.xy[agent, _last_key(key)[:, -1]]
+    # The last pose shapes the path, too, unless it is behind, by the jitter of a standing car.
+    is_ahead = offset[:, 0] * np.cos(final_heading) + offset[:, 1] * np.sin(final_heading) > _LAST_POSE_M
     points = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
     extension = logs.extension[:, :points]
-    line = np.concatenate([logs.xy, final[:, None], extension], axis=1)
+    xy = np.concatenate([logs.xy, final[:, None], extension], axis=1)
     # The tangent at a point of the extension is the sum of the pieces before and after it.
     tangent = np.diff(np.concatenate([final[:, None], extension, extension[:, -1:]], axis=1), axis=1)
     tangent = tangent[:, :-1] + tangent[:, 1:]
@@ -204,17 +214,17 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
     heading = np.concatenate([logs.heading, final_heading[:, None], heading], axis=1)
     height = _heights(bank, logs, extension, end)
     height = np.concatenate([logs.z, logs.z[agent, end][:, None], height], axis=1)
-    shapes = np.concatenate([key, onward[:, None], np.ones((count, points), bool)], axis=1)
-    flat = np.concatenate([line, height[..., None], heading[..., None]], axis=-1)[shapes]
-    # Unwrapped over all agents at once: each line is continuous, whatever heading it starts with.
+    mask = np.concatenate([key, is_ahead[:, None], np.ones((count, points), bool)], axis=1)
+    flat = np.concatenate([xy, height[..., None], heading[..., None]], axis=-1)[mask]
+    # Unwrapped over all agents at once: a line is continuous at any initial heading.
     flat[:, 3] = np.unwrap(flat[:, 3]) if len(flat) else flat[:, 3]
-    start = np.concatenate(([0], np.cumsum(shapes.sum(1))))
+    start = np.concatenate(([0], np.cumsum(mask.sum(1))))
     lines = Polylines(flat, start, arc_lengths(flat, start))
     return lines, _log_arcs(logs, lines, key)
 
 
 def _log_arcs(logs: _Logs, lines: Polylines, key: Numbers) -> Float[np.ndarray, "V T"]:
-    """Return the arc length of every logged step; between two shaping points by its projection on their chord."""
+    """Return the arc length of every logged step: between two key steps by projection on their chord."""
     # The first points of a line are its key steps, so their running count is the point at or before each step.
     point = lines.start[:-1, None] + np.cumsum(key, axis=1) - 1
     point = np.maximum(point, lines.start[:-1, None])
@@ -227,9 +237,9 @@ def _log_arcs(logs: _Logs, lines: Polylines, key: Numbers) -> Float[np.ndarray, 
 
 
 def _heights(bank: ScenarioBank, logs: _Logs, extension: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
-    """Return heights of the box centre beyond the log: of the nearest lane on the level of the point before.
+    """Return heights of the box centre beyond the log, from the nearest lane on the level of the point before.
 
-    ``end`` is the last valid step of each log; scenarios without elevation keep its height.
+    ``end`` is the last valid step of each log. In scenarios without elevation its height continues.
     """
     flags, lanes = np.asarray(bank.flags), np.asarray(bank.lanes)
     half = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
@@ -250,13 +260,13 @@ def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray
     low, high = xy.min(axis=0) - LANE_CUTOFF_M, xy.max(axis=0) + LANE_CUTOFF_M
     middle = (segments[0:2] + segments[2:4]) / 2
     # Segments are at most 4 m long.
-    around = ((middle > low[:, None] - 2.0) & (middle < high[:, None] + 2.0)).all(axis=0)
-    ax, ay, bx, by, z = segments[:, around]
-    if not around.any():
+    near = ((middle > low[:, None] - 2.0) & (middle < high[:, None] + 2.0)).all(axis=0)
+    if not near.any():
         return ground
-    away, _ = point_to_segment(xy[:, None], np.stack([ax, ay], -1)[None], np.stack([bx, by], -1)[None])
-    away = np.where(np.abs(z - ground[:, None]) <= LEVEL_M, away, np.inf)
-    return np.where(away.min(axis=1) <= LANE_CUTOFF_M, z[away.argmin(axis=1)], ground)
+    ax, ay, bx, by, z = segments[:, near]
+    distance, _ = point_to_segment(xy[:, None], np.stack([ax, ay], -1)[None], np.stack([bx, by], -1)[None])
+    distance = np.where(np.abs(z - ground[:, None]) <= LEVEL_M, distance, np.inf)
+    return np.where(distance.min(axis=1) <= LANE_CUTOFF_M, z[distance.argmin(axis=1)], ground)
 
 
 def _sample_paths(
@@ -276,8 +286,8 @@ def _sample_paths(
     speed = np.minimum(peak[:, None], np.sqrt(CURVE_MPS2 / np.maximum(curvature, 1e-6)))
     # Backwards, so that every point allows braking to the limits of all later ones.
     for point in range(PATH_POINTS - 2, -1, -1):
-        reach = np.sqrt(speed[:, point + 1] ** 2 + 2 * CURVE_BRAKING_MPS2 * spacing)
-        speed[:, point] = np.minimum(speed[:, point], reach)
+        braking_speed = np.sqrt(speed[:, point + 1] ** 2 + 2 * CURVE_BRAKING_MPS2 * spacing)
+        speed[:, point] = np.minimum(speed[:, point], braking_speed)
     direction = [np.cos(points[..., 3:]), np.sin(points[..., 3:])]
     poses = np.concatenate([points[..., :2], *direction], axis=-1)
     return poses, np.stack([points[..., 2], speed], axis=-1), spacing
@@ -291,28 +301,29 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
         agents = np.flatnonzero(logs.scenario == scenario)
         boxes, z, valid = _logged_boxes(*(table[scenario] for table in tables))
         own, slots = boxes[:, logs.slot[agents]], logs.slot[agents]
-        reach = np.hypot(boxes[0, :, LENGTH], boxes[0, :, WIDTH]) / 2
+        radius = np.hypot(boxes[0, :, LENGTH], boxes[0, :, WIDTH]) / 2
         dx, dy = (own[:, :, None, i] - boxes[:, None, :, i] for i in (0, 1))
-        near = dx * dx + dy * dy < (reach[slots][:, None] + reach) ** 2
+        near = dx * dx + dy * dy < (radius[slots][:, None] + radius) ** 2
         near &= valid[:, None] & valid[:, slots][..., None] & (slots[:, None] != np.arange(boxes.shape[1]))
         near &= np.abs(z[:, slots][..., None] - z[:, None]) <= LEVEL_M
-        step, agent, other = np.nonzero(near)
-        meets = overlap(own[step, agent], boxes[step, other])
-        step, agent, other = step[meets], agent[meets], other[meets]
-        # Overlaps are sorted by step and agent, so the distance from the first of an agent is the rank.
-        pair = step * len(agents) + agent
-        rank = np.arange(len(pair)) - np.searchsorted(pair, pair)
-        keep = rank < OVERLAPS
-        overlaps[scenario, step[keep], row[agents[agent[keep]]], rank[keep]] = other[keep]
+        candidates = np.argwhere(near)
+        step, agent, other = candidates.T
+        step, agent, other = candidates[overlap(own[step, agent], boxes[step, other])].T
+        # Overlaps are sorted by step and agent: the rank of one is its distance from the first of its agent and step.
+        key = step * len(agents) + agent
+        rank = np.arange(len(key)) - np.searchsorted(key, key)
+        is_first = rank < OVERLAPS
+        target = scenario, step[is_first], row[agents[agent[is_first]]], rank[is_first]
+        overlaps[target] = other[is_first]
     return overlaps
 
 
 def _logged_boxes(
-    agents: Numbers, box: Numbers, parked: Numbers, when: Numbers
+    agents: Numbers, box: Numbers, parked: Numbers, parked_when: Numbers
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Return boxes, heights and validity of all slots of a scenario's frames, at every logged step."""
     step = np.arange(len(agents))
-    is_parked = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
+    is_parked = (parked_when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
     rows = np.pad(agents, ((0, 0), (0, len(box) - agents.shape[1]), (0, 0)))
     rows = np.where(is_parked[..., None], parked, rows)
     size = np.broadcast_to(box[None, :, SizeColumn.FOOTPRINT], (len(rows), len(box), 2))
@@ -324,9 +335,9 @@ def _light_arcs(
     bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
     spacing: Float[np.ndarray, " V"],
 ) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
-    """Return arc lengths of the first four stops of paths (points, profile), and the slots of their lights.
+    """Return arc lengths of the first four stops of each path, and the slots of their lights.
 
-    Lights that are never observed do not count.
+    ``points`` has the columns of points and profile. Lights that are never observed do not count.
     """
     arcs = np.full((len(scenario), STOPS), NEVER_M)
     lights = np.zeros((len(scenario), STOPS), np.int64)
@@ -349,30 +360,33 @@ def _light_arcs(
 def _crossings(line: Numbers, points: Numbers, spacing: Numbers) -> Float[np.ndarray, "V L"]:
     """Return the arc length at which each path first crosses each stop line forwards; infinite where it does not."""
     cos, sin = line[LightRow.COS], line[LightRow.SIN]
-    dx, dy = (points[:, :, None, i] - line[at] for i, at in ((0, LightRow.X), (1, LightRow.Y)))
+    dx, dy = points[:, :, None, PATH_X] - line[LightRow.X], points[:, :, None, PATH_Y] - line[LightRow.Y]
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     before, after = ahead[:, :-1], ahead[:, 1:]
-    share = -before / np.where(after > before, after - before, 1.0)
-    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LightRow.HALF]
-    facing = points[:, :-1, None, 2] * cos + points[:, :-1, None, 3] * sin > _ASKEW_COS
-    level = np.abs(points[:, :-1, None, 4] - line[LightRow.Z]) <= LEVEL_M
-    crosses = (before < 0.0) & (after >= 0.0) & through & facing & level
+    fraction = -before / np.where(after > before, after - before, 1.0)
+    within = np.abs(left[:, :-1] + fraction * np.diff(left, axis=1)) <= line[LightRow.HALF]
+    parallel = points[:, :-1, None, PATH_COS] * cos + points[:, :-1, None, PATH_SIN] * sin > _MIN_COS
+    level = np.abs(points[:, :-1, None, PATH_SIN + 1 + PROFILE_Z] - line[LightRow.Z]) <= LEVEL_M
+    crosses = (before < 0.0) & (after >= 0.0) & within & parallel & level
     first = np.argmax(crosses, axis=1)
-    arc = (first + np.take_along_axis(share, first[:, None], axis=1)[:, 0]) * spacing[:, None]
+    arc = (first + np.take_along_axis(fraction, first[:, None], axis=1)[:, 0]) * spacing[:, None]
     return np.where(crosses.any(axis=1), arc, np.inf)
 
 
 def _stops(arc: Numbers, heading: Numbers, spacing: float, exits: Numbers) -> list[tuple[float, int]]:
-    """Return the places to stop in order: arc length, and the light that counts there."""
+    """Return the stops of a path in order: arc length, and the light that counts.
+
+    ``arc`` are the arc lengths at which the path crosses each line, ``exits`` the headings at the ends of their lanes.
+    """
     groups: list[list[int]] = []
     for light in (int(light) for light in np.argsort(arc) if np.isfinite(arc[light])):
-        if groups and arc[light] - arc[groups[-1][0]] <= _ONE_PLACE_M:
+        if groups and arc[light] - arc[groups[-1][0]] <= _ONE_STOP_M:
             groups[-1].append(light)
         else:
             groups.append([light])
     stops = []
     for group in groups:
-        later = min(round((arc[group[0]] + _EVALUATED_AFTER_M) / spacing), len(heading) - 1)
-        light = min(group, key=lambda light: abs(float(wrap(exits[light] - heading[later]))))
+        point = min(round((arc[group[0]] + _EVALUATED_AFTER_M) / spacing), len(heading) - 1)
+        light = min(group, key=lambda light: abs(float(wrap(exits[light] - heading[point]))))
         stops.append((float(arc[light]), light))
     return stops

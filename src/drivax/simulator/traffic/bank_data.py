@@ -45,13 +45,13 @@ def prepare_bank(traffic: Traffic, bank: ScenarioBank) -> ScenarioBank:
 
 def with_data(bank: ScenarioBank, data: TrafficData) -> PreparedBank:
     """Return the bank with the data of a traffic model; data of the same type are replaced."""
-    others = tuple(known for known in _all_data(bank) if type(known) is not type(data))
+    others = tuple(other for other in _all_data(bank) if type(other) is not type(data))
     logs = {field.name: getattr(bank, field.name) for field in fields(ScenarioBank)}
     return PreparedBank(**logs, traffic=(*others, data))
 
 
 def find_data(bank: ScenarioBank, kind: type[Data]) -> Data | None:
-    """Return the data of a type, None if the bank has none."""
+    """Return the data of a type, or None if the bank has none."""
     return next((data for data in _all_data(bank) if isinstance(data, kind)), None)
 
 

@@ -37,21 +37,21 @@ class LogTraffic:
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "history 4"]:
     """Return the last logged motions of a slot up to ``step``.
 
-    Where the log does not reach back (before its start, or before the agent appeared) the motion is extended
-    backwards at the velocity of the earliest known step.
+    Before the start of the log, and before the agent appeared, the motion is extended backwards at the velocity of the
+    earliest valid step.
     """
     steps = step - jnp.arange(HISTORY - 1, -1, -1)
     rows = bank.agents[index, jnp.clip(steps, 0, bank.steps - 1), slot]
-    known = (rows[:, AgentColumn.VALID] > 0) & (steps >= 0)
-    # The earliest row of the unbroken stretch that ends now.
-    unbroken = jnp.flip(jnp.cumprod(jnp.flip(known.astype(jnp.int32)))) > 0
-    first = jnp.minimum(HISTORY - jnp.sum(unbroken), HISTORY - 1)
+    valid = (rows[:, AgentColumn.VALID] > 0) & (steps >= 0)
+    # Rows that are valid, as are all later ones; and the earliest of them.
+    connected = jnp.flip(jnp.cumprod(jnp.flip(valid.astype(jnp.int32)))) > 0
+    first = jnp.minimum(HISTORY - jnp.sum(connected), HISTORY - 1)
     missing_s = (first - jnp.arange(HISTORY))[:, None] * DT_S
     heading = jnp.arctan2(rows[:, AgentColumn.SIN], rows[:, AgentColumn.COS])
     speed = jnp.maximum(jnp.sum(rows[:, AgentColumn.VELOCITY] * rows[:, AgentColumn.HEADING], axis=-1), 0.0)
     logged = jnp.stack([rows[:, AgentColumn.X], rows[:, AgentColumn.Y], heading, speed], axis=-1)
     extension = logged[first] - missing_s * jnp.pad(rows[first, AgentColumn.VELOCITY], (0, 2))
-    return jnp.where(unbroken[:, None], logged, extension)
+    return jnp.where(connected[:, None], logged, extension)
 
 
 def agent_rows(
@@ -69,38 +69,40 @@ def frame_of(
 ) -> Frame:  # fmt: skip
     """Return the frame of ``step - back`` from the traffic model's rows, driven agents and parked agents.
 
-    ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the last are empty.
-    ``back`` is less than ``HISTORY``; reactive traffic remembers 9 steps. ``slots`` selects agents; by default all.
+    ``driven`` stacks the contexts of all driven agents of the scenario ``[K]``; slots beyond the moving agents are
+    empty. ``back`` is less than ``HISTORY``; reactive traffic remembers 9 steps. ``slots`` selects agents; by default
+    all.
     """
     motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
-    rows, at = agent_rows(motion, jnp.zeros_like(present), present), jnp.clip(step - back, 0, bank.steps - 1)
-    box, parked, words = bank.agent_box[index], bank.parked[index], bank.parked_when[index, at // WORD]
+    rows = agent_rows(motion, jnp.zeros_like(present), present)
+    log_step = jnp.clip(step - back, 0, bank.steps - 1)
+    box, parked, words = bank.agent_box[index], bank.parked[index], bank.parked_when[index, log_step // WORD]
     moving, target = len(agents), driven.slot
     if slots is None:
-        parked_only = len(box) - moving
+        padding = len(box) - moving
     else:
         agents = agents.at[slots].get(mode="fill", fill_value=0.0)
-        box, parked, words, parked_only = box[slots], parked[slots], words[slots], 0
-        # Row of each driven agent among the selected ones; past the end, and so dropped, if it is not selected.
+        box, parked, words, padding = box[slots], parked[slots], words[slots], 0
+        # Row of each driven agent in the selection; the index past the end, which is dropped, if it has none.
         match = (slots[:, None] == driven.slot) & (slots[:, None] < moving)
         row = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
         target = jnp.where(match.any(axis=0), row, len(slots))
-    # Before the recording no other agent was seen.
+    # No other agent is valid before the recording.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
-    # Heights apart: measuring changes only them, so XLA computes the rest of the frame once for both.
+    # Heights in their own array: measuring changes only them, so XLA computes the rest of the frame once for both.
     z = agents[:, AgentColumn.Z].at[target].set(driven.z, mode="drop")
     agents = agents.at[target].set(rows, mode="drop")
-    is_parked = ((words >> (at % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)
-    z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, parked_only)))
-    agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, parked_only), (0, 0))))
-    parts = [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]]
+    is_parked = ((words >> (log_step % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)
+    z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, padding)))
+    agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, padding), (0, 0))))
+    columns = [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]]
     return Frame(
-        box=jnp.concatenate(parts, axis=-1),
+        box=jnp.concatenate(columns, axis=-1),
         velocity=agents[:, AgentColumn.VELOCITY],
         z=z,
         valid=agents[:, AgentColumn.VALID] > 0,
         kind=box[:, SizeColumn.KIND].astype(jnp.int32),
-        lights=jnp.where(step >= back, bank.light_state[index, at], -1),
+        lights=jnp.where(step >= back, bank.light_state[index, log_step], -1),
     )
 
 

@@ -25,19 +25,19 @@ Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"
 
 @record
 class OverrideMotions(TrafficData):
-    """Motions of K agents of every scenario."""
+    """Trajectories of K agents of every scenario."""
 
     slot: Int[Array, "N K"]  # Their slots, -1 for none
     motion: Float[Array, "N T K 4"]  # x, y, heading, speed
     z: Float[Array, "N T K"]  # Height of the box centre, m
-    valid: Bool[Array, "N T K"]  # Whether they are present
+    valid: Bool[Array, "N T K"]
 
 
 @dataclass(frozen=True)
 class OverrideTraffic:
-    """The agents of :class:`OverrideMotions` follow given motions, every other agent behaves as in ``base``.
+    """Agents of :class:`OverrideMotions` follow their trajectories; all others behave as in ``base``.
 
-    In reactive traffic the others see and avoid them.
+    In reactive traffic the others avoid them.
     """
 
     base: Traffic = field(default_factory=LogTraffic)
@@ -61,40 +61,41 @@ class OverrideTraffic:
         return self.base.advance(bank, context, frame)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Return the rows of ``base`` with the overridden agents at their own motions."""
+        """Return the rows of ``base``, replaced by those of the override for its agents."""
         rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
-        at, slot = (context.index, step), override.slot[context.index]
-        motions = agent_rows(override.motion[at], override.z[at], override.valid[at].astype(jnp.float32))
-        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(motions, mode="drop")
+        key, slot = (context.index, step), override.slot[context.index]
+        own_rows = agent_rows(override.motion[key], override.z[key], override.valid[key].astype(jnp.float32))
+        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(own_rows, mode="drop")
 
 
 def with_override(
     bank: ScenarioBank, slots: Int[Array, "N K"], motion: Float[Array, "N T K 4"],
     valid: Bool[Array, "N T K"] | None = None,
 ) -> ScenarioBank:  # fmt: skip
-    """Return the bank with given trajectories; their heights follow the nearest lane, from the first logged one on.
+    """Return the bank with trajectories of some agents, differentiable with respect to ``motion``.
 
-    Differentiable with respect to ``motion``: x, y (m), heading (rad), speed (m/s) at every step of the log, with the
-    mask ``valid`` (by default all). ``slots`` are moving agents of each scenario, -1 for none.
+    ``motion`` is x, y (m), heading (rad), speed (m/s) at every step of the log, with the mask ``valid`` (by default
+    all); ``slots`` are moving agents of each scenario, -1 for none. Heights follow the nearest lane on the level of the
+    step before, starting at the agent's first logged height.
     """
     valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
     slots = jnp.asarray(slots, jnp.int32)
 
-    def heights(index: Array, slot: Array, line: Float[Array, "T 4"]) -> Float[Array, " T"]:
+    def heights(index: Array, slot: Array, motion: Float[Array, "T 4"]) -> Float[Array, " T"]:
         """Return the heights of one agent's box centre along its trajectory."""
         slot = jnp.maximum(slot, 0)
         first = jnp.argmax(bank.agents[index, :, slot, AgentColumn.VALID] > 0)
         half = bank.height_m(index, slot) / 2
 
         def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
-            """Return the ground at a pose, on the level of the one before, and the height of the box centre."""
+            """Return the height of the ground at a pose, on the level of the last one, and of the box centre."""
             heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
             ground = around_lanes(bank, index, pose[:2], heading, pose[None, :2], ground).z
             return ground, ground + half
 
-        line = jax.lax.stop_gradient(line)
-        return jax.lax.scan(climb, bank.agents[index, first, slot, AgentColumn.Z] - half, line)[1]
+        motion = jax.lax.stop_gradient(motion)
+        return jax.lax.scan(climb, bank.agents[index, first, slot, AgentColumn.Z] - half, motion)[1]
 
     z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
     return with_data(bank, OverrideMotions(slots, motion, z, valid))
@@ -104,18 +105,18 @@ def motions_of_actions(
     bank: ScenarioBank, slots: Int[Array, "N K"], actions: Float[Array, "N steps K D"], move: Move,
     begin: int = CURRENT_STEP,
 ) -> Float[Array, "N T K 4"]:  # fmt: skip
-    """Return the trajectories of agents that follow the log until step ``begin`` and then execute given actions.
+    """Return the trajectories of agents that follow the log until step ``begin`` and then execute actions.
 
-    Differentiable with respect to ``actions``. An agent that the log lacks at ``begin`` starts where it was last seen,
-    or first. ``slots`` are moving agents of each scenario, -1 for none. There is one action per step; the last one is
-    repeated. ``move`` is the dynamics of the action space, such as ``Task().motion``. At most 15 steps before ``begin``
-    are as logged.
+    Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
+    action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
+    the log lacks at ``begin`` starts where it was last valid, or first. At most 22 steps before ``begin`` are as
+    logged; before them the agent stands.
     """
     steps = bank.steps - 1 - begin
     action_index = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
 
     def drive(index: Array, slot: Array, actions: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
-        """Return the trajectory of one agent; before its history it stands at the oldest pose."""
+        """Return the trajectory of one agent."""
         slot = jnp.maximum(slot, 0)
         past = logged_history(bank, index, begin, slot)
         length_m = bank.length_m(index, slot)
