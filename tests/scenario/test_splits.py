@@ -92,7 +92,7 @@ def test_a_share_of_everything_takes_everything(segment, shares):
 def test_empty_splits_are_empty_files(tmp_path):
     assert write_splits(tmp_path, entries(20), (100, 0, 0)) == {"train": 60, "validation": 0, "test": 0}
     assert (tmp_path / "splits" / "test.txt").read_text() == ""
-    assert sorted(path.name for path in (tmp_path / "splits").iterdir()) == [
+    assert sorted(path.name for path in (tmp_path / "splits").glob("*.txt")) == [
         "test.txt",
         "train.txt",
         "validation.txt",

@@ -13,7 +13,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.example_features import car_following, stop_line
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig, OwnGroup, observe
-from drivax.tasks.perception import Perception, in_view, detect_lights
+from drivax.tasks.perception import Perception, detect_lights, in_view
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
 

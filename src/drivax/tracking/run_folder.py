@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
-from drivax.files import check_output, replace_folder, write_text
+from drivax.files import check_output, replace_folder, restore_folder, write_text
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
@@ -112,6 +112,8 @@ class RunFolder:
         """
         path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
         file = path / RUN_FILE
+        if not file.is_file():
+            restore_folder(path)
         if not file.is_file():
             problem = f"not a run folder: no {RUN_FILE}" if path.is_dir() else "run folder not found"
             raise DataError(problem, file=path, cure=cure)
