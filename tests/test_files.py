@@ -131,6 +131,16 @@ def test_a_partial_folder_resumes_after_its_finished_parts(tmp_path: Path):
     assert not can_resume(tmp_path / "set")
 
 
+def test_replaced_folder_is_removed_after_a_resumable_writer(tmp_path: Path):
+    write_text(tmp_path / "set" / "old", "")
+    started(tmp_path / "set", {"seed": 1})
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    folder.open()
+    folder.publish()
+    folder.close()
+    assert names(tmp_path) == {"set"} and names(tmp_path / "set") == {"part"}
+
+
 def test_a_partial_folder_without_identity_leaves_nothing_behind(tmp_path: Path):
     started(tmp_path / "set")
     assert names(tmp_path) == set()

@@ -245,6 +245,7 @@ class PartialFolder:
             self._target.rename(self._old)
             self.content.rename(self._target)
         sync_folder(self._target.parent)
+        shutil.rmtree(self.root / "progress", ignore_errors=True)  # `content` may be the replaced folder
         self._new_parents = []
 
     def close(self) -> None:

@@ -640,6 +640,7 @@ def test_overwrite_continues_an_unfinished_set_of_the_same_identity(tmp_path: Pa
         continued(tmp_path / "set", stop=5, overwrite=True)
     assert len(ScenarioSet.open(tmp_path / "set")) == 7  # the old set stays until the new one is whole
     assert continued(tmp_path / "set", overwrite=True) == [2, 4]
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):
