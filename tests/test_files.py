@@ -358,6 +358,26 @@ def test_symbolic_links_to_outputs_are_followed(tmp_path: Path):
     assert names(tmp_path / "disk") == {"file", "run"} and names(tmp_path / "disk" / "run") == {"new"}
 
 
+def test_symbolic_links_under_hidden_names_are_not_followed(tmp_path: Path):
+    victim = tmp_path / "victim"
+    write_text(victim / "file", "kept")
+    (tmp_path / ".file.partial").symlink_to(victim / "file")
+    write_text(tmp_path / "file", "new")
+    (tmp_path / ".run.partial").symlink_to(victim)
+    with replace_folder(tmp_path / "run") as partial:
+        write_text(partial / "new", "")
+    (tmp_path / ".set.partial").mkdir()
+    for name in ("content", "progress", "old", "spool-1", "lock"):
+        (tmp_path / ".set.partial" / name).symlink_to(victim)
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    folder.open()
+    folder.note(0, {})
+    folder.publish()
+    folder.close()
+    assert names(tmp_path) == {"victim", "file", "run", "set"}
+    assert names(victim) == {"file"} and (victim / "file").read_text() == "kept"
+
+
 def test_failure_removes_the_parents_that_it_created(tmp_path: Path):
     with pytest.raises(ZeroDivisionError), replace_folder(tmp_path / "a" / "b" / "run"):
         raise ZeroDivisionError
