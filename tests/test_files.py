@@ -301,10 +301,25 @@ def test_folder_gets_its_name_back_after_a_kill_between_renames(tmp_path: Path):
     assert run(REPLACE, tmp_path / "run", "old disk").returncode == -signal.SIGKILL
     assert not (tmp_path / "run").exists()
     restore_folder(tmp_path / "run")
-    assert names(tmp_path / "run") == {"old"}
+    assert names(tmp_path / "run") == {"old"} and names(tmp_path) == {"run"}
     with replace_folder(tmp_path / "run") as partial:
         write_text(partial / "newer", "")
     assert names(tmp_path / "run") == {"newer"} and names(tmp_path) == {"run"}
+
+
+def test_read_passes_where_the_folder_cannot_get_its_name_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(self: Path, target: Path):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    (tmp_path / ".run.partial" / "old").mkdir(parents=True)
+    monkeypatch.setattr(Path, "rename", refuse)
+    restore_folder(tmp_path / "run")
+    assert names(tmp_path / ".run.partial") == {"lock", "old"}
+    monkeypatch.undo()
+    restore_folder(tmp_path / "run")  # The lock is free.
+    assert names(tmp_path) == {"run"}
 
 
 def test_error_between_renames_keeps_the_old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

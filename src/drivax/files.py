@@ -279,9 +279,10 @@ class PartialFolder:
     def restore(self) -> None:
         """Give a folder its name back if a process was killed while it replaced the folder."""
         if not self._target.exists() and self._old.is_dir():
-            with contextlib.suppress(UsageError):  # the process still runs
+            # The process still runs, or the disk cannot be written.
+            with contextlib.suppress(UsageError, OSError):
                 self._take_lock()
-                self._restore()
+                self.close()
             self._release()
 
     def _restore(self) -> None:
