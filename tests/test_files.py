@@ -131,6 +131,15 @@ def test_a_partial_folder_resumes_after_its_finished_parts(tmp_path: Path):
     assert not can_resume(tmp_path / "set")
 
 
+def test_temporary_files_of_a_killed_writer_are_removed_on_resume(tmp_path: Path):
+    spool = started(tmp_path / "set", {"seed": 1}).root / f"spool-{os.getpid()}"
+    write_text(spool / "0.records", "")
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == [{"part": "first"}]
+    assert names(folder.root) == {"content", "progress", "identity.json", "lock"}
+    folder.close()
+
+
 def test_replaced_folder_is_removed_after_a_resumable_writer(tmp_path: Path):
     write_text(tmp_path / "set" / "old", "")
     started(tmp_path / "set", {"seed": 1})

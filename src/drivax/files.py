@@ -34,6 +34,8 @@ from drivax.errors import DataError, UsageError
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 #: Errors of disks without locks or without exchange.
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
+#: What a later process needs to resume a partial folder.
+_RESUMABLE = ("content", "progress", "identity.json", "lock")
 #: Files that a process opens besides those of its data.
 _OTHER_FILES = 128
 
@@ -236,6 +238,7 @@ class PartialFolder:
             self._release()
             raise
         try:
+            self._clear(_RESUMABLE if notes else ("lock",))
             if not notes:
                 self._start()
         except BaseException:
@@ -266,9 +269,8 @@ class PartialFolder:
     def close(self) -> None:
         """Release the lock, and remove all files but finished parts that a later process can resume."""
         self._restore()
-        names = ("content", "progress", "identity.json", "lock")
         resumable = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
-        self._clear(names if resumable else ("lock",))
+        self._clear(_RESUMABLE if resumable else ("lock",))
         if not resumable:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
             for folder in (self.root, *self._new_parents):
@@ -308,7 +310,6 @@ class PartialFolder:
         return notes
 
     def _start(self) -> None:
-        self._clear(("lock",))
         self.content.mkdir()
         if self.identity is not None:
             (self.root / "progress").mkdir()
