@@ -39,7 +39,7 @@ def seal(folder: Path, *names: str) -> None:
     """Seal files of a folder in their present state: their content, or that they do not exist."""
     edited = edited_files(folder)  # An edited file stays one: its entry does not change.
     digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
-    write_json(folder / SEAL, {**_read(folder / SEAL), **digests})
+    write_json(folder / SEAL, {**_read(folder / SEAL), **digests}, follow=False)
 
 
 def unseal(folder: Path, name: str) -> None:
@@ -47,7 +47,7 @@ def unseal(folder: Path, name: str) -> None:
     entries = _read(folder / SEAL)
     if name in entries and str(folder / name) not in edited_files(folder):
         del entries[name]
-        write_json(folder / SEAL, entries)
+        write_json(folder / SEAL, entries, follow=False)
 
 
 def check_seal(file: Path) -> None:

@@ -55,6 +55,22 @@ def test_create_and_open(tmp_path: Path, scenarios: ScenarioSet):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "set"]
 
 
+def test_note_does_not_write_through_symbolic_links_of_a_stranger(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config())
+    for name in ("run.json", "seal.json"):
+        content = (run.path / name).read_bytes()
+        (tmp_path / name).write_bytes(content)
+        (run.path / name).unlink()
+        (run.path / name).symlink_to(tmp_path / name)
+    stored = {name: (tmp_path / name).read_bytes() for name in ("run.json", "seal.json")}
+    RunFolder.open(run.path).note(result=0.5)
+    assert RunFolder.open(run.path).info["result"] == 0.5
+    assert {name: (tmp_path / name).read_bytes() for name in stored} == stored
+    (run.path / "checkpoints").symlink_to(tmp_path)
+    with pytest.raises(DataError, match=r"checkpoints: is a symbolic link; replace"):
+        _ = run.checkpoints
+
+
 def test_notes(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config()).note(result=0.5)
     assert RunFolder.open(tmp_path / "run").info["result"] == 0.5

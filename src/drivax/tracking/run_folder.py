@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
-from drivax.files import check_output, replace_folder, restore_folder, write_text
+from drivax.files import check_output, refuse_link, replace_folder, restore_folder, write_text
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
@@ -153,14 +153,18 @@ class RunFolder:
         """Add entries to ``run.json``, and return the updated run folder."""
         updated_info = self.info | info
         unseal(self.path, RUN_FILE)
-        write_text(self.path / RUN_FILE, _json(updated_info))
+        write_text(self.path / RUN_FILE, _json(updated_info), follow=False)
         seal(self.path, RUN_FILE)
         return RunFolder(self.path, updated_info)
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
-        return self.path / "checkpoints"
+        """Folder of the checkpoints.
+
+        Raises:
+            DataError: It is a symbolic link.
+        """
+        return refuse_link(self.path / "checkpoints")
 
     @property
     def metrics(self) -> Path:
