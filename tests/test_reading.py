@@ -6,6 +6,7 @@ import io
 import os
 import struct
 import tokenize
+import tracemalloc
 import zipfile
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -62,9 +63,26 @@ def test_hostile_array_is_refused_in_one_line(tmp_path, content, words):
 def test_archive_that_unpacks_to_more_than_expected_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     file = tmp_path / "a.npz"
     np.savez_compressed(file, a=np.zeros(1 << 20))
-    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
+    monkeypatch.setattr(zipfile.ZipFile, "open", lambda *_: pytest.fail("unpacked"))
     with pytest.raises(DataError, match=r"unpacks to 8\.4 MB, more than the 1\.0 MB expected"):
         read_arrays(file, "again", 1_000_000)
+
+
+@pytest.mark.parametrize("size", [0, 100])
+def test_archive_with_lying_size_takes_no_more_memory_than_the_size(tmp_path, size):
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, a=np.zeros(8 << 20))
+    content = bytearray(file.read_bytes())
+    entry = content.index(b"PK\1\2")
+    content[entry + 24 : entry + 28] = struct.pack("<I", size)
+    file.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match="Bad CRC-32"):
+            read_arrays(file, "again", 1 << 20)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

@@ -122,8 +122,16 @@ def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
             raise ValueError("a name occurs twice")
         if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
             raise ValueError("compressed by another method than deflate")
-        # Only reading a member to its end tests its checksum.
-        return {member.filename.removesuffix(".npy"): parse_array(archive.read(member)) for member in members}
+        return {
+            member.filename.removesuffix(".npy"): parse_array(_unpack(archive, member)) for member in members
+        }
+
+
+def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+    """Return the content of a member, up to the size that it states."""
+    with archive.open(member) as file:
+        # Without a length, zipfile unpacks 2 GiB at a time. One byte more reaches the end, which tests the checksum.
+        return file.read(member.file_size + 1)
 
 
 def parse_array(data: bytes) -> Array:
