@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import struct
@@ -45,6 +46,7 @@ def test_arrays_are_those_of_numpy(tmp_path):
         (header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"), "another length"),
         (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -8)}") + bytes(64), "another length"),
         (header("(" * 60_000), "damaged"),
+        (header("-" * 60_000 + "1"), "nested too deeply"),
         (header("{'descr': '<f8', 'shape': (1L, \"\"\""), "damaged"),
         (b"\x93NUMPY\x09\0", "version"),
         (b"", "damaged"),
@@ -89,8 +91,8 @@ def test_archive_with_lying_size_takes_no_more_memory_than_the_size(tmp_path, si
     "error",
     [
         zlib.error("x"), tokenize.TokenError("x", (1, 2)), NotImplementedError("x"), RuntimeError("encrypted"),
-        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), RecursionError("x"), SystemError("x"), MemoryError(),
-        EOFError(), zipfile.BadZipFile("x"), KeyError("x"), OverflowError("x"), OSError("x"), struct.error("x"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), RecursionError("x"), SystemError("x"), EOFError(),
+        zipfile.BadZipFile("x"), KeyError("x"), OverflowError("x"), OSError("x"), struct.error("x"),
     ],
 )  # fmt: skip
 def test_each_kind_of_damage_becomes_one_line(tmp_path, error):
@@ -98,6 +100,21 @@ def test_each_kind_of_damage_becomes_one_line(tmp_path, error):
         raise error
     line = str(caught.value)
     assert line.startswith(f"{tmp_path / 'a'}: ") and line.endswith("); copy it again") and "()" not in line
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (OSError(errno.ESTALE, "x"), DataError, "mount the disk again"),
+        (PermissionError(errno.EACCES, "x"), DataError, "change the permissions"),
+        (OSError(errno.EMFILE, "x"), UsageError, "ulimit -n"),
+        (MemoryError(), UsageError, "raise the limit"),
+    ],
+)
+def test_disks_and_limits_have_cures_of_their_own(tmp_path, error, kind, words):
+    with pytest.raises(kind, match=words) as caught, explain_damage(tmp_path / "a", "copy it again"):
+        raise error
+    assert caught.value.file == tmp_path / "a" and "copy it again" not in str(caught.value)
 
 
 def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
