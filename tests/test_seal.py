@@ -202,11 +202,18 @@ def test_edited_rollouts_and_added_or_deleted_crashes_are_seen(tmp_path):
     with pytest.raises(DataError, match=r"crashes\.json: is missing; restore it"):
         EpisodeTable.read(run)
     (run / "crashes.json").write_bytes(content)
+    edit(run / "summary.json", '"ours"', '"theirs"')
+    with pytest.raises(DataError, match=r"summary\.json: changed since drivax wrote it"):
+        EpisodeTable.read(run)
+    edit(run / "summary.json", '"theirs"', '"ours"')
     table = EpisodeTable.read(run)
     with (run / "trajectories.npz").open("ab") as file:
         file.write(b"x")
     with pytest.raises(DataError, match=r"trajectories\.npz: changed since drivax wrote it"):
         _ = table.trajectories
+    with allow_edited():
+        table = EpisodeTable.read(run)
+        assert table.name == "ours (edited)" and len(table.trajectories.ego) == EPISODES
     crashes, seal_file = run / "crashes.json", run / SEAL
     crashes.unlink()
     seal(run, "crashes.json")

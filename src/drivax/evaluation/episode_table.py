@@ -20,7 +20,7 @@ from drivax.escaping import csv_rows, csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.reading import explain_damage, read_arrays, read_json, read_text
 from drivax.scenario.store import ScenarioSet
-from drivax.seal import check_seal, edited_files, mark_edited, seal
+from drivax.seal import check_seal, edited_files, is_edited_allowed, mark_edited, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
 from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, existing
@@ -122,7 +122,9 @@ class EpisodeTable:
             )
         keys, metrics = _read_columns(run.path / "episodes.csv")
         crashes = _read_crashes(run.path / "crashes.json")
-        check_seal(run.path / CONFIG_FILE)
+        # Trajectories are checked when they are read; only an edited file must mark the name before.
+        for file in (CONFIG_FILE, "summary.json", *(["trajectories.npz"] if is_edited_allowed() else [])):
+            check_seal(run.path / file)
         name = mark_edited(str(run.info.get("planner", run.path.name)), edited_files(run.path))
         return cls(run.path, name, run.info | {"planner": name}, keys, metrics, crashes)
 
@@ -349,6 +351,7 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
     """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
+    check_seal(path)
     archive = read_arrays(path, _RERUN, _MOST_BYTES + len(scenario_ids) * _MOST_EPISODE_BYTES)
     with explain_damage(path, _RERUN, "cannot be read"):
         ids = [_text(value) for value in archive["scenario_id"]]
