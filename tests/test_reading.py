@@ -16,9 +16,12 @@ import numpy as np
 import pytest
 
 from drivax import reading
+from drivax.datasets.nuscenes.map import city
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.episode_table import _read_columns
 from drivax.reading import explain_damage, parse_array, read_arrays, read_bytes, read_json, read_text
 from drivax.settings import parse_yaml
+from drivax.tracking.sinks import read_rows
 
 
 def header(text: str) -> bytes:
@@ -133,6 +136,16 @@ def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
     (tmp_path / "c").write_text("[" * 100_000)
     with pytest.raises(DataError, match=r"c: is not valid JSON \(nested too deeply\); again"):
         read_json(tmp_path / "c", "again")
+
+
+@pytest.mark.parametrize("read", [lambda file: list(read_rows(file)), _read_columns, city])
+def test_logs_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
+    """Values take up to 27 times as much memory as their text."""
+    file = tmp_path / "large"
+    file.touch()
+    os.truncate(file, 75 << 20)  # sparse
+    with pytest.raises(DataError, match="has 79 MB, more than the 67 MB that are read"):
+        read(file)
 
 
 def test_threads_parse_headers_in_turn(monkeypatch):

@@ -43,8 +43,8 @@ NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.s
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
-#: Largest ``episodes.csv``, and largest trajectories: bytes of all, and more per episode than any capacity takes.
-_MOST_TABLE, _MOST_BYTES, _MOST_EPISODE_BYTES = 256 << 20, 16 << 20, 1 << 20
+#: Largest trajectories: bytes of all, and more per episode than any capacity takes.
+_MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
@@ -302,7 +302,7 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    text = read_text(existing(path, _RERUN), _RERUN, _MOST_TABLE)
+    text = read_text(existing(path, _RERUN), _RERUN)
     with explain_damage(path, _RERUN, "cannot be read"):
         rows = csv_rows(text)
     header = rows[0] if rows else []
