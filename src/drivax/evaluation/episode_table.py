@@ -20,7 +20,7 @@ from drivax.escaping import csv_rows, csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.reading import explain_damage, read_arrays, read_json, read_text
 from drivax.scenario.store import ScenarioSet
-from drivax.seal import check_seal, edited_files, is_edited_allowed, mark_edited, seal
+from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
 from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, existing
@@ -122,8 +122,7 @@ class EpisodeTable:
             )
         keys, metrics = _read_columns(run.path / "episodes.csv")
         crashes = _read_crashes(run.path / "crashes.json")
-        # Trajectories are checked when they are read; only an edited file must mark the name before.
-        for file in (CONFIG_FILE, "summary.json", *(["trajectories.npz"] if is_edited_allowed() else [])):
+        for file in (CONFIG_FILE, "summary.json"):
             check_seal(run.path / file)
         name = mark_edited(str(run.info.get("planner", run.path.name)), edited_files(run.path))
         return cls(run.path, name, run.info | {"planner": name}, keys, metrics, crashes)
