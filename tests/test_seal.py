@@ -300,6 +300,10 @@ def test_large_seals_are_refused_before_they_are_read(tmp_path):
     os.truncate(tmp_path / SEAL, 20 << 30)  # sparse
     with pytest.raises(DataError, match=r"seal\.json: has 21 GB, more than the 1\.0 MB"):
         check_seal(tmp_path / "a.txt")
+    (tmp_path / SEAL).rename(tmp_path / "a.txt")
+    (tmp_path / SEAL).write_text('{"a.txt": "5"}')
+    with pytest.raises(DataError, match=r"a\.txt: is damaged \(larger than any sealed file\)"):
+        check_seal(tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("name", zoo())

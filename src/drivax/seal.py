@@ -24,7 +24,8 @@ SEAL = "seal.json"
 MARK = " (edited)"
 _CURE = "restore it, run the command again, or use the edited file with --edited"
 _RESTORE = "restore it, or run the command again"
-_MOST_BYTES = 1 << 20
+#: Largest seal, and largest sealed file, in bytes.
+_MOST_BYTES, _MOST_SEALED_BYTES = 1 << 20, 4 << 30
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ def _digest(file: Path) -> str | None:
         return None
     check_regular(file, _RESTORE)
     with explain_damage(file, _RESTORE), file.open("rb") as content:
+        if file.stat().st_size > _MOST_SEALED_BYTES:
+            raise ValueError("larger than any sealed file")
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
