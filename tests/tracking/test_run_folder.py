@@ -15,6 +15,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.seal import allow_edited
 from drivax.tracking import run_folder as runs
 from drivax.tracking.run_folder import RunFolder
 
@@ -167,3 +168,11 @@ def test_steps_of_runs():
     )
     with pytest.raises(UsageError, match="'best' is not a checkpoint step; write RUN@STEP"):
         runs.run_and_step("runs/a@best")
+
+
+@pytest.mark.parametrize("edited", ["abc", {"a": 1}, 5])
+def test_edited_files_are_a_list(tmp_path: Path, edited: object):
+    """The letters of a text would be noted as files."""
+    run = RunFolder.create(tmp_path / "run", Config()).note(edited=edited)
+    with allow_edited(), pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type"):
+        RunFolder.open(run.path)

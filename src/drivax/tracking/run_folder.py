@@ -38,7 +38,8 @@ _RERUN = "run the command again"
 #: Types of the entries of ``run.json`` that are read again.
 _ENTRIES: dict[str, Any] = {
     **dict.fromkeys(("kind", "planner", "traffic", "started", "command"), str),
-    **dict.fromkeys(("own_metrics", "networks_from", "versions"), dict), "data": list | dict, "trained_on": list,
+    **dict.fromkeys(("own_metrics", "networks_from", "versions"), dict), "data": list | dict,
+    **dict.fromkeys(("trained_on", "edited"), list),
 }  # fmt: skip
 _TRAINING_KINDS = ("training", "seeds")
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")

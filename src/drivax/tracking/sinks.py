@@ -14,8 +14,6 @@ from drivax.errors import DataError
 from drivax.files import refuse_link, sync_and_close, write_text
 from drivax.reading import DAMAGE, read_text
 
-_MOST_LOG = 256 << 20
-
 
 class JsonLines:
     """A file with one JSON object per row: ``{"step": 100, "loss": 0.5, ...}``; NaN and infinities become null.
@@ -123,7 +121,7 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
 
 def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield every line with its row; an incomplete last line is ignored."""
-    lines = read_text(file, "train again", _MOST_LOG).splitlines(keepends=True)
+    lines = read_text(file, "train again").splitlines(keepends=True)
     for number, line in enumerate(lines):
         try:
             row = json.loads(line)
