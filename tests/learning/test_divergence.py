@@ -316,20 +316,43 @@ def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path):
         train(config, data, run, validation=None, resume=True)
 
 
-def test_seeds_keep_a_common_checkpoint_until_all_have_the_next(data, config, tmp_path, monkeypatch):
-    """A process that is killed between the checkpoints of two seeds can resume, also with keep 1."""
+class Killed(BaseException):
+    """End of a process."""
 
-    class Killed(BaseException):
-        pass
 
-    write, run = Checkpoints.write, tmp_path / "run"
+def kill_at(step, monkeypatch):
+    """Kill the process before seed 5 writes its checkpoint of a step."""
+    write = Checkpoints.write
 
-    def write_or_die(self, step, state, score=None):
-        if step == 40 and "seed-5" in str(self.folder):
+    def write_or_die(self, number, state, score=None):
+        if number == step and "seed-5" in str(self.folder):
             raise Killed
-        return write(self, step, state, score)
+        return write(self, number, state, score)
 
     monkeypatch.setattr(Checkpoints, "write", write_or_die)
+
+
+def test_training_of_seeds_that_is_killed_at_its_first_checkpoint_starts_again(
+    data, config, tmp_path, monkeypatch
+):
+    """Without the ranks of the killed process, which would use up patience."""
+    config, whole, run = replace(config, evaluate_every=2, patience=2), tmp_path / "whole", tmp_path / "run"
+    monkeypatch.setattr(loop, "validate", lambda *_: {"validation/vmax_score": 0.5})
+    train(config, data, whole, seeds=2, validation=data)
+    with monkeypatch.context() as context, pytest.raises(Killed):
+        kill_at(20, context)
+        train(config, data, run, seeds=2, validation=data)
+    assert [steps(path) for path in seed_folders(run)] == [[20], []]
+    train(config, data, run, validation=data, resume=True)
+    for seed in ("seed-4", "seed-5"):
+        assert steps(run / seed) == steps(whole / seed) == [40, 60]
+        np.testing.assert_array_equal(last_parameters(run / seed), last_parameters(whole / seed))
+
+
+def test_seeds_keep_a_common_checkpoint_until_all_have_the_next(data, config, tmp_path, monkeypatch):
+    """A process that is killed between the checkpoints of two seeds can resume, also with keep 1."""
+    run = tmp_path / "run"
+    kill_at(40, monkeypatch)
     with pytest.raises(Killed):
         train(replace(config, keep=1), data, run, seeds=2, validation=None)
     assert [steps(path) for path in seed_folders(run)] == [[20, 40], [20]]

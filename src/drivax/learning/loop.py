@@ -375,7 +375,8 @@ def _restore(run: _Run, logs: Sequence[TrainingLog]) -> tuple[int | None, list[A
         return step, states
     if errors:
         raise errors[0]
-    if any(steps):
+    # A process that is killed at the first checkpoint has written that of some seeds.
+    if all(steps) or max(map(len, steps)) > 1:
         problem = "the seeds have no checkpoint of the same step"
         raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
     return None, []

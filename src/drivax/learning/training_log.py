@@ -191,6 +191,7 @@ class TrainingLog:
         self.checkpoints.drop_after(-1 if step is None else step)
         for leftover in self.folder.path.glob(".*.partial-*"):
             leftover.unlink()
+        self._ranks = []
         if step is not None:
             self._read_ranks(step)
         unseal(self.folder.path, self.folder.metrics.name)
