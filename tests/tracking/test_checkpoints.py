@@ -157,7 +157,8 @@ def test_a_full_disk_reports_the_size_of_the_checkpoint(tmp_path: Path, monkeypa
 
 def test_files_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
     (tmp_path / ".step-5.partial-123").mkdir()
-    (tmp_path / "step-x").mkdir()
+    for name in ("step-x", "step-1", "step-0000000001"):  # The last are not names of step 1.
+        (tmp_path / name).mkdir()
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.steps() == []
     with pytest.raises(DataError, match="no checkpoint found; start the training again, without --resume"):

@@ -102,7 +102,7 @@ def export_policy(
     step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step, trust=trust)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
-    data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
+    data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step

@@ -50,7 +50,7 @@ class Checkpoints:
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
         names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
-        return sorted(int(name) for name in names if name.isdecimal())
+        return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
     def best(self) -> int | None:
         """Return the step with the highest score, the latest if several are equal; None without scores.
