@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import pytest
 from drivax import settings
 from drivax.cli import main
 from drivax.errors import DataError, DrivaxError
+from drivax.files import PartialFolder, atomic_write, replace_folder
 from drivax.learning import loop
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.ppo import PpoConfig
@@ -293,12 +295,22 @@ def test_damaged_older_checkpoint_does_not_end_a_training(data, config, tmp_path
     assert steps(run) == [40, 60]
 
 
-def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path):
+class Killed(BaseException):
+    """End of a process."""
+
+
+def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path, monkeypatch):
     run = train(config, data, tmp_path / "run", seeds=2, validation=None).path
     seed = run / "seed-4"
-    (seed / "checkpoints" / ".step-000000060.partial-7" / "arrays").mkdir(parents=True)
+    checkpoint = seed / "checkpoints" / "step-000000060"
     (seed / "checkpoints" / ".step-40.old-7").mkdir()
-    (seed / ".metrics.jsonl.partial-7").write_text("{")
+    for write in (atomic_write(seed / "run.json"), replace_folder(checkpoint)):
+        with monkeypatch.context() as context, pytest.raises(Killed), write:
+            context.setattr(Path, "unlink", lambda *_, **__: None)
+            context.setattr(PartialFolder, "close", PartialFolder._release)
+            raise Killed
+    litter = [".run.json.partial", ".step-000000060.partial", ".step-40.old-7"]
+    assert sorted(path.name for path in seed.rglob(".*")) == litter
     train(config, data, run, validation=None, resume=True)
     assert [path.name for path in seed.rglob(".*")] == []
     # Killed after the first of two seeds has its folder.
@@ -314,10 +326,6 @@ def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path):
         DataError, match="seeds have no checkpoint of the same step; start again with --overwrite"
     ):
         train(config, data, run, validation=None, resume=True)
-
-
-class Killed(BaseException):
-    """End of a process."""
 
 
 def kill_at(step, monkeypatch):
