@@ -111,7 +111,7 @@ def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
         load_policy(packed.path, bank)
     (packed.path / POLICY_FILE).write_bytes(b"PK")
-    with pytest.raises(DataError, match=r"policy.npz: is damaged"):
+    with pytest.raises(DataError, match=r"policy\.npz: not an \.npz file, or damaged"):
         load_policy(packed.path, bank)
 
 
