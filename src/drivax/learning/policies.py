@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from drivax.errors import UsageError
+from drivax.files import replace_folder
 from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
@@ -102,15 +103,17 @@ def export_policy(
     step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step, trust=trust)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
-    data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
+    data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step
     config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
-    exported = RunFolder.create(out, config, overwrite=overwrite).note(**about)
-    pack(exported.path / POLICY_FILE, planner)
-    seal(exported.path, POLICY_FILE)
-    return exported
+    RunFolder.check(Path(out), overwrite)
+    with replace_folder(Path(out)) as partial_folder:
+        exported = RunFolder.create(partial_folder, config, overwrite=True).note(**about)
+        pack(partial_folder / POLICY_FILE, planner)
+        seal(partial_folder, POLICY_FILE)
+    return RunFolder(Path(out), exported.info)
 
 
 @dataclass(frozen=True)
