@@ -6,13 +6,14 @@ component of drivax, or within a module that the user trusts.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import inspect
 import re
 import sys
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -22,6 +23,8 @@ from drivax.errors import UsageError, did_you_mean
 
 #: ``zoo:NAME`` is a policy of the package, never a module.
 _FORM = re.compile(r"(?!zoo:)[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
+#: Packages that were found in the current folder; their other modules may import their neighbours too.
+_local_packages: set[str] = set()
 
 
 def is_dotted(value: Any) -> bool:
@@ -38,7 +41,7 @@ def is_trusted(name: str, trust: Collection[str]) -> bool:
 def find_named(name: str, trust: Collection[str] | None = None) -> Any:
     """Import the object with a dotted name.
 
-    Modules are searched on Python's path first, then in the current folder.
+    Modules are searched on Python's path first, then in the current folder, which later imports do not search.
 
     Args:
         name: ``package.module:name``.
@@ -87,12 +90,12 @@ def _may_be_named(thing: Any, module_name: str) -> bool:
 def _import(module_name: str, name: str) -> Any:
     if module_name in sys.modules:
         return sys.modules[module_name]
-    package, folder = module_name.split(".")[0], str(Path.cwd())
-    if folder not in sys.path and package not in sys.modules and importlib.util.find_spec(package) is None:
-        sys.path.append(folder)
-        importlib.invalidate_caches()
+    package = module_name.split(".")[0]
+    if package not in sys.modules and importlib.util.find_spec(package) is None:
+        _local_packages.add(package)
     try:
-        return importlib.import_module(module_name)
+        with _current_folder() if package in _local_packages else contextlib.nullcontext():
+            return importlib.import_module(module_name)
     except Exception as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and (module_name == missing or module_name.startswith(f"{missing}.")):
@@ -104,6 +107,21 @@ def _import(module_name: str, name: str) -> Any:
             f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}",
             cure="fix the module",
         ) from error
+
+
+@contextlib.contextmanager
+def _current_folder() -> Iterator[None]:
+    """Search the current folder last, only while a module that the user names is imported."""
+    path, folder = sys.path, str(Path.cwd())
+    is_new = folder not in path
+    if is_new:
+        path.append(folder)
+        importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if is_new and folder in path:
+            path.remove(folder)
 
 
 def dotted_name(thing: Any) -> str:
