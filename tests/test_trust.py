@@ -301,6 +301,46 @@ def test_flags_and_own_files_stay_the_users(folder):
         settings.load(TrainConfig, PLACES["metric"]("carried:thing"), trust=())
 
 
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        ("encoder", "drivax.synthetic.roads.families:TJunction"),
+        ("encoder_name", "drivax.synthetic.roads.families:TJunction"),
+        ("algorithm", "drivax.learning.algorithms.warm_start:WarmStart"),
+        ("feature", "drivax.tasks.observations:_masked_group"),
+        ("feature", "drivax.tasks.features:ego_on_route"),
+        ("feature", "drivax.tasks.rewards:collision"),
+        ("reward", "drivax.tasks.conditions:draw_conditions"),
+        ("reward", "drivax.tasks.rewards:reward_term"),
+        ("record", "drivax.tasks.rewards:_Weights"),
+    ],
+)
+def test_other_parts_of_drivax_are_refused(place, name, folder):
+    """A name within drivax must lead to a component of the kind that its place takes."""
+    with pytest.raises(UsageError) as error:
+        settings.load(TrainConfig, PLACES[place](name), trust=())
+    assert name in str(error.value) and "\n" not in str(error.value)
+
+
+def test_policies_of_useless_settings_are_one_line(folder, data):
+    run = write_stranger(
+        folder / "run", {"algorithm": {"kind": "ppo", "network": {"encoder": {"hidden": []}}}}
+    )
+    with pytest.raises(DataError, match=r"config\.yaml: makes no policy"):
+        load_policy(run, drivax.load(data.path).bank)
+
+
+def test_components_of_drivax_may_be_named():
+    values = {
+        "task": {
+            "observation": {"own": [{"feature": "drivax.tasks.example_features:time_gap"}]},
+            "rewards": {"own": [{"term": "drivax.tasks.rewards:pace", "weight": 1.0, "name": "again"}]},
+        },
+        "algorithm": {"network": {"encoder": {"kind": "drivax.networks.encoders:MlpConfig", "hidden": [8]}}},
+    }
+    assert settings.load(TrainConfig, values | {"algorithm": {"kind": "ppo"} | values["algorithm"]}, trust=())
+
+
 TRAPS = """
 from dataclasses import dataclass
 import jax.numpy as jnp

@@ -13,6 +13,7 @@ from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
+from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.seal import seal
 from drivax.simulator.traffic.log import LogTraffic
@@ -63,8 +64,9 @@ def load_policy(
     """
     folder = open_policy(run)
     config = folder.config(TrainConfig, _AS_LOGGED, trust)
-    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
-    template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    with explain_damage(folder.path / "config.yaml", "fix the settings", "makes no policy"):
+        learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+        template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
         name = folder.path.name if step is None else f"{folder.path.name}@{step}"
