@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
 import os
+import pkgutil
 import shutil
 import sys
 
@@ -386,13 +389,21 @@ def test_wrong_kinds_of_planners_and_traffic_are_not_called(folder):
 
 def test_only_traffic_of_drivax_is_made_by_name():
     """Of everything in drivax that a name in data reaches, only traffic models would be called as traffic."""
-    made = set()
-    for module in sorted(name for name in sys.modules if name.partition(".")[0] == "drivax"):
-        for attribute in list(vars(sys.modules[module])):
+    modules, made = [drivax], set()
+    for info in pkgutil.walk_packages(drivax.__path__, "drivax."):
+        with contextlib.suppress(ImportError, UsageError):  # an extra is not installed
+            if not info.name.endswith("__main__"):
+                modules.append(importlib.import_module(info.name))
+    assert len(modules) > 200
+    for module in modules:
+        for attribute in list(vars(module)):
             try:
-                thing = find_named(f"{module}:{attribute}", ())
+                thing = find_named(f"{module.__name__}:{attribute}", ())
             except UsageError:
                 continue
             if makes(thing, Traffic):
                 made.add(result_class(thing))
-    assert {cls.__name__ for cls in made} == {"LogTraffic", "IdmTraffic", "PlannerTraffic", "PolicyTraffic"}
+    # Traffic of a policy or of given motions names what it needs when a bank lacks it; none opens a folder.
+    assert {cls.__name__ for cls in made} == {"LogTraffic", "IdmTraffic", "PlannerTraffic", "OverrideTraffic"}
+    with pytest.raises(UsageError, match="makes no traffic"):
+        find_traffic("drivax.learning.policies:PolicyTraffic")

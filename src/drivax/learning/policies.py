@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +119,7 @@ def export_policy(
 class PolicyTraffic(PlannerTraffic):
     """Traffic in which the policy of a folder drives the vehicles nearest to ego, made by :func:`policy_traffic`."""
 
-    run: str = ""
+    run: str = field(kw_only=True)
     samples: bool = False
     trust: tuple[str, ...] = ()
 
