@@ -16,7 +16,7 @@ import pytest
 import drivax
 import own_terms
 from drivax import settings
-from drivax.adapters.gym import DrivingEnv
+from drivax.adapters.gym import DrivingEnv, VectorDrivingEnv
 from drivax.api import find_planner
 from drivax.cli import main
 from drivax.curation.methods import METHODS, check_current
@@ -264,6 +264,16 @@ def test_trusted_modules_are_resolved(folder):
     for name in ("own_terms:jax.jit", "own_terms:Any", "own_terms:dataclass"):
         with pytest.raises(UsageError, match="is not a component of 'own_terms'"):
             check_names({"a": [name]}, ["own_terms"])
+
+
+@pytest.mark.parametrize("environment", [DrivingEnv, VectorDrivingEnv])
+def test_environments_take_trust(environment, folder):
+    run = write_stranger(folder / "run", PLACES["metric"]("own_terms:nearest_other"))
+    with pytest.raises(UsageError, match="trust="):
+        environment(data=1, traffic=str(run))
+    # Trusted, the configuration is read, and the parameters of the policy with other groups are not.
+    with pytest.raises(DataError, match=r"policy\.npz"):
+        environment(data=1, traffic=str(run), trust=["own_terms"])
 
 
 @pytest.mark.slow
