@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from drivax.files import replace_folder
 from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
+from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.seal import seal
 from drivax.simulator.traffic.log import LogTraffic
@@ -64,8 +65,9 @@ def load_policy(
     """
     folder = open_policy(run)
     config = folder.config(TrainConfig, _AS_LOGGED, trust)
-    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
-    template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    with explain_damage(folder.path / "config.yaml", "fix the settings", "makes no policy"):
+        learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+        template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
         name = folder.path.name if step is None else f"{folder.path.name}@{step}"
@@ -120,7 +122,7 @@ def export_policy(
 class PolicyTraffic(PlannerTraffic):
     """Traffic in which the policy of a folder drives the vehicles nearest to ego, made by :func:`policy_traffic`."""
 
-    run: str = ""
+    run: str = field(kw_only=True)
     samples: bool = False
     trust: tuple[str, ...] = ()
 
