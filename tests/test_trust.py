@@ -135,15 +135,15 @@ def small_config(**values):
 #: Ways to read the configuration of a run or policy: functions of the folder, a set and an empty place.
 READERS = {
     "config": lambda run, data, out: RunFolder.open(run).config(TrainConfig),
-    "load_policy": lambda run, data, out: load_policy(run, None),
-    "export_policy": lambda run, data, out: export_policy(run, out, None),
+    "load_policy": lambda run, data, out: load_policy(run, drivax.load(data.path).bank),
+    "export_policy": lambda run, data, out: export_policy(run, out, drivax.load(data.path).bank),
     "policy_traffic": lambda run, data, out: policy_traffic(run),
     "find_traffic": lambda run, data, out: find_traffic(f"{run}+idm"),
     "find_planner": lambda run, data, out: find_planner(str(run), drivax.load(data.path).bank),
     "make_simulator": lambda run, data, out: drivax.make_simulator(traffic=str(run)),
     "evaluate": lambda run, data, out: drivax.evaluate(run, data.path),
     "evaluate_traffic": lambda run, data, out: drivax.evaluate("idm", data.path, traffic=str(run)),
-    "make_agent": lambda run, data, out: make_agent(small_config(traffic=str(run)), None),
+    "make_agent": lambda run, data, out: make_agent(small_config(traffic=str(run)), drivax.load(data.path).bank),
     "train_traffic": lambda run, data, out: train(small_config(traffic=str(run)), data, out, validation=None),
     "resume": lambda run, data, out: train(small_config(), data, run, validation=None, resume=True),
     "gym": lambda run, data, out: DrivingEnv(1, traffic=str(run)),

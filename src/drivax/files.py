@@ -118,7 +118,11 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
         yield
     except Exception as error:
         if not _is_full_disk(error):
-            if isinstance(error, OSError) and ".partial" in str(error.filename or ".partial"):
+            if (
+                isinstance(error, OSError)
+                and error.errno is not None
+                and ".partial" in str(error.filename or ".partial")
+            ):
                 error.filename = str(path)
             raise
         needed = needed or getattr(error, "needed", 0)
