@@ -257,6 +257,13 @@ def test_learning_tables(script, learning):
     assert tables.interval({"mean": None, "low": None, "high": None}) == "-"
 
 
+def test_training_time_is_that_of_the_median_speed(script):
+    """600 steps at 20 steps/s; the first row has the compilation in it, and no row a pause."""
+    rates = np.array([[200, 2.0], [400, 20.0], [600, 25.0]])
+    training = types.SimpleNamespace(curves={"steps_per_second": rates})
+    assert script("learning.presets").training_seconds(training) == 30
+
+
 def test_curves_show_every_seed(script, learning):
     curves = learning["curves"]["ppo"]
     figure = script("learning.tables").draw_curves("ppo", curves, seconds=60.0)

@@ -383,7 +383,7 @@ def format_cells(
         interval(
             intervals[metric],
             signed=signed,
-            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT, "distance") else 3,
+            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT) else 3,
         )
         for metric in metrics
     ]
