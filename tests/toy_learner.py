@@ -11,6 +11,15 @@ import jax.numpy as jnp
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.record import record
 
+#: Settings of a training of six iterations.
+VALUES = {
+    "algorithm": {"kind": "toy_learner:ToyConfig"},
+    "task": {"observation": {"agents": 1, "steps": 1, "road": 0, "lights": 1, "route": 2}},
+    "seed": 4,
+    "total_steps": 60,
+    "checkpoint_every": 2,
+}
+
 
 @record
 class ToyState:

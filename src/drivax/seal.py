@@ -7,7 +7,6 @@ as the metrics of an unfinished training, and folders without a seal, are not ch
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from drivax.errors import DataError
-from drivax.files import write_json
+from drivax.files import file_digest, write_json
 
 SEAL = "seal.json"
 #: Ends the name of a planner in tables that are made with edited files.
@@ -114,10 +113,10 @@ def _digest(file: Path) -> str | None:
     if not file.exists():
         return None
     check_regular(file, _RESTORE)
-    with explain_damage(file, _RESTORE), file.open("rb") as content:
+    with explain_damage(file, _RESTORE):
         if file.stat().st_size > _MOST_SEALED_BYTES:
             raise ValueError("larger than any sealed file")
-        return hashlib.file_digest(content, "sha256").hexdigest()
+        return file_digest(file)
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -16,44 +16,20 @@ from drivax.cli import main
 from drivax.errors import DataError, DrivaxError
 from drivax.files import PartialFolder, atomic_write, replace_folder
 from drivax.learning import loop
-from drivax.learning.algorithms.behaviour_cloning import BcConfig
-from drivax.learning.algorithms.ppo import PpoConfig
-from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.config import TrainConfig
 from drivax.learning.divergence import DivergenceError, large_logs, nonfinite_leaf, nonfinite_log
 from drivax.learning.loop import mean_logs, train
 from drivax.learning.program import Program, Seeds
-from drivax.learning.replay import ReplayConfig
 from drivax.learning.training_log import rank
-from drivax.networks.actor_critic import NetworkConfig
-from drivax.networks.encoders import MlpConfig
 from drivax.scenario.record import record
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder, seed_folders
 from pendulum import Demonstrations, Pendulum
-from toy_learner import Toy, ToyConfig
+from tiny_algorithms import BC, PPO, SAC
+from toy_learner import VALUES, Toy, ToyConfig
 
-VALUES = {
-    "algorithm": {"kind": "toy_learner:ToyConfig"},
-    "task": {"observation": {"agents": 1, "steps": 1, "road": 0, "lights": 1, "route": 2}},
-    "seed": 4,
-    "total_steps": 60,
-    "checkpoint_every": 2,
-}
-TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 RATE = 1e30
-SAC = SacConfig(
-    network=TINY,
-    replay=ReplayConfig(32),
-    environments=4,
-    unroll=4,
-    updates_per_step=1,
-    batch=8,
-    warm_up=16,
-)
-PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
-BC = BcConfig(batch=8, updates=2, network=TINY)
 FAST = {"bc": replace(BC, learning_rate=RATE), "ppo": replace(PPO, learning_rate=RATE)}
 SLOW = {
     "ppo_average": replace(PPO, learning_rate=RATE, average=0.9),
@@ -378,3 +354,12 @@ def test_memory_that_runs_out_is_one_line(data, config, tmp_path, monkeypatch):
         DrivaxError, match=r"out of memory in training; memory: .*: no room for an array of 14 GB; "
     ):
         train(config, data, tmp_path / "run", validation=None)
+
+
+def test_linked_folder_of_a_seed_is_refused(config, data, tmp_path):
+    run = tmp_path / "run"
+    train(config, data, run, seeds=2, validation=None)
+    (run / "seed-5").rename(tmp_path / "elsewhere")
+    (run / "seed-5").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="seed-5: is a symbolic link; replace the link"):
+        train(config, data, run, validation=None, resume=True)

@@ -26,16 +26,7 @@ from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import learned_from, seed_folders
 from drivax.tracking.sinks import read_rows
-from toy_learner import Toy, ToyConfig, ToyState
-
-VALUES = {
-    "algorithm": {"kind": "toy_learner:ToyConfig"},
-    "task": {"observation": {"agents": 1, "steps": 1, "road": 0, "lights": 1, "route": 2}},
-    "seed": 4,
-    "total_steps": 60,
-    "checkpoint_every": 2,
-}
-
+from toy_learner import VALUES, Toy, ToyConfig, ToyState
 
 KEY = jax.random.key(0)
 

@@ -9,33 +9,18 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
-from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
-from drivax.learning.algorithms.ppo import PpoConfig
-from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.learning.loop import PretrainedRun, mean_logs, replace_networks
 from drivax.learning.replay import ReplayConfig
-from drivax.networks.actor_critic import NetworkConfig
-from drivax.networks.encoders import MlpConfig
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from pendulum import Demonstrations, Pendulum
+from tiny_algorithms import BC, PPO, SAC
 
-TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
-#: Small enough that six iterations write over the whole ring.
-SAC = SacConfig(
-    network=TINY,
-    replay=ReplayConfig(32),
-    environments=4,
-    unroll=4,
-    updates_per_step=1,
-    batch=8,
-    warm_up=16,
-)
-PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
 START = WarmStart(iterations=2, cloning=Cloning(batch=8, updates=2), settle=2, weight=0.5, half_life=2)
 ALGORITHMS = {
-    "bc": BcConfig(batch=8, updates=2, network=TINY),
+    "bc": BC,
     "sac": SAC,
     "sac_observations": replace(SAC, replay=ReplayConfig(32, "observation")),
     "ppo": PPO,

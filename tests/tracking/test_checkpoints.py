@@ -404,3 +404,18 @@ def test_a_damaged_packed_tree_is_reported(tmp_path: Path):
         file.write_bytes(spoilt)
         with pytest.raises(DataError, match=r"or damaged|not found"):
             unpack(file, {"w": jnp.zeros(100)})
+
+
+def test_links_in_place_of_checkpoints_are_no_checkpoints(tmp_path: Path):
+    """A stranger's run leads elsewhere with them: nothing there is read, deleted or written."""
+    elsewhere = Checkpoints(tmp_path / "elsewhere")
+    path = elsewhere.save(2, {"a": 2})
+    checkpoints = Checkpoints(tmp_path / "run")
+    checkpoints.save(1, {"a": 1})
+    for name in (path.name, "step-000000003"):
+        (checkpoints.folder / name).symlink_to(path)
+    assert checkpoints.steps() == [1]
+    checkpoints.drop_after(1)
+    assert [entry.name for entry in checkpoints.folder.iterdir()] == ["step-000000001"]
+    checkpoints.save(2, {"a": 5})
+    assert elsewhere.restore({"a": 0}) == {"a": 2} and checkpoints.restore({"a": 0}) == {"a": 5}

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.memory import report_out_of_memory
-from drivax.files import explain_full_disk
+from drivax.files import explain_full_disk, refuse_link
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
@@ -91,25 +91,20 @@ def train(
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    out, folders = Path(out), list[RunFolder]()
-    split, trust = None, (*trust, *modules_of(config))
-    if isinstance(validation, str):
-        split, validation = _hold_out(data, out, resume), None
+    out, folders, trust = Path(out), list[RunFolder](), (*trust, *modules_of(config))
+    split, validation = _hold_out(data, validation, out, resume)
     notes = hashes(validation, weights) | ({} if split is None else {"validation": split.note()})
     if resume:
         config, folders = _resumed_folders(data, notes, out, seeds, trust)
     else:
         RunFolder.check(out, overwrite, "training")
-        if config.begin_from is not None:
-            # With its step, so that resuming finds the same checkpoint.
-            config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
+        config = _with_step(config)
     if seeds < 1:
         raise UsageError(f"{seeds} seeds", cure="use 1 or more")
     scenarios = _Scenarios.of(config, data, weights, split or validation)
     environment, bank = _environment(config, scenarios.training, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    held_out = None if scenarios.validation is None else Validation.of(scenarios.validation)
-    held_out_data = _held_out_data(config, environment, learner, held_out)
+    held_out, held_out_data = _held_out(config, environment, learner, scenarios)
     numbers = range(config.seed, config.seed + (len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, scenarios.weights)
     program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
@@ -118,11 +113,10 @@ def train(
     if split is not None:
         log(split.text())
     log(memory.text())
-    # Before any folder is created, because they may not fit.
-    networks = None if resume else pretrained_networks(config.begin_from, program, log)
+    networks = None if resume else pretrained_networks(config.begin_from, program, log)  # they may not fit
     folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
+    rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
-        rules = (config.checkpoint_rule, config.keep, config.patience)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(explain_full_disk(out))
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
@@ -130,12 +124,23 @@ def train(
     return RunFolder.open(out)
 
 
-def _hold_out(data: ScenarioSet, out: Path, resume: bool) -> HoldOut | None:
-    """Return the recordings that a new run holds out, or those that the run to resume held out, if any."""
+def _hold_out(
+    data: ScenarioSet, validation: ScenarioSet | Literal["held_out"] | None, out: Path, resume: bool
+) -> tuple[HoldOut | None, ScenarioSet | None]:
+    """Return the recordings that a new run holds out, or those that the run to resume held out, and the set."""
+    if not isinstance(validation, str):
+        return None, validation
     if not resume:
-        return hold_out(data.entries)
+        return hold_out(data.entries), None
     recorded = RunFolder.open(out).info.get("validation")
-    return hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None
+    return (hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None), None
+
+
+def _with_step(config: TrainConfig) -> TrainConfig:
+    """Return a configuration that begins from a run at its step, so that resuming finds the same checkpoint."""
+    if config.begin_from is None:
+        return config
+    return replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
 
 
 @dataclass(frozen=True)
@@ -205,13 +210,16 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     return row
 
 
-def _held_out_data(
-    config: TrainConfig, environment: Driving | Mixture, learner: Any, held_out: Validation | None
-) -> Any:
-    """Return the data of a learner's held-out metrics; None without any."""
-    if held_out is None or not isinstance(learner, HeldOutMetrics):
-        return None
-    return training_data(config.algorithm, environment, held_out.bank)
+def _held_out(
+    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: _Scenarios
+) -> tuple[Validation | None, Any]:
+    """Return the validation, and the data of a learner's held-out metrics; None without any."""
+    if scenarios.validation is None:
+        return None, None
+    held_out = Validation.of(scenarios.validation)
+    if not isinstance(learner, HeldOutMetrics):
+        return held_out, None
+    return held_out, training_data(config.algorithm, environment, held_out.bank)
 
 
 def _environment(
@@ -245,7 +253,7 @@ def _seed_folder(
     config: TrainConfig, data: ScenarioSet, notes: Mapping[str, Any], out: Path, seed: int
 ) -> RunFolder:
     """Open the folder of one of several seeds, or create it."""
-    path = out / f"seed-{seed}"
+    path = refuse_link(out / f"seed-{seed}")
     if (path / RUN_FILE).is_file():
         return RunFolder.open(path)
     return RunFolder.create(path, replace(config, seed=seed), [data], kind="training", **notes)
@@ -502,7 +510,7 @@ class PretrainedRun:
 
         Networks that the checkpoint lacks are omitted. Raises DataError for the first array that does not fit.
         """
-        checkpoints = Checkpoints(self.run / "checkpoints")
+        checkpoints = Checkpoints(RunFolder.open(self.run).checkpoints)
         leaves = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
         networks = _networks(state)
         sources = {path: source for path in networks if (source := _source(path, leaves))}

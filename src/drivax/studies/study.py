@@ -28,7 +28,7 @@ from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
-from drivax.files import write_json
+from drivax.files import refuse_link, write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import hashes, train, usable_steps
@@ -316,7 +316,7 @@ def _run_job(job: Job) -> float:
 def _train_and_evaluate_arm(job: Job) -> float:
     start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
-    steps = Checkpoints(run / "checkpoints").steps()
+    steps = Checkpoints(refuse_link(run / "checkpoints")).steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
         _check_not_evaluated(job, steps)
         validation = ScenarioSet.open(study.sets.validation)

@@ -49,7 +49,7 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
-        names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
+        names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own(path))
         return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
     def best(self) -> int | None:
@@ -131,6 +131,8 @@ class Checkpoints:
                 self._delete(other)
         for leftover in self.folder.glob(".step-*"):
             shutil.rmtree(leftover, ignore_errors=True)
+        for link in filter(Path.is_symlink, self.folder.glob("step-*")):
+            link.unlink()
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
         """Return the stored state, or a part of it (for example ``.parameters``).
@@ -180,6 +182,11 @@ class Checkpoints:
         shutil.rmtree(hidden_folder, ignore_errors=True)
         self._path(step).rename(hidden_folder)
         shutil.rmtree(hidden_folder, ignore_errors=True)
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a path is a folder, not a link by which a stranger's run could write or delete anywhere."""
+    return path.is_dir() and not path.is_symlink()
 
 
 def _best(scores: Mapping[int, Any]) -> int | None:
