@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import inspect
-import sys
+import pkgutil
+from types import ModuleType
+
+import drivax
+from drivax.errors import UsageError
 
 #: Modules that leave a trace when they are imported, at the places where a run folder could carry them.
 CARRIED = ("good_policy.extra", "good_policy", "carried", "drivaxx.tasks", "drivax_extra", "zoo.extra")
@@ -24,12 +30,22 @@ INSIDE = (
 )  # fmt: skip
 
 
+def modules() -> list[ModuleType]:
+    """All modules of drivax, but for those of extras that are not installed."""
+    found = [drivax]
+    for info in pkgutil.walk_packages(drivax.__path__, "drivax."):
+        with contextlib.suppress(ImportError, UsageError):
+            if not info.name.endswith("__main__"):
+                found.append(importlib.import_module(info.name))
+    return found
+
+
 def hostile_names() -> list[str]:
-    """All of them, and everything in the loaded modules of drivax that other packages define."""
+    """All of them, and everything in the modules of drivax that other packages define."""
     names = [f"{module}:{thing}" for module in (*CARRIED, *MODULES) for thing in OBJECTS]
-    for module_name in sorted(name for name in sys.modules if name.partition(".")[0] == "drivax"):
-        for name, thing in sorted(vars(sys.modules[module_name]).items()):
+    for module in modules():
+        for name, thing in sorted(vars(module).items()):
             origin = getattr(thing, "__name__" if inspect.ismodule(thing) else "__module__", None)
             if name.isidentifier() and isinstance(origin, str) and origin.partition(".")[0] != "drivax":
-                names.append(f"{module_name}:{name}")
+                names.append(f"{module.__name__}:{name}")
     return [*names, *INSIDE]

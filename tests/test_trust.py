@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
 import json
 import os
-import pkgutil
 import shutil
 import sys
 
@@ -35,6 +32,7 @@ from drivax.studies.definition import StudyConfig
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.run_folder import RunFolder, policy_folder, zoo
 from hostile_names import CARRIED, hostile_names
+from hostile_names import modules as all_modules
 from toy_learner import ToyConfig
 
 #: Places of a configuration that may hold a name: mappings around it.
@@ -399,11 +397,7 @@ def test_wrong_kinds_of_planners_and_traffic_are_not_called(folder):
 
 def test_only_traffic_of_drivax_is_made_by_name():
     """Of everything in drivax that a name in data reaches, only traffic models would be called as traffic."""
-    modules, made = [drivax], set()
-    for info in pkgutil.walk_packages(drivax.__path__, "drivax."):
-        with contextlib.suppress(ImportError, UsageError):  # an extra is not installed
-            if not info.name.endswith("__main__"):
-                modules.append(importlib.import_module(info.name))
+    modules, made = all_modules(), set()
     assert len(modules) > 200
     for module in modules:
         for attribute in list(vars(module)):

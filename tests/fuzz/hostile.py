@@ -27,6 +27,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -288,12 +289,20 @@ def payloads() -> Iterator[tuple[str, bytes | Callable[[Path], None]]]:
 
 def places() -> dict[str, tuple[Callable[[Path], Path | None], Callable[[Path], Any]]]:
     """Writers and readers of samples: what drivax writes, and every format."""
-    result: dict[str, Any] = {kind: (lambda folder, w=write: (w(folder), None)[1], lambda folder, _, r=read: r(folder))
-                              for kind, (write, read) in own_files.KINDS.items()}  # fmt: skip
+    result: dict[str, Any] = {
+        kind: (partial(write_unsealed, write), lambda folder, _, r=read: r(folder))
+        for kind, (write, read) in own_files.KINDS.items()
+    }
     for reader in READERS:
         sample = importlib.import_module(f"datasets.samples.{reader.name.replace('-', '_')}")
         result[reader.name] = (sample.write, lambda folder, path, name=reader.name: convert(path, name))
     return result
+
+
+def write_unsealed(write: Callable[[Path], Any], folder: Path) -> None:
+    """Write a sample without seals, which would refuse a payload before its reader sees it."""
+    write(folder)
+    own_files.remove_seals(folder)
 
 
 def convert(path: Path, name: str) -> list[str]:

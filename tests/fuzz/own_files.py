@@ -2,8 +2,8 @@
 
     python -m fuzz.own_files KIND ... --files 200 --seed 0       (from the folder tests)
 
-Exit status 1 when a file ended in anything else. Valid text of another content is accepted for the files of
-:data:`SEALED`, which have no checksum of their own, and counted.
+Exit status 1 when a file ended in anything else. Every second sample has no seals, so that damage reaches the parsers;
+valid text of another content is accepted there, and for the user's own files (:data:`OWN_TEXT`), and counted.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.metrics.catalogue import EVENTS
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
-from drivax.scenario.select.selection import select_scenarios
+from drivax.scenario.select import splits
+from drivax.scenario.select.selection import read_names, select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.seal import SEAL, seal
 from drivax.settings import load
 from drivax.studies.definition import StudyDefinition
 from drivax.tracking.checkpoints import pack, unpack
@@ -44,7 +46,6 @@ from fuzz.run import SECONDS_PER_FILE, Hang, limit_memory
 from fuzz.run import _alarm as alarm
 from scenes import car, straight_road
 
-#: Files of text without a checksum in them: the seal of their folder, or the digests of a set, find valid edits.
 SMALL_CAPACITY = replace(
     Capacity(),
     name="small",
@@ -57,16 +58,17 @@ SMALL_CAPACITY = replace(
     stops=2,
     routes=2,
 )
-SEALED = (
+#: Text without a checksum in it, of which only the seal finds valid edits, and text of the user, which has no seal.
+SEALED_TEXT = (
     "manifest.json",
     "run.json",
     "config.yaml",
     "episodes.csv",
     "crashes.json",
     "metrics.jsonl",
-    "study.yaml",
     ".txt",
 )
+OWN_TEXT = ("study.yaml",)
 TREE = {
     "head": np.arange(12, dtype=np.float32).reshape(3, 4),
     "body": [np.ones(5, np.float32), np.zeros(0, np.int32)],
@@ -112,8 +114,8 @@ def write_set(folder: Path) -> Path:
 def read_set(folder: Path) -> Any:
     """Records, entries, and the scenarios of each list."""
     data = ScenarioSet.open(folder / "set")
-    lists = [select_scenarios(data, (), [file]) for file in sorted((folder / "set" / "splits").glob("*.txt"))
-             if file.stat().st_size]  # fmt: skip
+    files = [folder / "set" / "splits" / f"{name}.txt" for name in splits.NAMES]
+    lists = [select_scenarios(data, (), [file]) if read_names(file) else [] for file in files]
     return (
         [[s.record.tobytes(), s.id, s.tags, s.audit, s.overflow] for s in data],
         data.entries,
@@ -164,6 +166,7 @@ def write_run(folder: Path) -> None:
     for step in (0, 100):
         log.write(step, {"loss": 0.5, "return": float("nan")})
     log.close()
+    seal(folder, *(file.name for file in folder.iterdir()))
 
 
 def read_run(folder: Path) -> Any:
@@ -203,6 +206,12 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
 }  # fmt: skip
 
 
+def remove_seals(folder: Path) -> None:
+    """Remove the seals of a sample, which would find damage before the parsers."""
+    for file in folder.rglob(SEAL):
+        file.unlink()
+
+
 def damage(folder: Path, rng: random.Random) -> tuple[Path, str]:
     """Damage one file of a sample: its bytes, its values, or the whole file."""
     path = rng.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
@@ -221,8 +230,10 @@ def damage(folder: Path, rng: random.Random) -> tuple[Path, str]:
     return path, "bytes"
 
 
-def outcome(read: Callable[[Path], Any], folder: Path, expected: str, path: Path) -> tuple[str, str | None]:
-    """How reading ends: its kind, and what is wrong with that."""
+def outcome(
+    read: Callable[[Path], Any], folder: Path, expected: str, editable: bool
+) -> tuple[str, str | None]:
+    """How reading ends: its kind, and what is wrong with that; ``editable`` files may have another content."""
     try:
         result = content(read(folder))
     except DrivaxError as error:
@@ -233,7 +244,7 @@ def outcome(read: Callable[[Path], Any], folder: Path, expected: str, path: Path
         return "traceback", traceback.format_exc()
     if result == expected:
         return "identical", None
-    return "changed", None if path.name.endswith(SEALED) else f"{path.name} changed"
+    return "changed", None if editable else "read with another content"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -262,9 +273,12 @@ def try_kind(kind: str, files: int, seed: int) -> int:
         for number in range(files):
             rng = random.Random(f"{seed} {kind} {number}")
             shutil.copytree(whole, folder)
+            editable = OWN_TEXT + SEALED_TEXT * (number % 2)
+            if number % 2:
+                remove_seals(folder)
             path, how = damage(folder, rng)
             signal.alarm(SECONDS_PER_FILE)
-            end, problem = outcome(read, folder, expected, path)
+            end, problem = outcome(read, folder, expected, path.name.endswith(editable))
             signal.alarm(0)
             ends[end] += 1
             changed[path.name] += end == "changed"
