@@ -192,7 +192,7 @@ def test_current_folder_is_searched_only_for_named_modules(tmp_path, monkeypatch
     (package / "second.py").write_text("from local_size import SIZE\n")
     path = [*sys.path]
     assert find_named("local_terms.first:Extra").__name__ == "Extra"
-    # Another module of the package may import what lies beside the package.
+    # Other modules of a local package may import the modules next to it.
     assert find_named("local_terms.second:SIZE") == 3
     with pytest.raises(UsageError, match="'local_missing' not found"):
         find_named("local_missing:f")

@@ -189,14 +189,14 @@ def _signature(function: Any) -> inspect.Signature | None:
 
 
 def result_class(function: Any) -> type | None:
-    """Return the class of what a class or function makes, judged without a call; None if unknown."""
+    """Return the class of what a class or function returns, from its annotation; None if unknown."""
     if isinstance(function, type):
         return function
     if isinstance(function, BuiltinFunctionType):
         return type(None)
     try:
         result = typing.get_type_hints(function).get("return")
-    except Exception:  # annotations are any code
+    except Exception:  # evaluating an annotation may raise any error
         return None
     return result if isinstance(result, type) else None
 
