@@ -161,32 +161,40 @@ def test_episodes_and_tables_of_experiments_are_not_tracked(repository: Path):
     )
 
 
-#: ``name==version`` with an optional marker, and one or more hashes on lines of their own.
+#: ``name[extras]==version`` with an optional marker, and one or more hashes on lines of their own.
 PIN = re.compile(
-    r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[\w.+!]+)(?P<marker> ; [^\\\n]+)?"
+    r"(?P<pin>[A-Za-z0-9._-]+(\[[a-z0-9, -]+\])?==[\w.+!]+)(?P<marker> ; [^\\\n]+)?"
     r"( \\\n    --hash=sha256:[0-9a-f]{64})+\n"
 )
 
 
-def pins(path: Path) -> dict[str, str]:
-    """Versions of a lock file by normal name, of the packages that this machine needs."""
-    return {
-        canonicalize_name(pin["name"]): pin["version"]
-        for pin in PIN.finditer(path.read_text())
-        if not pin["marker"] or Marker(pin["marker"].removeprefix(" ; ")).evaluate()
+def pins(path: Path) -> dict[str, Requirement]:
+    """Pins of a lock file by normal name, of the packages that this machine needs."""
+    found = {
+        Requirement(match["pin"])
+        for match in PIN.finditer(path.read_text())
+        if not match["marker"] or Marker(match["marker"].removeprefix(" ; ")).evaluate()
     }
+    return {canonicalize_name(pin.name): pin for pin in found}
 
 
-def unmet(requirement: Requirement, versions: dict[str, str]) -> set[str]:
-    """The requirement, and what its package needs in turn, as far as the versions do not meet it."""
+def version_of(pin: Requirement) -> str:
+    return next(iter(pin.specifier)).version
+
+
+def unmet(requirement: Requirement, pinned: dict[str, Requirement]) -> set[str]:
+    """The requirement, and what its package needs in turn, as far as the pins do not meet it, extras included."""
     found, waiting, seen = set(), [requirement], set()
     while waiting:
         needed = waiting.pop()
-        version = versions.get(canonicalize_name(needed.name))
-        if version is None or not needed.specifier.contains(version, prereleases=True):
+        pin = pinned.get(canonicalize_name(needed.name))
+        if pin is None or not (
+            needed.extras <= pin.extras and needed.specifier.contains(version_of(pin), prereleases=True)
+        ):
             found.add(str(needed))
         elif str(needed) not in seen:
-            assert metadata.version(needed.name) == version, f"install the lock file: {needed.name} {version}"
+            installed = metadata.version(needed.name)
+            assert installed == version_of(pin), f"install the lock file: {pin}"
             seen.add(str(needed))
             for line in map(Requirement, metadata.requires(needed.name) or ()):
                 extras = ("", *needed.extras)
@@ -209,15 +217,19 @@ def test_lock_file_meets_every_requirement_of_the_project(repository: Path):
     lines = [*project["project"]["dependencies"], *project["dependency-groups"]["dev"]]
     lines += [line for name in extras if name != "all" for line in extras[name]]
     assert Requirement(extras["all"][0]).extras == extras.keys() - {"all"}
-    versions = pins(repository / "requirements.lock")
-    assert {found for line in lines for found in unmet(Requirement(line), versions)} == set()
-    assert unmet(Requirement("numpy<2"), versions) == {"numpy<2"}
-    del versions["optax"]
-    assert [line.split(">")[0] for line in unmet(Requirement("flax"), versions)] == ["optax"]
+    pinned = pins(repository / "requirements.lock")
+    assert {found for line in lines for found in unmet(Requirement(line), pinned)} == set()
+    assert unmet(Requirement("numpy<2"), pinned) == {"numpy<2"}
+    assert unmet(Requirement("coverage[no-such]"), pinned) == {"coverage[no-such]"}
+    del pinned["optax"]
+    assert [line.split(">")[0] for line in unmet(Requirement("flax"), pinned)] == ["optax"]
 
 
 def test_lock_files_agree(repository: Path):
     """The documentation is built in the environment of the tests."""
     one, other = (pins(repository / name) for name in ("requirements.lock", "requirements-docs.lock"))
     shared = one.keys() & other.keys()
-    assert shared and {name: one[name] for name in shared} == {name: other[name] for name in shared}
+    assert shared
+    assert {name: version_of(one[name]) for name in shared} == {
+        name: version_of(other[name]) for name in shared
+    }
