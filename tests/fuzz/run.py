@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from drivax.datasets.conversion import Conversion, convert_file
@@ -112,6 +113,7 @@ def outcome(path: Path, format_name: str) -> tuple[str, str | None]:
 
 def limit_memory() -> None:
     """Refuse this process more than 1 GB beyond what it has now."""
+    jax.devices()  # takes a stack for each thread of the backend, many on a large machine
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
