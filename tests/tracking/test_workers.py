@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -56,6 +57,23 @@ def test_workers_end_with_a_killed_parent(tmp_path, end):
 def on_which_cores(number):
     """Task of the workers."""
     return number, len(os.sched_getaffinity(0))
+
+
+def test_closed_terminal_ends_a_pool_silently(tmp_path):
+    """SIGHUP reaches the whole process group, Python's tracker of semaphores included."""
+    end = "import signal; signal.signal(signal.SIGHUP, lambda *_: sys.exit(129)); print(1, flush=True); time.sleep(60)"
+    (tmp_path / "program.py").write_text(PROGRAM.format(end=end))
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "program.py")], text=True, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None and [process.stdout.readline() for _ in range(2)] == [
+        "ready\n",
+        "set\n",
+    ]
+    os.killpg(process.pid, signal.SIGHUP)
+    assert process.communicate(timeout=60)[1] == "" and process.returncode == 129
+    assert group_is_gone(process.pid, 10.0)
 
 
 def test_each_task_has_one_core():
