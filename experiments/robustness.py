@@ -44,9 +44,10 @@ PROGRAM = (sys.executable, "-m", "drivax")
 STATUSES = {
     "kill": (-9,), "worker": (1,), "term": (143, -15), "int": (130, -2), "hup": (129, -1), "full": (1,),
 }  # fmt: skip
-#: Values that differ between equal runs, by file name: times, speeds, command lines, random file names.
+#: Values that differ between equal runs, by file name: times, speeds, command lines, the state of the
+#: repository, random file names.
 VOLATILE = {
-    "run.json": {"started", "command"},
+    "run.json": {"started", "command", "git"},
     "metrics.jsonl": {"steps_per_second"},
     "about.json": {"files", "crc"},
     "seal.json": {"run.json", "metrics.jsonl"},
@@ -182,6 +183,7 @@ class Bench:
         self.reference: dict[str, str] = {}
         #: By command: seconds until the first file, and in all.
         self.seconds: dict[str, tuple[float, float]] = {}
+        self.process: subprocess.Popen[str] | None = None
         self.problems: list[str] = []
         self.counts: Counter[tuple[str, str, str]] = Counter()
         self.clear()
@@ -293,10 +295,16 @@ class Bench:
             flags = ["--overwrite"]
         devices = f"--xla_force_host_platform_device_count={command.devices}"
         environment = os.environ | {"TMPDIR": str(self.temporary), "XLA_FLAGS": devices}
-        return subprocess.Popen(
+        self.process = subprocess.Popen(
             (*PROGRAM, *command.arguments, *flags), cwd=self.work, env=environment, text=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
+        return self.process
+
+    def close(self) -> None:
+        """Kill the command that runs, which has a session of its own."""
+        if self.process is not None and self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
 
     def _end(self, name: str, process: subprocess.Popen[str]) -> None:
         error = process.communicate(timeout=_RUN_S)[1]
@@ -524,8 +532,9 @@ def main() -> int:
         tuple(STATUSES) if args.disk.is_mount() else tuple(fault for fault in STATUSES if fault != "full")
     )
     bench = Bench(args.disk, needed, args.only, faults, random.Random(args.seed))
-    bench.measure()
-    counts = run_kills(bench, args.moments) if args.mode == "kills" else run_soak(bench, args.minutes)
+    with contextlib.closing(bench):
+        bench.measure()
+        counts = run_kills(bench, args.moments) if args.mode == "kills" else run_soak(bench, args.minutes)
     summary = json.dumps(_summary(bench, args, counts), indent=1)
     print(re.sub(r"\n {3,}", " ", summary))
     if args.write:
