@@ -131,6 +131,18 @@ def test_a_partial_folder_resumes_after_its_finished_parts(tmp_path: Path):
     assert not can_resume(tmp_path / "set")
 
 
+def test_a_replaced_folder_is_removed_although_parts_are_finished(tmp_path: Path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "old").touch()
+    started(tmp_path / "set", {"seed": 1})
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    folder.open()
+    folder.publish()
+    folder.close()
+    assert names(tmp_path) == {"set"}
+    assert names(tmp_path / "set") == {"part"}
+
+
 def test_a_partial_folder_without_identity_leaves_nothing_behind(tmp_path: Path):
     started(tmp_path / "set")
     assert names(tmp_path) == set()

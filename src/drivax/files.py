@@ -244,6 +244,8 @@ class PartialFolder:
             # A process killed between these two lines is repaired by the next one that opens the folder.
             self._target.rename(self._old)
             self.content.rename(self._target)
+        # After an exchange, the content is the replaced folder, which nothing may resume.
+        shutil.rmtree(self.root / "progress", ignore_errors=True)
         sync_folder(self._target.parent)
         self._new_parents = []
 
