@@ -113,7 +113,7 @@ def test_commands_exist(block: Block):
         assert words[1] in cli.COMMANDS, f"{block.place}: there is no command {words[1]}"
         for flag in flags:
             dotted = "." in flag and cli.COMMANDS[words[1]].overrides
-            known = flag in ("--debug", "--help") or re.search(
+            known = flag in ("--debug", "--edited", "--help") or re.search(
                 rf"(?<![\w-]){flag}(?![\w-])", help_of(words[1])
             )
             if words[1] == "curate" and METHODS[words[2]].config is not None:

@@ -131,16 +131,23 @@ def test_a_partial_folder_resumes_after_its_finished_parts(tmp_path: Path):
     assert not can_resume(tmp_path / "set")
 
 
-def test_a_replaced_folder_is_removed_although_parts_are_finished(tmp_path: Path):
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "old").touch()
+def test_temporary_files_of_a_killed_writer_are_removed_on_resume(tmp_path: Path):
+    spool = started(tmp_path / "set", {"seed": 1}).root / f"spool-{os.getpid()}"
+    write_text(spool / "0.records", "")
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == [{"part": "first"}]
+    assert names(folder.root) == {"content", "progress", "identity.json", "lock"}
+    folder.close()
+
+
+def test_replaced_folder_is_removed_after_a_resumable_writer(tmp_path: Path):
+    write_text(tmp_path / "set" / "old", "")
     started(tmp_path / "set", {"seed": 1})
     folder = PartialFolder(tmp_path / "set", {"seed": 1})
     folder.open()
     folder.publish()
     folder.close()
-    assert names(tmp_path) == {"set"}
-    assert names(tmp_path / "set") == {"part"}
+    assert names(tmp_path) == {"set"} and names(tmp_path / "set") == {"part"}
 
 
 def test_a_partial_folder_without_identity_leaves_nothing_behind(tmp_path: Path):
@@ -303,10 +310,25 @@ def test_folder_gets_its_name_back_after_a_kill_between_renames(tmp_path: Path):
     assert run(REPLACE, tmp_path / "run", "old disk").returncode == -signal.SIGKILL
     assert not (tmp_path / "run").exists()
     restore_folder(tmp_path / "run")
-    assert names(tmp_path / "run") == {"old"}
+    assert names(tmp_path / "run") == {"old"} and names(tmp_path) == {"run"}
     with replace_folder(tmp_path / "run") as partial:
         write_text(partial / "newer", "")
     assert names(tmp_path / "run") == {"newer"} and names(tmp_path) == {"run"}
+
+
+def test_read_passes_where_the_folder_cannot_get_its_name_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(self: Path, target: Path):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    (tmp_path / ".run.partial" / "old").mkdir(parents=True)
+    monkeypatch.setattr(Path, "rename", refuse)
+    restore_folder(tmp_path / "run")
+    assert names(tmp_path / ".run.partial") == {"lock", "old"}
+    monkeypatch.undo()
+    restore_folder(tmp_path / "run")  # The lock is free.
+    assert names(tmp_path) == {"run"}
 
 
 def test_error_between_renames_keeps_the_old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -358,6 +380,26 @@ def test_symbolic_links_to_outputs_are_followed(tmp_path: Path):
     assert (tmp_path / "file").is_symlink() and (tmp_path / "run").is_symlink()
     assert (tmp_path / "disk" / "file").read_text() == "new"
     assert names(tmp_path / "disk") == {"file", "run"} and names(tmp_path / "disk" / "run") == {"new"}
+
+
+def test_symbolic_links_under_hidden_names_are_not_followed(tmp_path: Path):
+    victim = tmp_path / "victim"
+    write_text(victim / "file", "kept")
+    (tmp_path / ".file.partial").symlink_to(victim / "file")
+    write_text(tmp_path / "file", "new")
+    (tmp_path / ".run.partial").symlink_to(victim)
+    with replace_folder(tmp_path / "run") as partial:
+        write_text(partial / "new", "")
+    (tmp_path / ".set.partial").mkdir()
+    for name in ("content", "progress", "old", "spool-1", "lock"):
+        (tmp_path / ".set.partial" / name).symlink_to(victim)
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    folder.open()
+    folder.note(0, {})
+    folder.publish()
+    folder.close()
+    assert names(tmp_path) == {"victim", "file", "run", "set"}
+    assert names(victim) == {"file"} and (victim / "file").read_text() == "kept"
 
 
 def test_failure_removes_the_parents_that_it_created(tmp_path: Path):

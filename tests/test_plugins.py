@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -179,6 +180,25 @@ def test_modules_in_the_current_folder_are_found(tmp_path, monkeypatch):
     assert "'terms_broken:f': importing 'terms_broken' fails with ModuleNotFoundError: No module" in str(
         error.value
     )
+
+
+def test_current_folder_is_searched_only_for_named_modules(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "absent_extra.py").write_text("raise SystemExit")
+    (tmp_path / "local_size.py").write_text("SIZE = 3\n")
+    package = tmp_path / "local_terms"
+    package.mkdir()
+    (package / "first.py").write_text("class Extra: pass\n")
+    (package / "second.py").write_text("from local_size import SIZE\n")
+    path = [*sys.path]
+    assert find_named("local_terms.first:Extra").__name__ == "Extra"
+    # Another module of the package may import what lies beside the package.
+    assert find_named("local_terms.second:SIZE") == 3
+    with pytest.raises(UsageError, match="'local_missing' not found"):
+        find_named("local_missing:f")
+    assert sys.path == path
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("absent_extra")
 
 
 def test_training_runs_with_custom_terms(tmp_path):

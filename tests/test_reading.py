@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import struct
 import tokenize
+import tracemalloc
 import zipfile
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +16,12 @@ import numpy as np
 import pytest
 
 from drivax import reading
+from drivax.datasets.nuscenes.map import city
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.episode_table import _read_columns
 from drivax.reading import explain_damage, parse_array, read_arrays, read_bytes, read_json, read_text
 from drivax.settings import parse_yaml
+from drivax.tracking.sinks import read_rows
 
 
 def header(text: str) -> bytes:
@@ -44,6 +49,7 @@ def test_arrays_are_those_of_numpy(tmp_path):
         (header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"), "another length"),
         (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -8)}") + bytes(64), "another length"),
         (header("(" * 60_000), "damaged"),
+        (header("-" * 60_000 + "1"), "nested too deeply"),
         (header("{'descr': '<f8', 'shape': (1L, \"\"\""), "damaged"),
         (b"\x93NUMPY\x09\0", "version"),
         (b"", "damaged"),
@@ -62,17 +68,34 @@ def test_hostile_array_is_refused_in_one_line(tmp_path, content, words):
 def test_archive_that_unpacks_to_more_than_expected_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     file = tmp_path / "a.npz"
     np.savez_compressed(file, a=np.zeros(1 << 20))
-    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
+    monkeypatch.setattr(zipfile.ZipFile, "open", lambda *_: pytest.fail("unpacked"))
     with pytest.raises(DataError, match=r"unpacks to 8\.4 MB, more than the 1\.0 MB expected"):
         read_arrays(file, "again", 1_000_000)
+
+
+@pytest.mark.parametrize("size", [0, 100])
+def test_archive_with_lying_size_takes_no_more_memory_than_the_size(tmp_path, size):
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, a=np.zeros(8 << 20))
+    content = bytearray(file.read_bytes())
+    entry = content.index(b"PK\1\2")
+    content[entry + 24 : entry + 28] = struct.pack("<I", size)
+    file.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match="Bad CRC-32"):
+            read_arrays(file, "again", 1 << 20)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
     "error",
     [
         zlib.error("x"), tokenize.TokenError("x", (1, 2)), NotImplementedError("x"), RuntimeError("encrypted"),
-        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), RecursionError("x"), SystemError("x"), MemoryError(),
-        EOFError(), zipfile.BadZipFile("x"), KeyError("x"), OverflowError("x"), OSError("x"), struct.error("x"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), RecursionError("x"), SystemError("x"), EOFError(),
+        zipfile.BadZipFile("x"), KeyError("x"), OverflowError("x"), OSError("x"), struct.error("x"),
     ],
 )  # fmt: skip
 def test_each_kind_of_damage_becomes_one_line(tmp_path, error):
@@ -80,6 +103,21 @@ def test_each_kind_of_damage_becomes_one_line(tmp_path, error):
         raise error
     line = str(caught.value)
     assert line.startswith(f"{tmp_path / 'a'}: ") and line.endswith("); copy it again") and "()" not in line
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (OSError(errno.ESTALE, "x"), DataError, "mount the disk again"),
+        (PermissionError(errno.EACCES, "x"), DataError, "change the permissions"),
+        (OSError(errno.EMFILE, "x"), UsageError, "ulimit -n"),
+        (MemoryError(), UsageError, "raise the limit"),
+    ],
+)
+def test_disks_and_limits_have_cures_of_their_own(tmp_path, error, kind, words):
+    with pytest.raises(kind, match=words) as caught, explain_damage(tmp_path / "a", "copy it again"):
+        raise error
+    assert caught.value.file == tmp_path / "a" and "copy it again" not in str(caught.value)
 
 
 def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
@@ -98,6 +136,16 @@ def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
     (tmp_path / "c").write_text("[" * 100_000)
     with pytest.raises(DataError, match=r"c: is not valid JSON \(nested too deeply\); again"):
         read_json(tmp_path / "c", "again")
+
+
+@pytest.mark.parametrize("read", [lambda file: list(read_rows(file)), _read_columns, city])
+def test_logs_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
+    """Values take up to 27 times as much memory as their text."""
+    file = tmp_path / "large"
+    file.touch()
+    os.truncate(file, 75 << 20)  # sparse
+    with pytest.raises(DataError, match="has 79 MB, more than the 67 MB that are read"):
+        read(file)
 
 
 def test_threads_parse_headers_in_turn(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from pathlib import Path
@@ -94,8 +95,8 @@ def results(kind: str, folder: Path, other: Path) -> object:
         values = {name: points.tolist() for name, points in curves.curves.items()}
         return values, curves.info, run.config(TrainConfig), checkpoints.best(), checkpoints.about(200)
     if kind == "policy":
-        run, config = open_policy(folder)
-        return run.info, config
+        run = open_policy(folder)
+        return run.info, run.config(TrainConfig)
     run = RunFolder.open(folder)
     check_seal(folder / "results.json")
     return run.info, run.config(StudyConfig), (folder / "results.json").read_text()
@@ -201,11 +202,18 @@ def test_edited_rollouts_and_added_or_deleted_crashes_are_seen(tmp_path):
     with pytest.raises(DataError, match=r"crashes\.json: is missing; restore it"):
         EpisodeTable.read(run)
     (run / "crashes.json").write_bytes(content)
+    edit(run / "summary.json", '"ours"', '"theirs"')
+    with pytest.raises(DataError, match=r"summary\.json: changed since drivax wrote it"):
+        EpisodeTable.read(run)
+    edit(run / "summary.json", '"theirs"', '"ours"')
     table = EpisodeTable.read(run)
     with (run / "trajectories.npz").open("ab") as file:
         file.write(b"x")
     with pytest.raises(DataError, match=r"trajectories\.npz: changed since drivax wrote it"):
         _ = table.trajectories
+    with allow_edited():
+        assert len(table.trajectories.ego) == EPISODES
+        assert edited_files() == [str(run / "trajectories.npz")]
     crashes, seal_file = run / "crashes.json", run / SEAL
     crashes.unlink()
     seal(run, "crashes.json")
@@ -270,6 +278,32 @@ def test_damaged_seals_are_refused_in_one_line(tmp_path):
     assert json.loads((tmp_path / SEAL).read_text()) == {"a.txt": digest, "b.txt": None}
     unseal(tmp_path, "a.txt")
     assert json.loads((tmp_path / SEAL).read_text()) == {"b.txt": None}
+
+
+@pytest.mark.parametrize("name", [SEAL, "a.txt"])
+def test_seals_and_sealed_files_that_are_no_regular_files_are_refused_in_one_line(tmp_path, name):
+    """Reading a pipe or ``/dev/zero`` would not end."""
+    file, path = tmp_path / "a.txt", tmp_path / name
+    (tmp_path / SEAL).write_text('{"a.txt": "5"}')
+    for create in (os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero")):
+        path.unlink(missing_ok=True)
+        create(path)
+        with allow_edited(), pytest.raises(DataError, match=r"not a regular file\); restore it") as caught:
+            check_seal(file)
+        assert caught.value.file == path
+        if path.is_dir():
+            path.rmdir()
+
+
+def test_large_seals_are_refused_before_they_are_read(tmp_path):
+    (tmp_path / SEAL).touch()
+    os.truncate(tmp_path / SEAL, 20 << 30)  # sparse
+    with pytest.raises(DataError, match=r"seal\.json: has 21 GB, more than the 1\.0 MB"):
+        check_seal(tmp_path / "a.txt")
+    (tmp_path / SEAL).rename(tmp_path / "a.txt")
+    (tmp_path / SEAL).write_text('{"a.txt": "5"}')
+    with pytest.raises(DataError, match=r"a\.txt: is damaged \(larger than any sealed file\)"):
+        check_seal(tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("name", zoo())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
 import os
+import pkgutil
 import shutil
 import sys
 
@@ -13,7 +16,7 @@ import pytest
 import drivax
 import own_terms
 from drivax import settings
-from drivax.adapters.gym import DrivingEnv
+from drivax.adapters.gym import DrivingEnv, VectorDrivingEnv
 from drivax.api import find_planner
 from drivax.cli import main
 from drivax.curation.methods import METHODS, check_current
@@ -132,15 +135,15 @@ def small_config(**values):
 #: Ways to read the configuration of a run or policy: functions of the folder, a set and an empty place.
 READERS = {
     "config": lambda run, data, out: RunFolder.open(run).config(TrainConfig),
-    "load_policy": lambda run, data, out: load_policy(run, None),
-    "export_policy": lambda run, data, out: export_policy(run, out, None),
+    "load_policy": lambda run, data, out: load_policy(run, drivax.load(data.path).bank),
+    "export_policy": lambda run, data, out: export_policy(run, out, drivax.load(data.path).bank),
     "policy_traffic": lambda run, data, out: policy_traffic(run),
     "find_traffic": lambda run, data, out: find_traffic(f"{run}+idm"),
     "find_planner": lambda run, data, out: find_planner(str(run), drivax.load(data.path).bank),
     "make_simulator": lambda run, data, out: drivax.make_simulator(traffic=str(run)),
     "evaluate": lambda run, data, out: drivax.evaluate(run, data.path),
     "evaluate_traffic": lambda run, data, out: drivax.evaluate("idm", data.path, traffic=str(run)),
-    "make_agent": lambda run, data, out: make_agent(small_config(traffic=str(run)), None),
+    "make_agent": lambda run, data, out: make_agent(small_config(traffic=str(run)), drivax.load(data.path).bank),
     "train_traffic": lambda run, data, out: train(small_config(traffic=str(run)), data, out, validation=None),
     "resume": lambda run, data, out: train(small_config(), data, run, validation=None, resume=True),
     "gym": lambda run, data, out: DrivingEnv(1, traffic=str(run)),
@@ -263,6 +266,16 @@ def test_trusted_modules_are_resolved(folder):
             check_names({"a": [name]}, ["own_terms"])
 
 
+@pytest.mark.parametrize("environment", [DrivingEnv, VectorDrivingEnv])
+def test_environments_take_trust(environment, folder):
+    run = write_stranger(folder / "run", PLACES["metric"]("own_terms:nearest_other"))
+    with pytest.raises(UsageError, match="trust="):
+        environment(data=1, traffic=str(run))
+    # Trusted, the configuration is read, and the parameters of the policy with other groups are not.
+    with pytest.raises(DataError, match=r"policy\.npz"):
+        environment(data=1, traffic=str(run), trust=["own_terms"])
+
+
 @pytest.mark.slow
 def test_trusted_policy_is_evaluated_and_resumed(folder, data, capsys):
     run = train(
@@ -299,6 +312,46 @@ def test_flags_and_own_files_stay_the_users(folder):
     # That the user's file names it does not make it trusted in data.
     with pytest.raises(UsageError, match="names code"):
         settings.load(TrainConfig, PLACES["metric"]("carried:thing"), trust=())
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        ("encoder", "drivax.synthetic.roads.families:TJunction"),
+        ("encoder_name", "drivax.synthetic.roads.families:TJunction"),
+        ("algorithm", "drivax.learning.algorithms.warm_start:WarmStart"),
+        ("feature", "drivax.tasks.observations:_masked_group"),
+        ("feature", "drivax.tasks.features:ego_on_route"),
+        ("feature", "drivax.tasks.rewards:collision"),
+        ("reward", "drivax.tasks.conditions:draw_conditions"),
+        ("reward", "drivax.tasks.rewards:reward_term"),
+        ("record", "drivax.tasks.rewards:_Weights"),
+    ],
+)
+def test_other_parts_of_drivax_are_refused(place, name, folder):
+    """A name within drivax must lead to a component of the kind that its place takes."""
+    with pytest.raises(UsageError) as error:
+        settings.load(TrainConfig, PLACES[place](name), trust=())
+    assert name in str(error.value) and "\n" not in str(error.value)
+
+
+def test_policies_of_useless_settings_are_one_line(folder, data):
+    run = write_stranger(
+        folder / "run", {"algorithm": {"kind": "ppo", "network": {"encoder": {"hidden": []}}}}
+    )
+    with pytest.raises(DataError, match=r"config\.yaml: makes no policy"):
+        load_policy(run, drivax.load(data.path).bank)
+
+
+def test_components_of_drivax_may_be_named():
+    values = {
+        "task": {
+            "observation": {"own": [{"feature": "drivax.tasks.example_features:time_gap"}]},
+            "rewards": {"own": [{"term": "drivax.tasks.rewards:pace", "weight": 1.0, "name": "again"}]},
+        },
+        "algorithm": {"network": {"encoder": {"kind": "drivax.networks.encoders:MlpConfig", "hidden": [8]}}},
+    }
+    assert settings.load(TrainConfig, values | {"algorithm": {"kind": "ppo"} | values["algorithm"]}, trust=())
 
 
 TRAPS = """
@@ -346,13 +399,21 @@ def test_wrong_kinds_of_planners_and_traffic_are_not_called(folder):
 
 def test_only_traffic_of_drivax_is_made_by_name():
     """Of everything in drivax that a name in data reaches, only traffic models would be called as traffic."""
-    made = set()
-    for module in sorted(name for name in sys.modules if name.partition(".")[0] == "drivax"):
-        for attribute in list(vars(sys.modules[module])):
+    modules, made = [drivax], set()
+    for info in pkgutil.walk_packages(drivax.__path__, "drivax."):
+        with contextlib.suppress(ImportError, UsageError):  # an extra is not installed
+            if not info.name.endswith("__main__"):
+                modules.append(importlib.import_module(info.name))
+    assert len(modules) > 200
+    for module in modules:
+        for attribute in list(vars(module)):
             try:
-                thing = find_named(f"{module}:{attribute}", ())
+                thing = find_named(f"{module.__name__}:{attribute}", ())
             except UsageError:
                 continue
             if makes(thing, Traffic):
                 made.add(result_class(thing))
-    assert {cls.__name__ for cls in made} == {"LogTraffic", "IdmTraffic", "PlannerTraffic", "PolicyTraffic"}
+    # Traffic of a policy or of given motions names what it needs when a bank lacks it; none opens a folder.
+    assert {cls.__name__ for cls in made} == {"LogTraffic", "IdmTraffic", "PlannerTraffic", "OverrideTraffic"}
+    with pytest.raises(UsageError, match="makes no traffic"):
+        find_traffic("drivax.learning.policies:PolicyTraffic")

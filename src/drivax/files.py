@@ -9,7 +9,8 @@ While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
     old/           the replaced ``sets/a``, on disks that cannot exchange two folders
     spool*/        temporary files of the writer
 
-The next writer of ``sets/a`` takes over what a killed process left. Symbolic links to outputs are followed.
+The next writer of ``sets/a`` takes over what a killed process left. Symbolic links to outputs, which the user names,
+are followed; links inside them, which a stranger may have made, are replaced or refused.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from drivax.errors import DataError, UsageError
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 #: Errors of disks without locks or without exchange.
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
+#: What a later process needs to resume a partial folder.
+_RESUMABLE = ("content", "progress", "identity.json", "lock")
 #: Files that a process opens besides those of its data.
 _OTHER_FILES = 128
 
@@ -115,7 +118,11 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
         yield
     except Exception as error:
         if not _is_full_disk(error):
-            if isinstance(error, OSError) and ".partial" in str(error.filename or ".partial"):
+            if (
+                isinstance(error, OSError)
+                and error.errno is not None
+                and ".partial" in str(error.filename or ".partial")
+            ):
                 error.filename = str(path)
             raise
         needed = needed or getattr(error, "needed", 0)
@@ -134,12 +141,13 @@ def _is_full_disk(error: Exception) -> bool:
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path, needed: int = 0) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path, needed: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
 
-    A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``.
+    A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``. With
+    ``follow``, a symbolic link stays, and the file that it leads to is written.
     """
-    target = _follow(path)
+    target = _follow(path) if follow else path
     partial = _hidden_path(target)
     with explain_full_disk(path, needed), _open_locked(partial, wait=True) as file:
         try:
@@ -154,16 +162,27 @@ def atomic_write(path: Path, needed: int = 0) -> Iterator[IO[bytes]]:
         sync_folder(target.parent)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
+def write_text(path: Path, text: str, follow: bool = True) -> None:
+    """Write a text file as :func:`atomic_write` does."""
     content = text.encode()
-    with atomic_write(path, len(content)) as file:
+    with atomic_write(path, len(content), follow) as file:
         file.write(content)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write strict JSON atomically."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False))
+def write_json(path: Path, value: Any, follow: bool = True) -> None:
+    """Write strict JSON as :func:`atomic_write` does."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False), follow)
+
+
+def refuse_link(folder: Path) -> Path:
+    """Return a folder inside a run.
+
+    Raises:
+        DataError: It is a symbolic link, by which a stranger's run could write or delete anywhere.
+    """
+    if folder.is_symlink():
+        raise DataError("is a symbolic link", file=folder, cure="replace the link by the folder itself")
+    return folder
 
 
 def file_digest(path: Path) -> str:
@@ -215,12 +234,15 @@ class PartialFolder:
         self._new_parents = [parent for parent in self._target.parents if not parent.exists()]
         self._take_lock()
         try:
+            for entry in self.root.iterdir():
+                _unlink_link(entry)
             self._restore()
             notes = self._read_notes(restart)
         except BaseException:
             self._release()
             raise
         try:
+            self._clear(_RESUMABLE if notes else ("lock",))
             if not notes:
                 self._start()
         except BaseException:
@@ -244,17 +266,15 @@ class PartialFolder:
             # A process killed between these two lines is repaired by the next one that opens the folder.
             self._target.rename(self._old)
             self.content.rename(self._target)
-        # After an exchange, the content is the replaced folder, which nothing may resume.
-        shutil.rmtree(self.root / "progress", ignore_errors=True)
         sync_folder(self._target.parent)
+        shutil.rmtree(self.root / "progress", ignore_errors=True)  # `content` may be the replaced folder
         self._new_parents = []
 
     def close(self) -> None:
         """Release the lock, and remove all files but finished parts that a later process can resume."""
         self._restore()
-        names = ("content", "progress", "identity.json", "lock")
         resumable = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
-        self._clear(names if resumable else ("lock",))
+        self._clear(_RESUMABLE if resumable else ("lock",))
         if not resumable:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
             for folder in (self.root, *self._new_parents):
@@ -265,9 +285,10 @@ class PartialFolder:
     def restore(self) -> None:
         """Give a folder its name back if a process was killed while it replaced the folder."""
         if not self._target.exists() and self._old.is_dir():
-            with contextlib.suppress(UsageError):  # the process still runs
+            # The process still runs, or the disk cannot be written.
+            with contextlib.suppress(UsageError, OSError):
                 self._take_lock()
-                self._restore()
+                self.close()
             self._release()
 
     def _restore(self) -> None:
@@ -293,7 +314,6 @@ class PartialFolder:
         return notes
 
     def _start(self) -> None:
-        self._clear(("lock",))
         self.content.mkdir()
         if self.identity is not None:
             (self.root / "progress").mkdir()
@@ -309,6 +329,7 @@ class PartialFolder:
                 entry.unlink()
 
     def _take_lock(self) -> None:
+        _unlink_link(self.root)
         try:
             self._lock = _open_locked(self.root / "lock")
         except BlockingIOError as error:
@@ -355,6 +376,12 @@ def _follow(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def _unlink_link(path: Path) -> None:
+    """Remove a symbolic link under a hidden name, which is not drivax's and may lead anywhere."""
+    if path.is_symlink():
+        path.unlink()
+
+
 def _hidden_path(path: Path) -> Path:
     return path.parent / f".{path.name}.partial"
 
@@ -364,6 +391,7 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as cleanup:
+            _unlink_link(path)
             path.touch()
             file = cleanup.enter_context(path.open("r+b"))
             try:

@@ -6,13 +6,14 @@ component of drivax, or within a module that the user trusts.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import inspect
 import re
 import sys
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -22,6 +23,10 @@ from drivax.errors import UsageError, did_you_mean
 
 #: ``zoo:NAME`` is a policy of the package, never a module.
 _FORM = re.compile(r"(?!zoo:)[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
+#: First arguments of reward terms and of features.
+_TERM_ARGUMENTS = (("before", "now", "around"), ("bank", "context", "frames"))
+#: Packages that were found in the current folder; their other modules may import their neighbours too.
+_local_packages: set[str] = set()
 
 
 def is_dotted(value: Any) -> bool:
@@ -38,7 +43,7 @@ def is_trusted(name: str, trust: Collection[str]) -> bool:
 def find_named(name: str, trust: Collection[str] | None = None) -> Any:
     """Import the object with a dotted name.
 
-    Modules are searched on Python's path first, then in the current folder.
+    Modules are searched on Python's path first, then in the current folder, which later imports do not search.
 
     Args:
         name: ``package.module:name``.
@@ -60,7 +65,7 @@ def find_named(name: str, trust: Collection[str] | None = None) -> Any:
             cure = did_you_mean(attribute, names, otherwise=f"define {attribute} there")
             raise UsageError(f"{name!r}: {module_name!r} has no {attribute!r}", cure=cure)
         target = getattr(target, attribute)
-    if trust is not None and not _may_be_named(target, module_name):
+    if trust is not None and not _may_be_named(target, name):
         raise UsageError(f"{name!r} is not a component of {module_name!r}", cure="do not use this file")
     return target
 
@@ -72,27 +77,41 @@ def trust_cure(names: Collection[str]) -> str:
     return f"read the code, then pass {flags} (in Python trust={modules})"
 
 
-def _may_be_named(thing: Any, module_name: str) -> bool:
-    """Return whether data may name an object of a module: what its package defines, or a component of drivax.
+def _may_be_named(thing: Any, name: str) -> bool:
+    """Return whether data may lead to an object by its name: what its package defines, or a component of drivax.
 
-    A component is a dataclass, an instance of one, or a function with arguments of ``drivax.tasks``, which is pure.
+    A component is a dataclass, an instance of one, or a reward term or feature of ``drivax.tasks``, which is pure; its
+    name has no underscore in front.
     """
-    origin = str(getattr(thing, "__module__", None))
-    if origin.partition(".")[0] != "drivax":
-        return origin.partition(".")[0] == module_name.partition(".")[0]
-    is_term = inspect.isfunction(thing) and origin.startswith("drivax.tasks.") and not _accepts(thing, ())
-    return is_dataclass(thing) or is_term
+    if not _is_part_of_drivax(thing):
+        return _package_of(thing) == name.partition(":")[0].partition(".")[0]
+    is_private = any(part.startswith("_") for part in re.split("[.:]", name))
+    return not is_private and (is_dataclass(thing) or _is_term(thing))
+
+
+def _package_of(thing: Any) -> str:
+    return str(getattr(thing, "__module__", None)).partition(".")[0]
+
+
+def _is_part_of_drivax(thing: Any) -> bool:
+    return _package_of(thing) == "drivax"
+
+
+def _is_term(thing: Any) -> bool:
+    """Return whether an object is a reward term or a feature of drivax."""
+    is_of_tasks = inspect.isfunction(thing) and thing.__module__.startswith("drivax.tasks.")
+    return is_of_tasks and tuple(inspect.signature(thing).parameters)[:3] in _TERM_ARGUMENTS
 
 
 def _import(module_name: str, name: str) -> Any:
     if module_name in sys.modules:
         return sys.modules[module_name]
-    package, folder = module_name.split(".")[0], str(Path.cwd())
-    if folder not in sys.path and package not in sys.modules and importlib.util.find_spec(package) is None:
-        sys.path.append(folder)
-        importlib.invalidate_caches()
+    package = module_name.split(".")[0]
+    if package not in sys.modules and importlib.util.find_spec(package) is None:
+        _local_packages.add(package)
     try:
-        return importlib.import_module(module_name)
+        with _current_folder() if package in _local_packages else contextlib.nullcontext():
+            return importlib.import_module(module_name)
     except Exception as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and (module_name == missing or module_name.startswith(f"{missing}.")):
@@ -104,6 +123,21 @@ def _import(module_name: str, name: str) -> Any:
             f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}",
             cure="fix the module",
         ) from error
+
+
+@contextlib.contextmanager
+def _current_folder() -> Iterator[None]:
+    """Search the current folder last, only while a module that the user names is imported."""
+    path, folder = sys.path, str(Path.cwd())
+    is_new = folder not in path
+    if is_new:
+        path.append(folder)
+        importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if is_new and folder in path:
+            path.remove(folder)
 
 
 def dotted_name(thing: Any) -> str:
@@ -126,12 +160,13 @@ def dotted_name(thing: Any) -> str:
 
 
 def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
-    """Check that a callable accepts these positional arguments.
+    """Check that a callable accepts positional arguments of these types; those of drivax's terms must be the same.
 
     Raises:
         ValueError: The signature differs or, as of some builtins, is unknown.
     """
-    if not _accepts(function, arguments):
+    hints = typing.get_type_hints(function) if _is_term(function) else {}
+    if not _accepts(function, arguments) or (hints and tuple(hints.values())[: len(arguments)] != arguments):
         types = ", ".join(getattr(argument, "__name__", str(argument)) for argument in arguments)
         signature = _signature(function) or "unknown arguments"
         raise ValueError(f"{name!r} takes {signature}; it is called with ({types})")
@@ -178,11 +213,24 @@ def check_protocol(thing: Any, name: str, protocol: Any) -> None:
     """Check that an object, or a dataclass by its fields, has all members of a protocol.
 
     Raises:
-        ValueError: A member is missing.
+        ValueError: A member is missing, or a method takes other arguments.
     """
     for member in protocol_members(protocol):
         if not hasattr(thing, member) and member not in getattr(thing, "__dataclass_fields__", ()):
             raise ValueError(f"{name!r} lacks {member!r}; see {protocol.__module__}.{protocol.__name__}")
+        _check_method(thing, name, member, getattr(protocol, member, None))
+
+
+def _check_method(thing: Any, name: str, member: str, expected: Any) -> None:
+    """Check the arguments of a method by their number, and those of drivax also by their names."""
+    method = getattr(thing, member, None)
+    if not inspect.isfunction(expected) or not callable(method):
+        return
+    arguments = tuple(inspect.signature(expected).parameters)[not isinstance(thing, type) :]
+    signature = _signature(method)
+    has_names = signature is not None and tuple(signature.parameters)[: len(arguments)] == arguments
+    if not _accepts(method, arguments) or (_is_part_of_drivax(thing) and not has_names):
+        raise ValueError(f"{name!r}: {member} takes {signature}, not ({', '.join(arguments)})")
 
 
 def protocol_members(protocol: Any) -> list[str]:

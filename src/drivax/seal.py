@@ -17,11 +17,15 @@ from typing import Any
 
 from drivax.errors import DataError
 from drivax.files import write_json
+from drivax.reading import check_regular, explain_damage, read_bytes
 
 SEAL = "seal.json"
 #: Ends the name of a planner in tables that are made with edited files.
 MARK = " (edited)"
 _CURE = "restore it, run the command again, or use the edited file with --edited"
+_RESTORE = "restore it, or run the command again"
+#: Largest seal, and largest sealed file, in bytes.
+_MOST_BYTES, _MOST_SEALED_BYTES = 1 << 20, 4 << 30
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ def seal(folder: Path, *names: str) -> None:
     """Seal files of a folder in their present state: their content, or that they do not exist."""
     edited = edited_files(folder)  # An edited file stays one: its entry does not change.
     digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
-    write_json(folder / SEAL, {**_read(folder / SEAL), **digests})
+    write_json(folder / SEAL, {**_read(folder / SEAL), **digests}, follow=False)
 
 
 def unseal(folder: Path, name: str) -> None:
@@ -47,7 +51,7 @@ def unseal(folder: Path, name: str) -> None:
     entries = _read(folder / SEAL)
     if name in entries and str(folder / name) not in edited_files(folder):
         del entries[name]
-        write_json(folder / SEAL, entries)
+        write_json(folder / SEAL, entries, follow=False)
 
 
 def check_seal(file: Path) -> None:
@@ -106,17 +110,20 @@ def mark_edited(name: str, edited: object) -> str:
 
 def _digest(file: Path) -> str | None:
     """Return the SHA-256 of a file (hex); None without the file."""
-    try:
-        with file.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
-    except FileNotFoundError:
+    if not file.exists():
         return None
+    check_regular(file, _RESTORE)
+    with explain_damage(file, _RESTORE), file.open("rb") as content:
+        if file.stat().st_size > _MOST_SEALED_BYTES:
+            raise ValueError("larger than any sealed file")
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def _read(file: Path) -> dict[str, Any]:
     """Return the entries of a seal; none without one."""
+    data = read_bytes(file, _RESTORE, _MOST_BYTES) if file.exists() else b"{}"
     with contextlib.suppress(ValueError, RecursionError):
-        entries = json.loads(file.read_bytes()) if file.exists() else {}
+        entries = json.loads(data)
         if isinstance(entries, dict):
             return entries
     refuse_edited(file, "is damaged")

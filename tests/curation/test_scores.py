@@ -201,6 +201,10 @@ def test_edited_tables_need_permission_and_are_noted(data, table, tmp_path):
     del header["sha256"]  # as tables of earlier versions
     np.savez(file, allow_pickle=False, **arrays | {"header": np.array(json.dumps(header))})
     assert read_scores(file, data).method == "kinematic"
+    header["edited"] = "abc"
+    np.savez(file, allow_pickle=False, **arrays | {"header": np.array(json.dumps(header))})
+    with pytest.raises(DataError, match="edited is not a list"):
+        read_scores(file, data)
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.1, 1.1])

@@ -83,6 +83,15 @@ def patched(data: bytes, old: bytes, offset: int, new: bytes) -> bytes:
     return bytes(out)
 
 
+def _lying(data: bytes, times: int) -> bytes:
+    """An archive whose ``ego.npy`` unpacks to repeated data, and states 100 bytes."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
+    block = deflate.compress(data) + deflate.flush(zlib.Z_FULL_FLUSH)
+    members = archive({"ego.npy": block * times + b"\3\0"}, zipfile.ZIP_STORED)
+    deflated = patched(patched(members, b"PK\1\2", 10, b"\x08"), b"PK\3\4", 8, b"\x08")
+    return patched(deflated, b"PK\1\2", 24, struct.pack("<I", 100))
+
+
 def framed(payload: bytes, length: int | None = None) -> bytes:
     """A TFRecord with right checksums, also of a wrong length."""
     head = struct.pack("<Q", len(payload) if length is None else length)
@@ -138,7 +147,7 @@ def payloads() -> Iterator[tuple[str, bytes | Callable[[Path], None]]]:
         "gzip bomb": zlib.compress(zeros, 9, 31),
         "zlib bomb": zlib.compress(zeros, 9),
         "zip bomb": bomb,
-        "zip with lying size": patched(bomb, b"PK\1\2", 24, struct.pack("<I", 100)),
+        "zip with lying size": _lying(zeros, 64),
         "zip of 4 GB": patched(bomb, b"PK\1\2", 24, struct.pack("<I", 2**32 - 2)),
         "zip encrypted": patched(patched(small, b"PK\1\2", 8, b"\1"), b"PK\3\4", 6, b"\1"),
         "zip of an unknown method": patched(patched(small, b"PK\1\2", 10, b"\x63"), b"PK\3\4", 8, b"\x63"),

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import pytest
 from drivax import settings
 from drivax.cli import main
 from drivax.errors import DataError, DrivaxError
+from drivax.files import PartialFolder, atomic_write, replace_folder
 from drivax.learning import loop
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.ppo import PpoConfig
@@ -293,12 +295,22 @@ def test_damaged_older_checkpoint_does_not_end_a_training(data, config, tmp_path
     assert steps(run) == [40, 60]
 
 
-def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path):
+class Killed(BaseException):
+    """End of a process."""
+
+
+def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path, monkeypatch):
     run = train(config, data, tmp_path / "run", seeds=2, validation=None).path
     seed = run / "seed-4"
-    (seed / "checkpoints" / ".step-000000060.partial-7" / "arrays").mkdir(parents=True)
+    checkpoint = seed / "checkpoints" / "step-000000060"
     (seed / "checkpoints" / ".step-40.old-7").mkdir()
-    (seed / ".metrics.jsonl.partial-7").write_text("{")
+    for write in (atomic_write(seed / "run.json"), replace_folder(checkpoint)):
+        with monkeypatch.context() as context, pytest.raises(Killed), write:
+            context.setattr(Path, "unlink", lambda *_, **__: None)
+            context.setattr(PartialFolder, "close", PartialFolder._release)
+            raise Killed
+    litter = [".run.json.partial", ".step-000000060.partial", ".step-40.old-7"]
+    assert sorted(path.name for path in seed.rglob(".*")) == litter
     train(config, data, run, validation=None, resume=True)
     assert [path.name for path in seed.rglob(".*")] == []
     # Killed after the first of two seeds has its folder.
@@ -316,20 +328,39 @@ def test_files_of_a_killed_training_are_taken_over(data, config, tmp_path):
         train(config, data, run, validation=None, resume=True)
 
 
-def test_seeds_keep_a_common_checkpoint_until_all_have_the_next(data, config, tmp_path, monkeypatch):
-    """A process that is killed between the checkpoints of two seeds can resume, also with keep 1."""
+def kill_at(step, monkeypatch):
+    """Kill the process before seed 5 writes its checkpoint of a step."""
+    write = Checkpoints.write
 
-    class Killed(BaseException):
-        pass
-
-    write, run = Checkpoints.write, tmp_path / "run"
-
-    def write_or_die(self, step, state, score=None):
-        if step == 40 and "seed-5" in str(self.folder):
+    def write_or_die(self, number, state, score=None):
+        if number == step and "seed-5" in str(self.folder):
             raise Killed
-        return write(self, step, state, score)
+        return write(self, number, state, score)
 
     monkeypatch.setattr(Checkpoints, "write", write_or_die)
+
+
+def test_training_of_seeds_that_is_killed_at_its_first_checkpoint_starts_again(
+    data, config, tmp_path, monkeypatch
+):
+    """Without the ranks of the killed process, which would use up patience."""
+    config, whole, run = replace(config, evaluate_every=2, patience=2), tmp_path / "whole", tmp_path / "run"
+    monkeypatch.setattr(loop, "validate", lambda *_: {"validation/vmax_score": 0.5})
+    train(config, data, whole, seeds=2, validation=data)
+    with monkeypatch.context() as context, pytest.raises(Killed):
+        kill_at(20, context)
+        train(config, data, run, seeds=2, validation=data)
+    assert [steps(path) for path in seed_folders(run)] == [[20], []]
+    train(config, data, run, validation=data, resume=True)
+    for seed in ("seed-4", "seed-5"):
+        assert steps(run / seed) == steps(whole / seed) == [40, 60]
+        np.testing.assert_array_equal(last_parameters(run / seed), last_parameters(whole / seed))
+
+
+def test_seeds_keep_a_common_checkpoint_until_all_have_the_next(data, config, tmp_path, monkeypatch):
+    """A process that is killed between the checkpoints of two seeds can resume, also with keep 1."""
+    run = tmp_path / "run"
+    kill_at(40, monkeypatch)
     with pytest.raises(Killed):
         train(replace(config, keep=1), data, run, seeds=2, validation=None)
     assert [steps(path) for path in seed_folders(run)] == [[20, 40], [20]]

@@ -79,6 +79,23 @@ def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
     )
 
 
+def test_failed_export_leaves_the_former_policy(run, bank, tmp_path, monkeypatch):
+    """A folder never appears without all of its files."""
+    former = export_policy(run.path, tmp_path / "packed", bank)
+    files = {path.name: path.read_bytes() for path in former.path.iterdir()}
+    assert RunFolder.open(former.path) == former
+
+    def fail(*_):
+        raise RuntimeError("disk failed")
+
+    for name in ("pack", "seal"):
+        with monkeypatch.context() as context, pytest.raises(RuntimeError, match="disk failed"):
+            context.setattr(f"drivax.learning.policies.{name}", fail)
+            export_policy(run.path, former.path, bank, {"measured": {}}, overwrite=True)
+        assert {path.name: path.read_bytes() for path in former.path.iterdir()} == files
+    assert [path.name for path in tmp_path.iterdir()] == ["packed"]
+
+
 @pytest.mark.slow
 def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank)
@@ -94,7 +111,7 @@ def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
         load_policy(packed.path, bank)
     (packed.path / POLICY_FILE).write_bytes(b"PK")
-    with pytest.raises(DataError, match=r"policy.npz: is damaged"):
+    with pytest.raises(DataError, match=r"policy\.npz: not an \.npz file, or damaged"):
         load_policy(packed.path, bank)
 
 

@@ -299,7 +299,7 @@ def test_reactive_agents_are_those_of_the_last_run(runs, tmp_path):
 def test_runs_in_other_traffic_are_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
-    with pytest.raises(DataError, match="lacks an array: others"):
+    with pytest.raises(DataError, match=r"lacks 'others'"):
         read_runs(runs)
     react(runs[0])
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())

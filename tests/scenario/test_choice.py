@@ -66,7 +66,7 @@ def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
         ({"names": ["x", "log-1", "y", "z", "w"]}, DataError, "'x', 'y', 'z' and 1 more are not in the set"),
         ({"names": ["two\tlog-0"]}, DataError, "'log-0' is not in the set"),
         ({"names": ["ids.txt"]}, DataError, "ids.txt: line 2 names 'log-7', which is not in the set sets/made"),
-        ({"names": [Path("none.txt")]}, DataError, "none.txt: No such file"),
+        ({"names": [Path("none.txt")]}, DataError, "none.txt: file not found"),
         ({"filters": ["typ=turn_left"]}, UsageError, "did you mean 'type'?"),
         ({"filters": ["type=turn_lef"]}, UsageError, "did you mean 'turn_left'?"),
         ({"filters": ["place=bostn"]}, DataError, "no scenario is selected by 'place=bostn'; did you mean 'boston'?"),

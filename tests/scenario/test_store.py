@@ -431,6 +431,25 @@ def test_checksums_of_another_shard(scenario_set: Path):
         ScenarioSet.open(as_earlier_version(scenario_set))[6]
 
 
+@pytest.mark.parametrize("earlier", [False, True])
+def test_larger_checksum_files_are_refused_before_they_are_read(scenario_set: Path, earlier: bool):
+    if earlier:
+        as_earlier_version(scenario_set)
+    with (scenario_set / "shard-00001.crc.npy").open("r+b") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(DataError, match=r"shard-00001\.crc\.npy: checksum file does not fit"):
+        ScenarioSet.open(scenario_set)
+
+
+def test_sparse_shards_do_not_allow_a_manifest_of_any_size(scenario_set: Path):
+    (scenario_set / "seal.json").unlink()
+    for name, size in (("shard-00000.npy", 1 << 42), ("manifest.json", 1 << 41)):
+        with (scenario_set / name).open("r+b") as file:
+            file.truncate(size)
+    with pytest.raises(DataError, match=r"manifest\.json: has 2\.2 TB, more than the 1\.1 GB that are read"):
+        ScenarioSet.open(scenario_set)
+
+
 def exchange(first: Path, second: Path) -> None:
     content = first.read_bytes()
     first.write_bytes(second.read_bytes())
@@ -640,6 +659,7 @@ def test_overwrite_continues_an_unfinished_set_of_the_same_identity(tmp_path: Pa
         continued(tmp_path / "set", stop=5, overwrite=True)
     assert len(ScenarioSet.open(tmp_path / "set")) == 7  # the old set stays until the new one is whole
     assert continued(tmp_path / "set", overwrite=True) == [2, 4]
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):

@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -156,7 +159,8 @@ def test_a_full_disk_reports_the_size_of_the_checkpoint(tmp_path: Path, monkeypa
 
 def test_files_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
     (tmp_path / ".step-5.partial-123").mkdir()
-    (tmp_path / "step-x").mkdir()
+    for name in ("step-x", "step-1", "step-0000000001"):  # The last are not names of step 1.
+        (tmp_path / name).mkdir()
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.steps() == []
     with pytest.raises(DataError, match="no checkpoint found; start the training again, without --resume"):
@@ -204,8 +208,7 @@ def test_checkpoints_without_checksums_of_files_are_read(tmp_path: Path):
     write_former(path, leaves=about["leaves"])
     with pytest.raises(DataError, match=r"checksum mismatch in \.key; use another checkpoint"):
         checkpoints.restore(state)
-    about["leaves"][0]["stored"][0] = "ant32"
-    write_former(path, leaves=about["leaves"])
+    (path / "arrays" / "_METADATA").write_text("{}")
     with pytest.raises(DataError, match="arrays cannot be read"):
         checkpoints.restore(state)
 
@@ -231,7 +234,7 @@ def test_damage_is_found_before_orbax_reads(tmp_path: Path, capfd: pytest.Captur
             checkpoints.restore(state)
         assert raised.value.file == file and "\n" not in str(raised.value)
         if file.name == "about.json":
-            with pytest.raises(DataError, match=r"about\.json: is"):
+            with pytest.raises(DataError, match=r"about\.json: (is|file not found)"):
                 checkpoints.best()
         file.write_bytes(whole)
     restored = checkpoints.restore(state)
@@ -245,6 +248,73 @@ def test_edited_score_is_found(tmp_path: Path):
     about.write_text(about.read_text().replace('"score": 0.25', '"score": 0.95'))
     with pytest.raises(DataError, match=r"about\.json: is damaged .*checksum mismatch"):
         checkpoints.best()
+
+
+def edit(path: Path, **changes: Any) -> None:
+    """Change entries of ``about.json``, with a checksum that is right, as a stranger can."""
+    about = json.loads((path / "about.json").read_text()) | changes
+    del about["crc"]
+    about["crc"] = zlib.crc32(json.dumps(about, sort_keys=True).encode())
+    (path / "about.json").write_text(json.dumps(about))
+
+
+LEAF = {"name": "['a']", "type": "float32", "shape": [3], "crc": 0}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"score": "abc"},
+        {"score": {"a": 1}},
+        {"score": [0.5, None]},
+        {"files": ["a"]},
+        {"files": {"/dev/null": 0}},
+        {"files": {"../../outside": zlib.crc32(b"secret")}},
+        {"files": {"arrays/device": 0}},
+        {"leaves": 5},
+        {"leaves": [{"name": "['a']"}]},
+        {"leaves": [LEAF | {"shape": 5}]},
+        {"leaves": [LEAF | {"name": 5}]},
+    ],
+)
+def test_checkpoint_of_a_stranger_is_refused_in_one_line(tmp_path: Path, changes: dict[str, Any]):
+    (tmp_path / "outside").write_bytes(b"secret")
+    checkpoints, state = Checkpoints(tmp_path / "checkpoints"), {"a": np.ones(3, np.float32)}
+    path = checkpoints.save(1, state, 0.5)
+    (path / "arrays" / "device").symlink_to("/dev/null")
+    edit(path, **changes)
+    with pytest.raises(DataError, match="use another checkpoint, or train again") as raised:
+        checkpoints.restore(state)
+    assert "\n" not in str(raised.value)
+    if "files" not in changes or isinstance(changes["files"], list):
+        with pytest.raises(DataError, match=r"about\.json: is damaged"):
+            checkpoints.best()
+
+
+def test_large_about_is_not_read(tmp_path: Path):
+    path = Checkpoints(tmp_path).save(1, {"a": 1})
+    os.truncate(path / "about.json", 1 << 40)
+    with pytest.raises(DataError, match=r"about\.json: has 1\.1 TB, more than"):
+        Checkpoints(tmp_path).restore({"a": 0})
+
+
+def test_array_of_another_shape_than_its_leaf_is_not_read(tmp_path: Path):
+    path, small = Checkpoints(tmp_path).save(1, {"a": np.zeros((1000, 1000))}), {"a": np.zeros(2)}
+    leaf = json.loads((path / "about.json").read_text())["leaves"][0]
+    leaf |= {"shape": [2], "stored": ["float64", [2]], "crc": zlib.crc32(bytes(16))}
+    edit(path, leaves=[leaf])
+    with pytest.raises(DataError, match=r"array 00000 has shape \(1000, 1000\), not \(2,\)"):
+        Checkpoints(tmp_path).restore(small)
+
+
+def test_only_leaves_of_the_template_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A replay buffer may be larger than the memory of the machine that evaluates the policy."""
+    Checkpoints(tmp_path).save(1, {"policy": np.ones(2), "replay": np.zeros((50, 50))})
+    sizes, crc = [], zlib.crc32
+    monkeypatch.setattr("zlib.crc32", lambda data, *value: sizes.append(len(data)) or crc(data, *value))
+    part = Checkpoints(tmp_path).restore(np.zeros(2), part="['policy']")
+    np.testing.assert_array_equal(part, np.ones(2))
+    assert 16 in sizes and 20000 not in sizes
 
 
 def test_files_are_on_disk_before_the_checkpoint_has_its_name(
@@ -336,3 +406,27 @@ def test_a_damaged_packed_tree_is_reported(tmp_path: Path):
         file.write_bytes(spoilt)
         with pytest.raises(DataError, match=r"or damaged|not found"):
             unpack(file, {"w": jnp.zeros(100)})
+
+
+FAILING_WRITE = """
+import resource, sys, time
+from pathlib import Path
+import numpy as np
+from drivax.tracking import checkpoints
+
+path, arrays = Path(sys.argv[1]), {str(number): np.zeros(1000) for number in range(40)}
+checkpoints._save_arrays(path / "whole", arrays)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+try:
+    checkpoints._save_arrays(path / "failed", arrays)
+except Exception as error:
+    print(type(error).__name__)
+time.sleep(0.5)
+"""
+
+
+def test_failing_write_prints_no_tracebacks(tmp_path: Path):
+    """No file may grow: all arrays fail, as on a full disk."""
+    command = [sys.executable, "-c", FAILING_WRITE, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.stdout.strip() == "ValueError" and result.stderr == ""

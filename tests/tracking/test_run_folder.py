@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.seal import allow_edited
 from drivax.tracking import run_folder as runs
 from drivax.tracking.run_folder import RunFolder
 
@@ -53,6 +55,22 @@ def test_create_and_open(tmp_path: Path, scenarios: ScenarioSet):
     assert info["machine"]["cpu_count"] >= 1
     assert "pytest" in info["command"] or info["command"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "set"]
+
+
+def test_note_does_not_write_through_symbolic_links_of_a_stranger(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config())
+    for name in ("run.json", "seal.json"):
+        content = (run.path / name).read_bytes()
+        (tmp_path / name).write_bytes(content)
+        (run.path / name).unlink()
+        (run.path / name).symlink_to(tmp_path / name)
+    stored = {name: (tmp_path / name).read_bytes() for name in ("run.json", "seal.json")}
+    RunFolder.open(run.path).note(result=0.5)
+    assert RunFolder.open(run.path).info["result"] == 0.5
+    assert {name: (tmp_path / name).read_bytes() for name in stored} == stored
+    (run.path / "checkpoints").symlink_to(tmp_path)
+    with pytest.raises(DataError, match=r"checkpoints: is a symbolic link; replace"):
+        _ = run.checkpoints
 
 
 def test_notes(tmp_path: Path):
@@ -99,6 +117,64 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
     (run.path / "seal.json").unlink()
     with pytest.raises(DataError, match=r"run\.json: is not valid JSON"):
         RunFolder.open(run.path)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"data": [{"path": "x"}]},
+        {"data": {"hash": "x"}},
+        {"data": [5]},
+        {"networks_from": {"data": [{"path": "x"}]}},
+        {"networks_from": {"data": 5}},
+        {"divergence": "x"},
+        {"divergence": {"step": "a", "problem": "x is NaN"}},
+        {"divergence": {"problem": "x is NaN"}},
+        {"divergence": {"step": 1, "problem": 1}},
+        {"seeds": "x"},
+        {"seeds": 1_000_000_000},
+        {"seeds": -1},
+        {"validation": 5},
+        {"validation": {"scenarios": 1}},
+        {"validation": {"recordings": [["a"]]}},
+        {"validation": {"recordings": [[["a"], "b"]]}},
+        {"weights": 5},
+    ],
+)
+def test_entries_of_other_types_are_refused(tmp_path: Path, values: dict[str, Any]):
+    folder = RunFolder.create(tmp_path / "run", Config(), kind="training").note(**values)
+    with pytest.raises(DataError, match=r"run\.json: is damaged \(.+; run the command again") as raised:
+        RunFolder.open(folder.path)
+    assert "\n" not in str(raised.value)
+
+
+def test_entries_of_trainings_are_read(tmp_path: Path):
+    entries = [
+        {"data": None, "networks_from": None, "divergence": None, "seeds": None, "validation": None},
+        {
+            "divergence": {"step": 10, "problem": "x is NaN"},
+            "seeds": 3,
+            "weights": "abc",
+            "validation": "abc",
+        },
+        {"validation": {"recordings": [["nuplan", "log"]], "scenarios": 3}},
+    ]
+    run = RunFolder.create(tmp_path / "run", Config(), kind="training")
+    for values in entries:
+        info = RunFolder.open(run.note(**values).path).info
+        assert info.items() >= values.items() and runs.trained_on(info) == []
+
+
+def test_tables_of_other_programs_need_no_hash(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config(), kind="evaluation").note(data={"path": "x"})
+    assert RunFolder.open(run.path).info["data"] == {"path": "x"}
+
+
+def test_seeds_are_ordered_by_number_without_other_folders(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config(), kind="seeds", seeds=4)
+    for name in ("seed-10", "seed-9", "seed--1", "seed-x"):
+        RunFolder.create(run.path / name, Config(), kind="training")
+    assert [path.name for path in runs.seed_folders(run.path)] == ["seed--1", "seed-9", "seed-10"]
 
 
 def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -151,3 +227,11 @@ def test_steps_of_runs():
     )
     with pytest.raises(UsageError, match="'best' is not a checkpoint step; write RUN@STEP"):
         runs.run_and_step("runs/a@best")
+
+
+@pytest.mark.parametrize("edited", ["abc", {"a": 1}, 5])
+def test_edited_files_are_a_list(tmp_path: Path, edited: object):
+    """The letters of a text would be noted as files."""
+    run = RunFolder.create(tmp_path / "run", Config()).note(edited=edited)
+    with allow_edited(), pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type"):
+        RunFolder.open(run.path)

@@ -36,6 +36,22 @@ def test_resume_drops_later_rows(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
 
 
+@pytest.mark.parametrize("resume_step", [None, 0])
+def test_symbolic_links_of_a_stranger_are_not_written_through(tmp_path: Path, resume_step: int | None):
+    victim, row = tmp_path / "victim", '{"step": 0}\n'
+    victim.write_text(row)
+    for name, target in (("run", victim), ("empty", tmp_path / "missing")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.jsonl").symlink_to(target)
+        with MetricLog(tmp_path / name, resume_step, tensorboard=False) as log:
+            log.write(1, {"x": 2})
+        assert [row["step"] for row in read_rows(tmp_path / name / "metrics.jsonl")][-1] == 1
+    assert victim.read_text() == row and not (tmp_path / "missing").exists()
+    (tmp_path / "run" / "tensorboard").symlink_to(tmp_path / "empty")
+    with pytest.raises(DataError, match=r"tensorboard: is a symbolic link; replace"):
+        MetricLog(tmp_path / "run")
+
+
 def test_resume_drops_a_row_that_was_cut_off(tmp_path: Path):
     file = tmp_path / "metrics.jsonl"
     file.write_text('{"step": 0, "x": 1}\n{"step": 5, "x"')

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
+from drivax.datasets import spool
+from drivax.scenario.schema import CAPACITIES
+from drivax.synthetic import generate
 from drivax.tracking.workers import one_core_each, worker_pool
 
 PROGRAM = """
@@ -67,10 +72,8 @@ def test_closed_terminal_ends_a_pool_silently(tmp_path):
         [sys.executable, str(tmp_path / "program.py")], text=True, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    assert process.stdout is not None and [process.stdout.readline() for _ in range(2)] == [
-        "ready\n",
-        "set\n",
-    ]
+    assert process.stdout is not None
+    assert [process.stdout.readline() for _ in range(2)] == ["ready\n", "1\n"]
     os.killpg(process.pid, signal.SIGHUP)
     assert process.communicate(timeout=60)[1] == "" and process.returncode == 129
     assert group_is_gone(process.pid, 10.0)
@@ -78,3 +81,75 @@ def test_closed_terminal_ends_a_pool_silently(tmp_path):
 
 def test_each_task_has_one_core():
     assert sorted(one_core_each(on_which_cores, [3, 1, 2], cores=2)) == [(n, (n, 1)) for n in (1, 2, 3)]
+
+
+def send_half():
+    """Task that begins to send its result and never ends, as a worker that is killed while it sends does."""
+    frame = sys._getframe()
+    while "result_queue" not in frame.f_locals:
+        frame = frame.f_back
+    os.write(frame.f_locals["result_queue"]._writer.fileno(), struct.pack("!i", 1000))
+    time.sleep(60)
+
+
+def sleep_in_conversion(number):
+    """Conversion of a file: the first is empty, the next is slow."""
+    time.sleep(60 * number)
+    yield from ()
+
+
+@pytest.fixture
+def pools(monkeypatch):
+    """Pools of the module that draws scenarios and of the one that converts files."""
+    made = []
+
+    def record_pool(*arguments):
+        made.append(worker_pool(*arguments))
+        return made[-1]
+
+    for module in (generate, spool):
+        monkeypatch.setattr(module, "worker_pool", record_pool)
+    return made
+
+
+def join_threads(others):
+    """Wait for all threads but these; that of a pool learns the exit codes of its workers."""
+    for thread in set(threading.enumerate()) - others:
+        thread.join(20)
+        assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(("task", "arguments"), [(time.sleep, [60]), (send_half, [])])
+def test_workers_end_when_the_block_is_left(task, arguments):
+    threads = set(threading.enumerate())
+    begin = time.monotonic()
+    with pytest.raises(KeyError), worker_pool(1) as pool:
+        pool.submit(on_which_cores, 1).result()  # imports this module
+        pool.submit(task, *arguments)
+        workers = list(pool._processes.values())
+        time.sleep(0.5)
+        raise KeyError
+    join_threads(threads)
+    assert not any(worker.is_alive() for worker in workers)
+    assert time.monotonic() - begin < 40
+
+
+def open_draws(tmp_path):
+    return generate._draws(100_000, 1, generate.Generation(workers=1))
+
+
+def open_conversion(tmp_path):
+    return spool.convert_ahead([(0,), (1,)], sleep_in_conversion, CAPACITIES["default"], 2, tmp_path)
+
+
+@pytest.mark.parametrize("start", [open_draws, open_conversion])
+def test_reader_that_stops_ends_the_workers(start, pools, tmp_path):
+    """A signal, or an error of the reader, closes the generator."""
+    threads = set(threading.enumerate())
+    results = start(tmp_path)
+    next(results)
+    workers = list(pools[0]._processes.values())
+    results.close()
+    join_threads(threads)
+    assert workers and -signal.SIGTERM in [worker.exitcode for worker in workers]
+    assert list(tmp_path.iterdir()) == []

@@ -146,13 +146,20 @@ Observation = dict[str, Any]
 class _Backend:
     """Scenarios on the CPU, simulator and spaces of an environment; both classes of environments use it."""
 
-    def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
+    def __init__(
+        self,
+        data: Scenarios | str | Path | int,
+        task: Task | None,
+        traffic: str | Traffic,
+        trust: Sequence[str],
+    ) -> None:
         bank, self.ids, self.scenarios = _load(data)
         self.task = task or Task()
         if self.task.hold > 1:
             cure = "set hold to 1 and repeat the action"
             raise UsageError(f"the task holds decisions for {self.task.hold} steps", cure=cure)
-        self.simulator = Simulator(self.task, find_traffic(traffic) if isinstance(traffic, str) else traffic)
+        model = find_traffic(traffic, trust) if isinstance(traffic, str) else traffic
+        self.simulator = Simulator(self.task, model)
         cpu = jax.devices("cpu")[0]
         self.bank = jax.device_put(prepare_bank(self.simulator.traffic, bank), cpu)
         self.actions = _action_space(self.task)
@@ -204,15 +211,16 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         render_mode: ``rgb_array`` draws the scenario from above (needs the extra ``show``).
         traffic: Model of the other agents: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
             ``package.module:name``, or a traffic model.
+        trust: Modules outside drivax whose code a policy in the traffic may name.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own spelling)
 
     def __init__(
         self, data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, task: Task | None = None,
-        render_mode: str | None = None, traffic: str | Traffic = "log",
+        render_mode: str | None = None, traffic: str | Traffic = "log", trust: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self._backend = _Backend(data, task, traffic)
+        self._backend = _Backend(data, task, traffic, trust)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
         self.render_mode = _check_render_mode(render_mode)
@@ -286,9 +294,9 @@ class VectorDrivingEnv(VectorEnv):
 
     def __init__(
         self, num_envs: int = 1, data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, task: Task | None = None,
-        render_mode: str | None = None, traffic: str | Traffic = "log",
+        render_mode: str | None = None, traffic: str | Traffic = "log", trust: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self._backend = _Backend(data, task, traffic)
+        self._backend = _Backend(data, task, traffic, trust)
         self.num_envs = num_envs
         self.render_mode = _check_render_mode(render_mode)
         self.single_action_space = self._backend.actions

@@ -230,7 +230,10 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         _check_shapes(ids, arrays, file, data)
         if header.get("sha256", digest) != digest:
             refuse_edited(file, "changed since drivax wrote it")
-        note_edited(*map(str, header.get("edited", ())))
+        edited = header.get("edited", [])
+        if not isinstance(edited, list):
+            raise ValueError("edited is not a list")
+        note_edited(*map(str, edited))
         valid, steps, scenarios = (arrays[name] for name in ("valid", "step_score", "scenario_score"))
         component_names = [name for name in arrays if name.startswith(_COMPONENT)]
         components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 
 from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, cut_counts
-from drivax.reading import MOST_TEXT, read_json
+from drivax.reading import read_json
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
@@ -151,9 +151,9 @@ def spacing_m(features: Sequence[MapFeature]) -> float | None:
     return float(np.median(np.concatenate(gaps))) if gaps else None
 
 
-def load_json(path: Path, most: int = MOST_TEXT) -> Any:
-    """The content of a JSON file of up to ``most`` bytes."""
-    return read_json(path, "download it again", most)
+def load_json(path: Path) -> Any:
+    """The content of a JSON file."""
+    return read_json(path, "download it again")
 
 
 def windows_of(steps: int) -> int:

@@ -41,37 +41,32 @@ def convert_ahead(
     """
     spool = folder / f"spool-{os.getpid()}"
     spool.mkdir()
-    pool = worker_pool(min(workers, len(tasks)))
     waiting: deque[tuple[Path, Future[list[Scenario | BadRecord]]]] = deque()
     remaining = enumerate(tasks)
     try:
-        while True:
-            # Two tasks ahead keep all workers busy and bound the space on the disk.
-            while len(waiting) < workers + 2 and (item := next(remaining, None)) is not None:
-                number, task = item
-                path = spool / f"{number}.records"
-                waiting.append((path, pool.submit(_spool, task, convert, path)))
-            if not waiting:
-                return
-            path, future = waiting.popleft()
-            yield _unspool(future, path, capacity)
-            path.unlink(missing_ok=True)
+        with worker_pool(min(workers, len(tasks))) as pool:
+            while True:
+                # Two tasks ahead keep all workers busy and bound the space on the disk.
+                while len(waiting) < workers + 2 and (item := next(remaining, None)) is not None:
+                    number, task = item
+                    path = spool / f"{number}.records"
+                    waiting.append((path, pool.submit(_spool, task, convert, path)))
+                if not waiting:
+                    return
+                path, future = waiting.popleft()
+                yield _unspool(future, path, capacity)
+                path.unlink(missing_ok=True)
     finally:
-        shutil.rmtree(spool, ignore_errors=True)  # signals workers to stop
-        pool.shutdown(wait=True, cancel_futures=True)
+        shutil.rmtree(spool, ignore_errors=True)
 
 
 def _spool(
     task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
 ) -> list[Scenario | BadRecord]:
-    """Run one task in a worker: write its records to ``path``, return the other fields; stop if the file is removed."""
+    """Run one task in a worker: write its records to ``path``, return the other fields."""
     items: list[Scenario | BadRecord] = []
-    if not path.parent.is_dir():
-        return items
     with path.open("wb") as file:
         for item in convert(*task):
-            if not path.exists():
-                break
             if isinstance(item, Scenario):
                 file.write(item.record.tobytes())
             items.append(replace(item, record=_SPOOLED) if isinstance(item, Scenario) else item)

@@ -43,8 +43,8 @@ NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.s
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
-#: Largest ``episodes.csv``, and largest trajectories: bytes of all, and more per episode than any capacity takes.
-_MOST_TABLE, _MOST_BYTES, _MOST_EPISODE_BYTES = 256 << 20, 16 << 20, 1 << 20
+#: Largest trajectories: bytes of all, and more per episode than any capacity takes.
+_MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
@@ -122,7 +122,8 @@ class EpisodeTable:
             )
         keys, metrics = _read_columns(run.path / "episodes.csv")
         crashes = _read_crashes(run.path / "crashes.json")
-        check_seal(run.path / CONFIG_FILE)
+        for file in (CONFIG_FILE, "summary.json"):
+            check_seal(run.path / file)
         name = mark_edited(str(run.info.get("planner", run.path.name)), edited_files(run.path))
         return cls(run.path, name, run.info | {"planner": name}, keys, metrics, crashes)
 
@@ -300,7 +301,7 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    text = read_text(existing(path, _RERUN), _RERUN, _MOST_TABLE)
+    text = read_text(existing(path, _RERUN), _RERUN)
     with explain_damage(path, _RERUN, "cannot be read"):
         rows = csv_rows(text)
     header = rows[0] if rows else []
@@ -349,6 +350,7 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
     """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
+    check_seal(path)
     archive = read_arrays(path, _RERUN, _MOST_BYTES + len(scenario_ids) * _MOST_EPISODE_BYTES)
     with explain_damage(path, _RERUN, "cannot be read"):
         ids = [_text(value) for value in archive["scenario_id"]]

@@ -260,13 +260,13 @@ def _resumed_folders(
         UsageError: Data or options differ from those of the run, or it names code that is not trusted.
     """
     folder = RunFolder.open(out)
-    previous = {"data": [entry.get("hash") for entry in folder.info.get("data", [])]}
+    previous = {"data": [entry.get("hash") for entry in folder.info.get("data") or ()]}
     previous |= {name: folder.info.get(name) for name in ("validation", "weights")}
     for name, value in {"data": [data.hash], **notes}.items():
         if previous[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
             raise UsageError(problem, file=out, cure=f"resume with the same {option}")
-    config, count = folder.config(TrainConfig, trust=trust), folder.info.get("seeds", 1)
+    config, count = folder.config(TrainConfig, trust=trust), folder.info.get("seeds") or 1
     if seeds not in (1, count):
         raise UsageError(f"contains {count} seeds, not {seeds}", file=out, cure="resume without --seeds")
     if folder.kind != "seeds":
@@ -375,7 +375,8 @@ def _restore(run: _Run, logs: Sequence[TrainingLog]) -> tuple[int | None, list[A
         return step, states
     if errors:
         raise errors[0]
-    if any(steps):
+    # A process that is killed at the first checkpoint has written that of some seeds.
+    if all(steps) or max(map(len, steps)) > 1:
         problem = "the seeds have no checkpoint of the same step"
         raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
     return None, []

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from drivax.errors import UsageError
+from drivax.files import replace_folder
 from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import PlannerTraffic, with_driver
+from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.seal import seal
 from drivax.simulator.traffic.log import LogTraffic
@@ -63,8 +65,9 @@ def load_policy(
     """
     folder = open_policy(run)
     config = folder.config(TrainConfig, _AS_LOGGED, trust)
-    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
-    template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    with explain_damage(folder.path / "config.yaml", "fix the settings", "makes no policy"):
+        learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+        template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
         name = folder.path.name if step is None else f"{folder.path.name}@{step}"
@@ -102,22 +105,24 @@ def export_policy(
     step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step, trust=trust)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
-    data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
+    data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step
     config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
-    exported = RunFolder.create(out, config, overwrite=overwrite).note(**about)
-    pack(exported.path / POLICY_FILE, planner)
-    seal(exported.path, POLICY_FILE)
-    return exported
+    RunFolder.check(Path(out), overwrite)
+    with replace_folder(Path(out)) as partial_folder:
+        exported = RunFolder.create(partial_folder, config, overwrite=True).note(**about)
+        pack(partial_folder / POLICY_FILE, planner)
+        seal(partial_folder, POLICY_FILE)
+    return RunFolder(Path(out), exported.info)
 
 
 @dataclass(frozen=True)
 class PolicyTraffic(PlannerTraffic):
     """Traffic in which the policy of a folder drives the vehicles nearest to ego, made by :func:`policy_traffic`."""
 
-    run: str = ""
+    run: str = field(kw_only=True)
     samples: bool = False
     trust: tuple[str, ...] = ()
 

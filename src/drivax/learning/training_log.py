@@ -189,8 +189,10 @@ class TrainingLog:
         Later rows and checkpoints, and files of killed processes, are deleted.
         """
         self.checkpoints.drop_after(-1 if step is None else step)
-        for leftover in self.folder.path.glob(".*.partial-*"):
-            leftover.unlink()
+        for leftover in self.folder.path.glob(".*.partial*"):
+            if leftover.is_file():
+                leftover.unlink()
+        self._ranks = []
         if step is not None:
             self._read_ranks(step)
         unseal(self.folder.path, self.folder.metrics.name)

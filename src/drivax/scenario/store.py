@@ -65,6 +65,8 @@ MANIFEST = "manifest.json"
 AGAIN = "convert or generate the set again"
 #: Bytes at the beginning of a record that hold its names.
 _PAGE = 4096
+#: Bytes of the largest manifest that is read, of some 500,000 scenarios; sparse shards may claim any size.
+_MOST_MANIFEST = 1 << 30
 #: Scenarios that an iteration reads at a time, and those of a task of a thread.
 _BATCH, _PART = 64, 8
 #: Threads map a shard once.
@@ -396,6 +398,8 @@ class Shard:
         for path in (self.path, self.crc_path):
             if not path.is_file():
                 raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
+        if self.crc_path.stat().st_size > _PAGE + 4 * self.count:  # A header is shorter than a page.
+            raise self._other_checksums()
         self._check_file("crc_sha256")
         with self.path.open("rb") as file:
             shape, dtype = read_header(file, self.path)
@@ -457,13 +461,16 @@ class Shard:
             shape, dtype = read_header(file, self.crc_path)
             crcs = file.read()
         if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
-            raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
+            raise self._other_checksums()
         self._crcs = np.frombuffer(crcs, np.uint32)
         # A plain view: indexing a memmap costs Python time. Set last, since several threads may read.
         self._data = np.asarray(
             np.memmap(self.path, np.uint8, "r", offset, (self.count, self._dtype.itemsize))
         )
         return self._data
+
+    def _other_checksums(self) -> DataError:
+        return DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
 
     def _damage(self, problem: str, record: int) -> DataError:
         return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
@@ -507,7 +514,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     check_seal(file)
     # A manifest is shorter than the records that it lists.
     most = sum(shard.stat().st_size for shard in path.glob("shard-*.npy") if shard.is_file())
-    text = read_bytes(file, AGAIN, max(MOST_TEXT, most))
+    text = read_bytes(file, AGAIN, min(max(MOST_TEXT, most), _MOST_MANIFEST))
     with explain_damage(file, AGAIN, "manifest is damaged"):
         manifest = json.loads(text)
         version = manifest["schema_version"]

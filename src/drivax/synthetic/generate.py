@@ -302,21 +302,19 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
         yield from _draw_chunk(0, scenarios, seed, options)
         return
     spans = _spans(scenarios, options.workers)
-    pool = worker_pool(min(options.workers, len(spans)))
     waiting: deque[Future[list[_Draw]]] = deque()
     try:
-        for first, last in spans:
-            with portable_workers():  # processes are started as they are needed
-                waiting.append(pool.submit(_draw_in_worker, first, last, seed, options))
-            if len(waiting) > _AHEAD * options.workers:
+        with worker_pool(min(options.workers, len(spans))) as pool:
+            for first, last in spans:
+                with portable_workers():  # processes are started as they are needed
+                    waiting.append(pool.submit(_draw_in_worker, first, last, seed, options))
+                if len(waiting) > _AHEAD * options.workers:
+                    yield from waiting.popleft().result()
+            while waiting:
                 yield from waiting.popleft().result()
-        while waiting:
-            yield from waiting.popleft().result()
     except BrokenProcessPool as error:
         await_interrupt()
         raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True)

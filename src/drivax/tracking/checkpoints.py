@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
+import sys
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -24,7 +26,7 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, replace_folder, sync_folder, write_text
-from drivax.reading import read_arrays
+from drivax.reading import check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
 ABOUT = "about.json"
@@ -50,7 +52,7 @@ class Checkpoints:
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
         names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
-        return sorted(int(name) for name in names if name.isdecimal())
+        return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
     def best(self) -> int | None:
         """Return the step with the highest score, the latest if several are equal; None without scores.
@@ -78,19 +80,17 @@ class Checkpoints:
         if not path.is_dir():
             cure = f"available steps: {available or 'none'}"
             raise DataError(f"no checkpoint of step {step}", file=self.folder, cure=cure)
-        try:
-            about = json.loads((path / ABOUT).read_bytes())
+        about = read_json(path / ABOUT, _OTHER)
+        with explain_damage(path / ABOUT, _OTHER):
             crc = about.pop("crc", None)
             if (crc is not None or "files" in about) and crc != _checksum(about):
                 raise ValueError("checksum mismatch")
+            if about["step"] != step:
+                raise ValueError(f"it is of step {about['step']}")
+            _check_types(about)
             for leaf in about["leaves"]:
                 leaf["name"] = _current_name(leaf["name"])
-            if about["step"] != step or "score" not in about:
-                raise ValueError(f"it has no score, or is of step {about['step']}")
-            return about
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            reason = "missing" if isinstance(error, FileNotFoundError) else f"damaged ({error!r})"
-            raise DataError(f"is {reason}", file=path / ABOUT, cure=_OTHER) from error
+        return about
 
     def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
         """Write a checkpoint as :meth:`write` does, and delete superseded ones."""
@@ -169,8 +169,7 @@ class Checkpoints:
         part_leaves = [leaf for leaf in stored_leaves if is_part(leaf["name"], templates)]
         _compare(path, part_leaves, requested_leaves, cure)
         _check_files(path, about.get("files", {}))
-        names = [leaf["name"] for leaf in stored_leaves]
-        arrays = dict(zip(names, _load_arrays(path, stored_leaves), strict=True))
+        arrays = _load_arrays(path, stored_leaves, dict(requested_leaves))
         values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested_leaves])
         return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
 
@@ -226,16 +225,31 @@ def _file_crc(file: IO[bytes]) -> int:
     return crc
 
 
+def _check_types(about: Mapping[str, Any]) -> None:
+    """Raise ValueError if ``about.json`` has other types than :meth:`Checkpoints.write` writes."""
+    score, files = about["score"], about.get("files", {})
+    scores = score if isinstance(score, list) else [score or 0.0]
+    if not all(isinstance(number, int | float) for number in scores) or not isinstance(files, dict):
+        raise ValueError("scores or files of other types")
+    for leaf in about["leaves"]:
+        types = {name: type(leaf[name]) for name in ("name", "type", "shape", "crc")}
+        if types != {"name": str, "type": str, "shape": list, "crc": int}:
+            raise ValueError("a leaf of other types")
+
+
 def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing or damaged."""
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, or no regular file."""
+    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if not file.is_dir()}
+    for file in files.values():
+        check_regular(file, _OTHER)
     for name, expected in checksums.items():
-        try:
-            with (path / name).open("rb") as file:
+        with explain_damage(path / name, _OTHER):
+            if name not in files:  # A stranger's checkpoint may name files outside.
+                raise FileNotFoundError
+            with files[name].open("rb") as file:
                 crc = _file_crc(file)
-        except OSError as error:
-            raise DataError(f"cannot be read ({error.strerror})", file=path / name, cure=_OTHER) from error
-        if crc != expected:
-            raise DataError("is damaged (checksum mismatch)", file=path / name, cure=_OTHER)
+            if crc != expected:
+                raise ValueError("checksum mismatch")
 
 
 def pack(file: Path, tree: Any) -> None:
@@ -320,30 +334,70 @@ def _compare(
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
     import orbax.checkpoint as ocp
 
-    with ocp.StandardCheckpointer() as checkpointer:
+    with _silence_writers(), ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.resolve(), arrays)
 
 
-def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[Any, Any]]:
-    """Read the arrays of all leaves, and verify their checksums."""
+@contextlib.contextmanager
+def _silence_writers() -> Iterator[None]:
+    """Raise the first error of a write alone: Orbax logs it too, and TensorStore prints one for each array."""
+    logger, report = logging.getLogger("absl"), sys.unraisablehook
+    level = logger.level
+
+    def report_other(lost: sys.UnraisableHookArgs) -> None:
+        if str(lost.exc_value) != "Event loop is closed":
+            report(lost)
+
+    logger.setLevel(logging.CRITICAL)
+    try:
+        sys.unraisablehook = report_other
+        yield
+        sys.unraisablehook = report  # not after an error: late arrays still fail
+    finally:
+        logger.setLevel(level)
+
+
+def _load_arrays(
+    path: Path, leaves: list[dict[str, Any]], templates: Mapping[str, Any]
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Read the arrays of the template's leaves by name, and verify their checksums.
+
+    Memory depends only on the template, since a stranger's checkpoint may state any size.
+    """
     import orbax.checkpoint as ocp
 
+    numbers = {leaf["name"]: f"{number:05d}" for number, leaf in enumerate(leaves)}
+    arrays = {name: _zeros(leaf) for name, leaf in templates.items()}
+    nonempty = {numbers[name]: array for name, array in arrays.items() if array.size}
     restored_arrays: dict[str, Any] = {}
     try:
-        templates = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
-        nonempty = {f"{number:05d}": array for number, array in enumerate(templates) if array.size}
         if nonempty:
-            with ocp.StandardCheckpointer() as checkpointer:
-                restored_arrays = checkpointer.restore((path / _ARRAYS).resolve(), nonempty)
+            folder, types = (path / _ARRAYS).resolve(), ocp.checkpoint_utils.construct_restore_args(nonempty)
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                _check_shapes(checkpointer.metadata(folder).item_metadata.tree, nonempty)
+                request = ocp.args.PyTreeRestore(nonempty, types, partial_restore=True)
+                restored_arrays = checkpointer.restore(folder, args=request)
     except Exception as error:
         raise DataError(f"arrays cannot be read ({error})", file=path, cure=_OTHER) from error
-    arrays = [
-        np.asarray(restored_arrays.get(f"{number:05d}", array)) for number, array in enumerate(templates)
-    ]
-    for array, leaf in zip(arrays, leaves, strict=True):
-        if zlib.crc32(array.tobytes()) != leaf["crc"]:
-            raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure=_OTHER)
+    arrays = {name: np.asarray(restored_arrays.get(numbers[name], array)) for name, array in arrays.items()}
+    for leaf in leaves:
+        if (name := leaf["name"]) in arrays and zlib.crc32(arrays[name].tobytes()) != leaf["crc"]:
+            raise DataError(f"checksum mismatch in {name}", file=path, cure=_OTHER)
     return arrays
+
+
+def _zeros(leaf: Any) -> np.ndarray[Any, Any]:
+    """Return zeros of the shape and type in which a leaf is stored."""
+    if _is_key(leaf):
+        leaf = jax.eval_shape(jax.random.key_data, leaf)
+    return np.zeros(np.shape(leaf), getattr(leaf, "dtype", type(leaf)))
+
+
+def _check_shapes(stored_arrays: Mapping[str, Any], arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
+    """Raise ValueError for the first array that is stored in another shape, which Orbax would allocate."""
+    for number, array in arrays.items():
+        if tuple(stored_arrays[number].shape) != array.shape:
+            raise ValueError(f"array {number} has shape {stored_arrays[number].shape}, not {array.shape}")
 
 
 def _rebuild(array: np.ndarray[Any, Any], template: Any) -> Any:

@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
-from drivax.files import check_output, replace_folder, restore_folder, write_text
+from drivax.files import check_output, refuse_link, replace_folder, restore_folder, write_text
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
@@ -37,10 +38,15 @@ _ZOO_FOLDER = Path(__file__).resolve().parent.parent / "zoo"
 _RERUN = "run the command again"
 #: Types of the entries of ``run.json`` that are read again.
 _ENTRIES: dict[str, Any] = {
-    **dict.fromkeys(("kind", "planner", "traffic", "started", "command"), str),
-    **dict.fromkeys(("own_metrics", "networks_from", "versions"), dict), "data": list | dict, "trained_on": list,
+    **dict.fromkeys(("kind", "planner", "traffic", "started", "command", "weights"), str),
+    **dict.fromkeys(("own_metrics", "networks_from", "versions", "divergence"), dict), "data": list | dict,
+    **dict.fromkeys(("trained_on", "edited"), list), "seeds": int, "validation": str | dict,
 }  # fmt: skip
 _TRAINING_KINDS = ("training", "seeds")
+#: Kinds of runs whose data sets have hashes; tables of other programs may lack them.
+_HASHED_KINDS = (*_TRAINING_KINDS, "policy", "study")
+#: Far more seeds than a device trains; resuming creates a folder for each.
+_MOST_SEEDS = 10_000
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 Record = TypeVar("Record")
@@ -153,14 +159,18 @@ class RunFolder:
         """Add entries to ``run.json``, and return the updated run folder."""
         updated_info = self.info | info
         unseal(self.path, RUN_FILE)
-        write_text(self.path / RUN_FILE, _json(updated_info))
+        write_text(self.path / RUN_FILE, _json(updated_info), follow=False)
         seal(self.path, RUN_FILE)
         return RunFolder(self.path, updated_info)
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
-        return self.path / "checkpoints"
+        """Folder of the checkpoints.
+
+        Raises:
+            DataError: It is a symbolic link.
+        """
+        return refuse_link(self.path / "checkpoints")
 
     @property
     def metrics(self) -> Path:
@@ -195,9 +205,26 @@ def _check_info(info: Any) -> None:
     for name, kind in _ENTRIES.items():
         if not isinstance(info.get(name), kind | None):
             raise ValueError(f"{name} is not of type {kind}")
+    _check_data(info)
+    validation, divergence = info.get("validation"), info.get("divergence")
+    for recording in validation["recordings"] if isinstance(validation, dict) else ():
+        if [*map(type, recording)] != [str, str]:
+            raise ValueError("a recording that is not named by its data set and its segment")
+    if divergence is not None and [type(divergence[name]) for name in ("step", "problem")] != [int, str]:
+        raise ValueError("a divergence without its step or problem")
+    if not 1 <= (info.get("seeds") or 1) <= _MOST_SEEDS:
+        raise ValueError(f"{info['seeds']} seeds")
+
+
+def _check_data(info: Mapping[str, Any]) -> None:
+    """Check the data sets in ``run.json``."""
+    is_hashed = info.get("kind") in _HASHED_KINDS
+    hash_type: Any = str if is_hashed else str | None
+    if is_hashed and isinstance(info.get("data"), dict):
+        raise ValueError("data is not a list")
     for data in (info.get("data"), info.get("trained_on"), (info.get("networks_from") or {}).get("data")):
         for entry in [data] if isinstance(data, dict) else data or ():
-            if not isinstance(entry, dict) or not isinstance(entry.get("hash"), str | None):
+            if not isinstance(entry, dict) or not isinstance(entry.get("hash"), hash_type):
                 raise ValueError("a data set without its hash")
 
 
@@ -211,7 +238,9 @@ def seed_folders(path: str | Path) -> list[Path]:
     if _kind(path) != "seeds":
         return [path]
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
-    return sorted(folders, key=lambda folder: int(folder.name.removeprefix("seed-")))
+    seeds = {folder: re.fullmatch(r"seed-(-?\d+)", folder.name) for folder in folders}
+    numbers = {folder: int(match[1]) for folder, match in seeds.items() if match}
+    return sorted(numbers, key=numbers.__getitem__)
 
 
 def _kind(path: Path) -> str | None:
@@ -272,7 +301,8 @@ def learned_from(planner: str) -> list[dict[str, Any]]:
 def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the data sets in the ``run.json`` of a training run without duplicates, its own sets first."""
     by_hash: dict[str, dict[str, Any]] = {}
-    for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
+    networks_from = info.get("networks_from") or {}
+    for entry in (*(info.get("data") or ()), *(networks_from.get("data") or ())):
         by_hash.setdefault(entry["hash"], entry)
     return list(by_hash.values())
 

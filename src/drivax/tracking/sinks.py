@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from drivax.errors import DataError
-from drivax.files import sync_and_close, write_text
+from drivax.files import refuse_link, sync_and_close, write_text
 from drivax.reading import DAMAGE, read_text
-
-_MOST_LOG = 256 << 20
 
 
 class JsonLines:
@@ -30,7 +28,9 @@ class JsonLines:
         self.path = Path(file)
         if resume_step is not None and self.path.exists():
             lines = [line for line, row in _rows(self.path) if row["step"] <= resume_step]
-            write_text(self.path, "".join(lines))
+            write_text(self.path, "".join(lines), follow=False)
+        elif self.path.is_symlink():
+            self.path.unlink()
         self._file = self.path.open("wb" if resume_step is None else "ab")
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
@@ -80,12 +80,13 @@ class MetricLog:
         self, folder: str | Path, resume_step: int | None = None, tensorboard: bool | None = None
     ) -> None:
         folder = Path(folder)
+        events = refuse_link(folder / "tensorboard")
         self._rows = JsonLines(folder / "metrics.jsonl", resume_step)
         self.sinks: list[JsonLines | TensorBoard] = [self._rows]
         if tensorboard is None:
             tensorboard = importlib.util.find_spec("tensorboardX") is not None
         if tensorboard:
-            self.sinks.append(TensorBoard(folder / "tensorboard", resume_step))
+            self.sinks.append(TensorBoard(events, resume_step))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Log the numbers of one step."""
@@ -120,7 +121,7 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
 
 def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield every line with its row; an incomplete last line is ignored."""
-    lines = read_text(file, "train again", _MOST_LOG).splitlines(keepends=True)
+    lines = read_text(file, "train again").splitlines(keepends=True)
     for number, line in enumerate(lines):
         try:
             row = json.loads(line)

@@ -22,7 +22,27 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPoolExecutor:
+class WorkerPool(ProcessPoolExecutor):
+    """A pool whose workers end at once if the ``with`` block does not reach its end."""
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """Wait for the workers, or after an exception (a signal reaches this process alone) terminate them."""
+        if kind is not None:
+            self._stop()
+        self.shutdown()
+
+    def _stop(self) -> None:
+        running = list((self._processes or {}).values())
+        results: Any = self._result_queue
+        self.shutdown(wait=False, cancel_futures=True)
+        results._writer.close()  # else the pool's thread waits for the rest of a result that a worker began to send
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.join()
+
+
+def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
     """Return a pool of spawned processes that exit silently on Ctrl-C, and when their parent is killed.
 
     Each process is bound to one of ``cores``, if given.
@@ -35,7 +55,7 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPool
             core_queue = processes.SimpleQueue()
             for core in cores:
                 core_queue.put(core)
-        return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(core_queue,))
+        return WorkerPool(workers, processes, initializer=_start, initargs=(core_queue,))
     except OSError as error:  # it names no file
         if error.errno not in _NO_SHARED_MEMORY:
             raise
@@ -55,15 +75,8 @@ def one_core_each(
     available = sorted(os.sched_getaffinity(0))[:cores]
     with worker_pool(len(available), available) as pool:
         futures = {pool.submit(call, task): task for task in tasks}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            running = list((pool._processes or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in running:  # a signal reached this process alone
-                process.terminate()
-            raise
+        for future in as_completed(futures):
+            yield futures[future], future.result()
 
 
 def await_interrupt() -> None:

@@ -48,8 +48,6 @@ class Box:
 
 
 _AGAIN = "unpack the map expansion again"
-#: Largest map of a city, bytes.
-_MOST_BYTES = 256 << 20
 #: Layers that are read, row by row, and others of the map expansion.
 _LAYERS = (
     "line", "polygon", "drivable_area", "lane", "lane_connector", "lane_divider", "road_divider", "ped_crossing",
@@ -109,7 +107,7 @@ class City:
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
     """The map in a file of the map expansion (v1.2 or later)."""
-    content = load_json(path, _MOST_BYTES)
+    content = load_json(path)
     try:
         return _Layers(content).city()
     except DataError as error:
