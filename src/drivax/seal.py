@@ -17,7 +17,6 @@ from typing import Any
 
 from drivax.errors import DataError
 from drivax.files import write_json
-from drivax.reading import check_regular, explain_damage, read_bytes
 
 SEAL = "seal.json"
 #: Ends the name of a planner in tables that are made with edited files.
@@ -110,6 +109,8 @@ def mark_edited(name: str, edited: object) -> str:
 
 def _digest(file: Path) -> str | None:
     """Return the SHA-256 of a file (hex); None without the file."""
+    from drivax.reading import check_regular, explain_damage  # imports NumPy, which --help does not wait for
+
     if not file.exists():
         return None
     check_regular(file, _RESTORE)
@@ -121,6 +122,8 @@ def _digest(file: Path) -> str | None:
 
 def _read(file: Path) -> dict[str, Any]:
     """Return the entries of a seal; none without one."""
+    from drivax.reading import read_bytes
+
     data = read_bytes(file, _RESTORE, _MOST_BYTES) if file.exists() else b"{}"
     with contextlib.suppress(ValueError, RecursionError):
         entries = json.loads(data)

@@ -96,7 +96,11 @@ def test_overrides_reach_the_command(probe: Any):
             "/x: permission denied; change the permissions of the file or of its folder, or choose another",
             1,
         ),
-        (OSError(28, "No space left on device"), "No space left on device", 1),
+        (
+            OSError(28, "No space left on device"),
+            "no space left on device; make room, or choose another disk",
+            1,
+        ),
         (
             ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot"),
             "matplotlib is not installed; pip install 'drivax[show]'",

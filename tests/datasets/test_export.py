@@ -92,7 +92,7 @@ def test_ids_that_are_unknown(stored, tmp_path, text, said):
         export(stored, tmp_path / "part", Export(ids=file))
     assert raised.value.file == file and raised.value.cure
     assert listing(tmp_path) == ["ids.txt"]
-    with pytest.raises(DataError, match="No such file"):
+    with pytest.raises(DataError, match="file not found"):
         export(stored, tmp_path / "part", Export(ids=tmp_path / "none"))
 
 
