@@ -227,13 +227,10 @@ class Bench:
         command = self.commands[name]
         replaces = command.overwrite and self._exists(command) and self.rng.random() < 0.5
         complete = replaces and all((self.work / output).exists() for output in command.outputs)
-        for share in _SHARES:
-            # An unfinished run or study is continued.
-            if not replaces and (command.overwrite or not self._differences(name)):
-                self.remove(command)
-            process = self._run_until(name, share)
-            if process.poll() is None:
-                break
+        shares = iter(_SHARES)
+        process = self._run_until(name, next(shares), replaces)
+        while process.poll() is not None and (share := next(shares, None)):
+            process = self._run_until(name, share, replaces)
         self._apply(fault, process)
         try:
             error = process.communicate(timeout=_RUN_S if fault in ("full", "worker") else _STOP_S)[1]
@@ -248,11 +245,15 @@ class Bench:
         if complete:
             self.problems += [f"{name}, {fault}: replaced {line}" for line in self._differences(name)]
 
-    def _run_until(self, name: str, share: float) -> subprocess.Popen[str]:
+    def _run_until(self, name: str, share: float, replaces: bool) -> subprocess.Popen[str]:
         """Start a command and wait until a random moment in this share of its time, after its first file or not."""
+        command = self.commands[name]
+        # An unfinished run or study is continued.
+        if not replaces and (command.overwrite or not self._differences(name)):
+            self.remove(command)
         first, whole = self.rng.choice(((0.0, self.seconds[name][1]), self.seconds[name]))
         before = _paths(self.work)
-        process = self._start(self.commands[name])
+        process = self._start(command)
         if first:
             self._wait_for_file(process, before)
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -12,28 +12,22 @@ from experiment_scripts import load_script
 
 robustness = load_script("robustness")
 
-#: Writes OUT/data through a hidden folder; faults of its own by the second argument.
+#: Writes a folder in one step, unless the second argument names a fault.
 PROGRAM = """
-import json, os, shutil, sys, time
+import contextlib, json, os, sys, time
 from pathlib import Path
+from drivax.files import replace_folder
 
 out, fault = Path(sys.argv[1]), sys.argv[2]
-partial = out if fault == "direct" else out.with_name(f".{out.name}.partial")
-shutil.rmtree(partial, ignore_errors=True)
-partial.mkdir()
-try:
+if fault == "direct":
+    out.mkdir(exist_ok=True)
+with contextlib.nullcontext(out) if fault == "direct" else replace_folder(out) as folder:
     for number in range(20):
-        (partial / "data").write_bytes(os.urandom(10) if fault == "random" else b"x" * 10 * number)
+        (folder / "data").write_bytes(os.urandom(10) if fault == "random" else b"x" * 10 * number)
         time.sleep(0.01)
-    (partial / "run.json").write_text(json.dumps({"started": time.time(), "kind": "training"}))
-    if partial != out:
-        shutil.rmtree(out, ignore_errors=True)
-        partial.rename(out)
-    if fault == "litter":
-        out.with_name(".left").touch()
-except OSError as error:
-    shutil.rmtree(partial)
-    sys.exit(f"drivax: {error}")
+    (folder / "run.json").write_text(json.dumps({"started": time.time(), "kind": "training"}))
+if fault == "litter":
+    out.with_name(".left").touch()
 """
 
 
