@@ -54,7 +54,8 @@ VOLATILE = {
 }
 #: The same in pages: times, command lines, and the curve of the training's speed.
 _VOLATILE_HTML = re.compile(
-    rb"\d{4}-\d\d-\d\dT[\d:.+]+|<td>__main__\.py [^<]*|<figcaption>steps_per_second</figcaption>.*?</figure>",
+    rb"\d{4}-\d\d-\d\dT[\d:.+]+|(?:<td>|&quot;)__main__\.py .*?(?:</td>|&quot;)"
+    rb"|<figcaption>steps_per_second</figcaption>.*?</figure>",
     re.DOTALL,
 )
 _IGNORED_FOLDERS = {"tensorboard", "arrays"}

@@ -409,7 +409,7 @@ def test_a_damaged_packed_tree_is_reported(tmp_path: Path):
 
 
 FAILING_WRITE = """
-import resource, sys, time
+import logging, resource, sys, time
 from pathlib import Path
 import numpy as np
 from drivax.tracking import checkpoints
@@ -421,6 +421,7 @@ try:
     checkpoints._save_arrays(path / "failed", arrays)
 except Exception as error:
     print(type(error).__name__)
+logging.getLogger("absl").error("of a late thread")
 time.sleep(0.5)
 """
 

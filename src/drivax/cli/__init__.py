@@ -166,7 +166,8 @@ def _stop_at_signals() -> Iterator[None]:
             signal.signal(number, stop)
         yield
     finally:
-        sys.unraisablehook = report_unraisable
+        if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
+            sys.unraisablehook = report_unraisable
         for number in handled:
             signal.signal(number, signal.SIG_DFL)
 

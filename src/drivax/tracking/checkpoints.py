@@ -349,12 +349,11 @@ def _silence_writers() -> Iterator[None]:
             report(lost)
 
     logger.setLevel(logging.CRITICAL)
-    try:
-        sys.unraisablehook = report_other
-        yield
-        sys.unraisablehook = report  # not after an error: late arrays still fail
-    finally:
-        logger.setLevel(level)
+    sys.unraisablehook = report_other
+    yield
+    # Not after an error or an interruption, because threads of Orbax still run and fail.
+    logger.setLevel(level)
+    sys.unraisablehook = report
 
 
 def _load_arrays(
