@@ -17,12 +17,12 @@ JAX := $(shell sed -n 's/^jax==\([^ ]*\).*/\1/p' requirements.lock)
 # Each process takes neighbouring files, because the tests of a file share compiled programs.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test test-all coverage lint docs bench setup lock hooks clean
+.PHONY: help demo test test-all soak coverage lint docs bench setup lock hooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
-	@echo "targets: demo  test  test-all  coverage  lint  docs  bench  setup  lock  hooks  clean"
+	@echo "targets: demo  test  test-all  soak  coverage  lint  docs  bench  setup  lock  hooks  clean"
 
 setup: $(STAMP)
 
@@ -48,6 +48,11 @@ test: $(STAMP)
 
 test-all: $(STAMP)
 	DRIVAX_OPTIMISED=1 $(PYTEST) $(ARGS)
+
+MINUTES ?= 60
+
+soak: $(STAMP)
+	$(BIN)/python -m experiments.robustness soak --minutes $(MINUTES) $(ARGS)
 
 coverage: $(STAMP)
 	$(PYTEST) -m "not slow" --cov=drivax --cov-report=term:skip-covered $(ARGS)

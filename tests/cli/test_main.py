@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 from typing import Any
@@ -179,3 +182,22 @@ def test_closed_pipe_is_not_an_error():
     pipeline = f"'{sys.executable}' -m drivax --help | head -c 1"
     result = subprocess.run(["bash", "-c", pipeline], capture_output=True, text=True, check=False)
     assert (result.stdout, result.stderr) == ("d", "")
+
+
+class Callback:
+    """Its finaliser is a callback: Python drops what a signal handler raises in it."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __del__(self):
+        os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_signals_in_callbacks_are_not_lost(number):
+    with pytest.raises(KeyboardInterrupt) as stopped, cli._stop_at_signals():
+        Callback(number)
+        time.sleep(5)
+        raise AssertionError(f"{number.name} was lost")
+    assert getattr(stopped.value, "signal", signal.SIGINT) == number

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -419,3 +421,28 @@ def test_links_in_place_of_checkpoints_are_no_checkpoints(tmp_path: Path):
     assert [entry.name for entry in checkpoints.folder.iterdir()] == ["step-000000001"]
     checkpoints.save(2, {"a": 5})
     assert elsewhere.restore({"a": 0}) == {"a": 2} and checkpoints.restore({"a": 0}) == {"a": 5}
+
+
+FAILING_WRITE = """
+import logging, resource, sys, time
+from pathlib import Path
+import numpy as np
+from drivax.tracking import checkpoints
+
+path, arrays = Path(sys.argv[1]), {str(number): np.zeros(1000) for number in range(40)}
+checkpoints._save_arrays(path / "whole", arrays)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+try:
+    checkpoints._save_arrays(path / "failed", arrays)
+except Exception as error:
+    print(type(error).__name__)
+logging.getLogger("absl").error("of a late thread")
+time.sleep(0.5)
+"""
+
+
+def test_failing_write_prints_no_tracebacks(tmp_path: Path):
+    """No file may grow: all arrays fail, as on a full disk."""
+    command = [sys.executable, "-c", FAILING_WRITE, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.stdout.strip() == "ValueError" and result.stderr == ""

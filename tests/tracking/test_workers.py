@@ -64,6 +64,21 @@ def on_which_cores(number):
     return number, len(os.sched_getaffinity(0))
 
 
+def test_closed_terminal_ends_a_pool_silently(tmp_path):
+    """SIGHUP reaches the whole process group, Python's tracker of semaphores included."""
+    end = "import signal; signal.signal(signal.SIGHUP, lambda *_: sys.exit(129)); print(1, flush=True); time.sleep(60)"
+    (tmp_path / "program.py").write_text(PROGRAM.format(end=end))
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "program.py")], text=True, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert [process.stdout.readline() for _ in range(2)] == ["ready\n", "1\n"]
+    os.killpg(process.pid, signal.SIGHUP)
+    assert process.communicate(timeout=60)[1] == "" and process.returncode == 129
+    assert group_is_gone(process.pid, 10.0)
+
+
 def test_each_task_has_one_core():
     assert sorted(one_core_each(on_which_cores, [3, 1, 2], cores=2)) == [(n, (n, 1)) for n in (1, 2, 3)]
 

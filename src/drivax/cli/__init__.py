@@ -44,6 +44,8 @@ class Command:
 _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of help that is not printed to a terminal.
 _COLUMNS = 100
+#: A callback ends within this time (s).
+_CALLBACK_S = 0.01
 COMMANDS = {
     "demo": Command(
         "drivax.cli.demo",
@@ -138,6 +140,7 @@ def _stop_at_signals() -> Iterator[None]:
     A signal that the process ignores already (nohup) stays so. Threads but the main one have no signals.
     """
     handled: list[signal.Signals] = []
+    report_unraisable = sys.unraisablehook
     if threading.current_thread() is threading.main_thread():
         signals = (signal.SIGTERM, signal.SIGHUP)
         handled = [number for number in signals if signal.getsignal(number) == signal.SIG_DFL]
@@ -147,11 +150,24 @@ def _stop_at_signals() -> Iterator[None]:
             signal.signal(other, signal.SIG_IGN)
         raise Stopped(signal.Signals(number))
 
+    def stop_later(lost: sys.UnraisableHookArgs) -> None:
+        # Python drops what is raised in a callback, such as JAX's of the garbage collector.
+        if not isinstance(error := lost.exc_value, KeyboardInterrupt):
+            report_unraisable(lost)
+            return
+        for number in handled:
+            signal.signal(number, stop)
+        number = error.signal if isinstance(error, Stopped) else signal.SIGINT
+        threading.Timer(_CALLBACK_S, os.kill, (os.getpid(), number)).start()
+
     try:
+        sys.unraisablehook = stop_later
         for number in handled:
             signal.signal(number, stop)
         yield
     finally:
+        if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
+            sys.unraisablehook = report_unraisable
         for number in handled:
             signal.signal(number, signal.SIG_DFL)
 

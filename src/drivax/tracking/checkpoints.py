@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
+import sys
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -339,8 +341,26 @@ def _compare(
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
     import orbax.checkpoint as ocp
 
-    with ocp.StandardCheckpointer() as checkpointer:
+    with _silence_writers(), ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.resolve(), arrays)
+
+
+@contextlib.contextmanager
+def _silence_writers() -> Iterator[None]:
+    """Raise the first error of a write alone: Orbax logs it too, and TensorStore prints one for each array."""
+    logger, report = logging.getLogger("absl"), sys.unraisablehook
+    level = logger.level
+
+    def report_other(lost: sys.UnraisableHookArgs) -> None:
+        if str(lost.exc_value) != "Event loop is closed":
+            report(lost)
+
+    logger.setLevel(logging.CRITICAL)
+    sys.unraisablehook = report_other
+    yield
+    # Not after an error or an interruption, because threads of Orbax still run and fail.
+    logger.setLevel(level)
+    sys.unraisablehook = report
 
 
 def _load_arrays(

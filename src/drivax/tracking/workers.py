@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from drivax.errors import UsageError
@@ -49,6 +50,7 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
     processes = multiprocessing.get_context("spawn")
     core_queue: Any = None
     try:
+        _start_tracker()
         if cores is not None:
             core_queue = processes.SimpleQueue()
             for core in cores:
@@ -80,6 +82,15 @@ def one_core_each(
 def await_interrupt() -> None:
     """Wait for 0.3 s after the death of a worker: a Ctrl-C that caused it raises KeyboardInterrupt in this time."""
     time.sleep(0.3)
+
+
+def _start_tracker() -> None:
+    """Start Python's process that removes semaphores, with SIGHUP blocked: a closed terminal must not end it first."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGHUP,))
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _start(core_queue: Any) -> None:

@@ -1,0 +1,93 @@
+"""The script that stops commands: on a small program that behaves well, or badly in a known way."""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+
+import pytest
+
+from experiment_scripts import load_script
+
+robustness = load_script("robustness")
+
+#: Writes a folder in one step, unless the second argument names a fault.
+PROGRAM = """
+import contextlib, json, os, sys, time
+from pathlib import Path
+from drivax.files import replace_folder
+
+out, fault = Path(sys.argv[1]), sys.argv[2]
+if fault == "direct":
+    out.mkdir(exist_ok=True)
+with contextlib.nullcontext(out) if fault == "direct" else replace_folder(out) as folder:
+    for number in range(20):
+        (folder / "data").write_bytes(os.urandom(10) if fault == "random" else b"x" * 10 * number)
+        time.sleep(0.01)
+    (folder / "run.json").write_text(json.dumps({"started": time.time(), "kind": "training"}))
+if fault == "litter":
+    out.with_name(".left").touch()
+"""
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    monkeypatch.setattr(robustness, "PROGRAM", (sys.executable, str(tmp_path / "program.py")))
+
+    def make(fault, faults=("kill",)):
+        command = robustness.Command(("out", fault), ("out",), overwrite=True)
+        (tmp_path / "disk").mkdir()
+        return robustness.Bench(tmp_path / "disk", {"write": command}, ["write"], faults, random.Random(0))
+
+    return make
+
+
+def test_atomic_program_is_identical_after_kills(bench):
+    bench = bench("none")
+    bench.measure()
+    assert robustness.run_kills(bench, 4) == {"moments": 4}
+    assert bench.problems == []
+    assert sum(bench.counts.values()) == 4 and bench.counts["write", "kill", "stopped"] >= 1
+
+
+def test_soak_ends_with_the_digest_of_undisturbed_runs(bench):
+    bench = bench("none")
+    bench.measure()
+    result = robustness.run_soak(bench, 0.01)
+    assert bench.problems == [] and result["cycles"] >= 1 and result["digest"] == result["undisturbed"]
+
+
+def test_random_output_is_no_reference(bench):
+    with pytest.raises(SystemExit, match="out/data: differs"):
+        bench("random").measure()
+
+
+def test_litter_is_found(bench):
+    with pytest.raises(SystemExit, match=r"leaves \.left"):
+        bench("litter").measure()
+
+
+def test_incomplete_replacement_is_found(bench):
+    bench = bench("direct")
+    bench.measure()
+    bench.rng = random.Random(1)
+    for _ in range(6):
+        bench.finish("write")
+        bench.disturb("write", "kill")
+    assert any("replaced out/data" in problem for problem in bench.problems)
+
+
+def test_volatile_values_are_not_compared(tmp_path):
+    for name, time, kind in (("a", 1, "training"), ("b", 2, "training"), ("c", 1, "evaluation")):
+        (tmp_path / name / "tensorboard").mkdir(parents=True)
+        (tmp_path / name / "tensorboard" / f"events.{time}").touch()
+        (tmp_path / name / "run.json").write_text(json.dumps({"started": time, "kind": kind}))
+    first, second, third = (robustness.digests(tmp_path / name) for name in "abc")
+    assert first == second and robustness.differences(first, third) == ["run.json: differs"]
+
+
+def test_differences_name_each_file():
+    lines = robustness.differences({"a": "1", "b": "1", "c": "1"}, {"b": "2", "c": "1", "d": "1"})
+    assert lines == ["a: missing", "b: differs", "d: additional"]
