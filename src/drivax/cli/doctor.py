@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
+from drivax.errors import UsageError
 from drivax.escaping import escape_controls
 from drivax.files import format_bytes, free_bytes
 from drivax.tracking.run_folder import zoo
@@ -46,10 +47,14 @@ class Doctor:
     formats that drivax does not read. The exit status is 1 if nothing can be converted.
 
     Example: drivax doctor womd/training
+
+    Example: drivax doctor --digest
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]")] = None
     """File or folder to identify; this machine by default."""
+    digest: bool = False
+    """Simulate standard episodes, and print a digest that is equal on machines that simulate the same."""
 
 
 def run(args: Doctor) -> int:
@@ -57,6 +62,11 @@ def run(args: Doctor) -> int:
     console = Console(
         width=min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS, highlight=False
     )
+    if args.digest:
+        if args.path is not None:
+            raise UsageError("--digest is about this machine, not about a path", cure="leave out one of them")
+        console.print(_table(digests()))
+        return 0
     if args.path is None:
         console.print(_table(machine()))
         return 0
@@ -80,6 +90,18 @@ def machine() -> Iterator[tuple[str, str]]:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     yield "memory", format_bytes(memory)
     yield "disk", f"{format_bytes(free_bytes(Path.cwd()))} free here"
+
+
+def digests() -> Iterator[tuple[str, str]]:
+    """Yield versions, device, and digests of standard episodes, as (name, value)."""
+    import jax
+
+    from drivax.evaluation.digest import standard_digests
+
+    device = jax.devices()[0]
+    yield "drivax", metadata.version("drivax")
+    yield "jax", f"{metadata.version('jax')} on {device.platform}: {device.device_kind}"
+    yield from standard_digests()
 
 
 def _is_installed(module: str) -> bool:

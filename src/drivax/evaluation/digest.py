@@ -1,0 +1,86 @@
+"""Digest of standard episodes: one value on all machines that simulate the same up to rounding.
+
+Rule-based planners drive 64 scenarios of the built-in world. The digest covers which metrics are defined, truths,
+counts and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would differ
+between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its unit
+that is farthest from all 64 values (docs/guide/reproducibility.md has distance and noise).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from drivax.evaluation.episode_table import EpisodeTable
+from drivax.evaluation.runner import evaluate
+from drivax.metrics.catalogue import EVENTS, METRICS, names_of
+from drivax.planners.catalogue import PLANNERS
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.traffic.reactive import make_traffic
+from drivax.synthetic.generate import Generation, generate
+
+#: Number and seed of the scenarios; planners with their traffic.
+SCENARIOS, SEED = 64, 33
+DRIVES = (("constant_velocity", "log"), ("idm", "log"), ("idm", "idm"))
+#: Units of the grids, metres.
+UNITS = {"distance": 2.0, "progress": 2.0, "goal_distance": 2.0, "ade": 1.0}
+#: Metrics that are truths or counts.
+EXACT = (*names_of(METRICS, "rate", "code"), "steps", "last_step", "ignored_overlaps")
+#: Candidates for the start of a grid, per unit.
+_STARTS = 8
+#: In place of an undefined truth or count.
+_UNDEFINED = -9.0
+
+
+def standard_digests() -> Iterator[tuple[str, str]]:
+    """Generate the standard scenarios, drive them, and yield (name, digest) of each planner and of them all.
+
+    The first pair is the hash of the set, which the last digest does not cover.
+    """
+    with TemporaryDirectory() as folder:
+        options = Generation(workers=os.cpu_count() or 1)
+        data = ScenarioSet.open(generate(Path(folder) / "set", SCENARIOS, SEED, options).path)
+        yield "scenarios", data.hash[:16]
+        digests = []
+        for planner, traffic in DRIVES:
+            table = evaluate(PLANNERS[planner](), data, traffic=make_traffic(traffic))
+            digests.append(episode_digest(table))
+            yield f"{planner}, {traffic}", digests[-1]
+    yield "digest", _sha256("".join(digests).encode())
+
+
+def episode_digest(table: EpisodeTable) -> str:
+    """Return 16 hexadecimal digits for the episodes of a table from memory."""
+    assert table.in_memory is not None, "episodes in memory have their first events"
+    exact = [np.nan_to_num(table.metrics[name], nan=_UNDEFINED) for name in EXACT]
+    cells = [grid_cells(table.metrics[name], unit)[0] for name, unit in UNITS.items()]
+    columns = [*exact, *(table.in_memory.events[name] for name in EVENTS), *cells]
+    return _sha256(np.stack([column.astype("<i8") for column in columns]).tobytes())
+
+
+def grid_cells(
+    values: Float[np.ndarray, " n"], unit: float
+) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " start"]]:
+    """Return the cell of each value, and the distance from each start of the grid to the nearest edge.
+
+    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the largest negative
+    number. Distances are shares of the unit.
+    """
+    defined = np.isfinite(values)
+    starts = np.arange(_STARTS) / _STARTS
+    phase = (values[defined, None] / unit - starts) % 1.0
+    distances = np.minimum(phase, 1.0 - phase).min(axis=0, initial=0.5)
+    best = int(distances.argmax())
+    cells = np.full(values.shape, np.iinfo(np.int64).min)
+    cells[defined] = np.floor(values[defined] / unit - starts[best]).astype(np.int64) * _STARTS + best
+    return cells, distances
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
