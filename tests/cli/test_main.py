@@ -201,3 +201,14 @@ def test_signals_in_callbacks_are_not_lost(number):
         time.sleep(5)
         raise AssertionError(f"{number.name} was lost")
     assert getattr(stopped.value, "signal", signal.SIGINT) == number
+
+
+def test_interrupt_at_exit_prints_no_traceback():
+    """The function runs at Python's exit, as those of JAX do."""
+    code = "import atexit, time; atexit.register(lambda: (print(flush=True), time.sleep(20)))"
+    command = [sys.executable, "-c", f"{code}; from drivax.cli import main; main()", "--version"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("drivax ") and process.stdout.readline() == "\n"
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=10)[1] == "" and process.returncode == -signal.SIGINT

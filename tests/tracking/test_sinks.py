@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -98,3 +100,27 @@ def test_tensorboard_events(tmp_path: Path):
         result += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
         data = data[16 + size :]
     assert result == [(7, "train/loss", 0.25)]
+
+
+FAILING_CLOSE = """
+import resource, sys
+from pathlib import Path
+from drivax.tracking.sinks import TensorBoard
+
+log = TensorBoard(Path(sys.argv[1]))
+for step in range(30):
+    log.write(step, {"loss": 0.5})
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+try:
+    log.close()
+except OSError as error:
+    print(error.strerror)
+"""
+
+
+def test_failing_tensorboard_raises_and_prints_nothing(tmp_path: Path):
+    """No file may grow, as on a full disk."""
+    pytest.importorskip("tensorboardX")
+    command = [sys.executable, "-c", FAILING_CLOSE, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (result.stdout, result.stderr) == ("File too large\n", "")

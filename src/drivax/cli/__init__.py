@@ -122,6 +122,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         line, status = describe(error)
         with contextlib.suppress(OSError):  # a terminal that hung up
             show(f"drivax: {escape_controls(line)}", sys.stderr)
+    finally:
+        if argv is None:  # The process ends: Ctrl-C stops what JAX does at exit without a traceback.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
     return status
 
 

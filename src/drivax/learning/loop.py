@@ -114,11 +114,11 @@ def train(
         log(split.text())
     log(memory.text())
     networks = None if resume else pretrained_networks(config.begin_from, program, log)  # they may not fit
-    folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
-        logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(explain_full_disk(out))
+        folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
+        logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
         _learn(_Run(config, program, logs, held_out, held_out_data, networks, log, trust))
     return RunFolder.open(out)

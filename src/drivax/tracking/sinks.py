@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import math
 import os
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +15,9 @@ from typing import Any, Self
 from drivax.errors import DataError
 from drivax.files import refuse_link, sync_and_close, write_text
 from drivax.reading import DAMAGE, read_text
+
+#: TensorBoard shows new values within this time (s).
+_FLUSH_S = 10.0
 
 
 class JsonLines:
@@ -52,22 +57,34 @@ class JsonLines:
 
 
 class TensorBoard:
-    """TensorBoard events through tensorboardX (extra ``track``), without those after ``resume_step``."""
+    """TensorBoard events in the format of tensorboardX (extra ``track``), without those after ``resume_step``.
 
-    def __init__(self, folder: str | Path, resume_step: int | None = None) -> None:
-        from tensorboardX import SummaryWriter
+    Its ``SummaryWriter`` writes in a thread, which prints the errors of the disk instead of raising them.
+    """
 
-        first_step = None if resume_step is None else resume_step + 1
-        self._writer = SummaryWriter(str(folder), purge_step=first_step, write_to_disk=True)
+    def __init__(self, folder: Path, resume_step: int | None = None) -> None:
+        from tensorboardX.event_file_writer import EventsWriter
+
+        event_pb2: Any = importlib.import_module("tensorboardX.proto.event_pb2")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._event = event_pb2.Event
+        self._file = EventsWriter(str(folder / "events"))
+        self._next_flush = 0.0
+        if resume_step is not None:
+            start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+            self._file.write_event(self._event(step=resume_step + 1, session_log=start))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Add a scalar for each value."""
-        for name, value in values.items():
-            self._writer.add_scalar(name, float(value), int(step))
+        scalars = [{"tag": name, "simple_value": float(value)} for name, value in values.items()]
+        self._file.write_event(self._event(wall_time=time.time(), step=int(step), summary={"value": scalars}))
+        if time.monotonic() > self._next_flush:
+            self._file.flush()
+            self._next_flush = time.monotonic() + _FLUSH_S
 
     def close(self) -> None:
         """Flush to disk."""
-        self._writer.close()
+        self._file.close()
 
 
 class MetricLog:
