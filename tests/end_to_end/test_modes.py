@@ -22,6 +22,7 @@ from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
+from drivax.tracking.sinks import read_rows
 from tiny_run import write_run
 
 START = 60
@@ -141,3 +142,40 @@ def test_threads_and_devices_do_not_change_results(data, planner, tmp_path):
         )
         found.add((out / "episodes.csv").read_bytes())
     assert len(found) == 1
+
+
+TRAINING = """
+total_steps: 1536
+task: {metrics: none}
+devices: 1
+algorithm:
+  kind: ppo
+  network: {encoder: {hidden: [128]}, head: [64]}
+  environments: 64
+  unroll: 8
+  minibatches: 2
+checkpoint_every: 3
+"""
+
+
+@pytest.mark.slow
+def test_threads_change_training_only_by_rounding(data, tmp_path):
+    """Sums are divided among the threads: each number gives other roundings."""
+    (tmp_path / "train.yaml").write_text(TRAINING)
+    flags = os.environ.get("XLA_FLAGS", "")
+    variables = [{"NPROC": threads, "XLA_FLAGS": flags} for threads in ("1", "2", "8")]
+    variables += [{"XLA_FLAGS": f"{flags} --xla_cpu_multi_thread_eigen=false"}]
+    rows = []
+    for number, values in enumerate(variables):
+        out = tmp_path / str(number)
+        call = ["train", str(tmp_path / "train.yaml"), "--data", str(data), "--validation", "none"]
+        subprocess.run(
+            [sys.executable, "-m", "drivax", *call, "--out", str(out)],
+            env=os.environ | values | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            check=True,
+            timeout=900,
+        )
+        rows.append([{**row, "steps_per_second": 0.0} for row in read_rows(out / "metrics.jsonl")])
+    for same_step in zip(*rows, strict=True):
+        for row in same_step[1:]:
+            assert row == pytest.approx(same_step[0], rel=2e-3, abs=2e-5, nan_ok=True)
