@@ -54,6 +54,8 @@ _LIMITS = {
     errno.ENOMEM: ("memory in kB", resource.RLIMIT_AS, _LESS_MEMORY),
     errno.EAGAIN: ("processes and threads", resource.RLIMIT_NPROC, "raise the limit: ulimit -u 4096"),
 }  # fmt: skip
+#: Address space below which JAX aborts a process (bytes).
+_LEAST_MEMORY = 1400 << 20
 
 
 class DrivaxError(Exception):
@@ -110,7 +112,9 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
     ``file`` counts if the system's error names none. Other errors are None.
     """
     number = getattr(error, "errno", None)
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or (
+        isinstance(error, ImportError) and "failed to map segment" in str(error)
+    ):
         number = errno.ENOMEM
     elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         number = errno.EAGAIN
@@ -125,6 +129,13 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
         )
         return UsageError(f"{problem} (limit of {name}: {shown})", file=file, cure=cure)
     return DataError(problem, file=file, cure=_DISK_CURES[number]) if number in _DISK_CURES else None
+
+
+def check_memory_limit() -> None:
+    """Raise a UsageError if this process may take so little memory that JAX would abort it."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY and (error := explain_system(MemoryError())):
+        raise error
 
 
 def missing_package(error: ImportError) -> UsageError | None:

@@ -184,6 +184,16 @@ def test_closed_pipe_is_not_an_error():
     assert (result.stdout, result.stderr) == ("d", "")
 
 
+@pytest.mark.parametrize("limit", ["300000", "700000", "1300000"])
+def test_low_memory_limit_is_one_line(limit):
+    shell = f"ulimit -v {limit}; exec '{sys.executable}' -m drivax evaluate --planner idm --data missing --out run"
+    result = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, check=False)
+    assert result.returncode in (1, 2) and result.stderr.startswith(
+        f"drivax: cannot allocate memory (limit of memory in kB: {limit}); "
+    ), result.stderr
+    assert result.stderr.count("\n") == 1
+
+
 class Callback:
     """Its finaliser is a callback: Python drops what a signal handler raises in it."""
 

@@ -25,7 +25,14 @@ from inspect import getdoc
 from typing import Any, TypeVar
 
 from drivax.compilation import report_compilation, use_compilation_cache
-from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_system, missing_package
+from drivax.errors import (
+    DrivaxError,
+    UsageError,
+    check_memory_limit,
+    did_you_mean,
+    explain_system,
+    missing_package,
+)  # fmt: skip
 from drivax.escaping import escape_controls, show
 from drivax.seal import allow_edited, edited_files
 
@@ -240,6 +247,8 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
         # Also for a folder of JAX's own variable, which is read when a command imports JAX.
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     module = importlib.import_module(command.module)
+    if "jax" in sys.modules:
+        check_memory_limit()
     if cache and "jax" in sys.modules:
         report_compilation(partial(show, file=sys.stderr))
     config = getattr(module, command.config)
