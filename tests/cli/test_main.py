@@ -217,6 +217,30 @@ def test_signals_in_callbacks_are_not_lost(number):
     assert getattr(stopped.value, "signal", signal.SIGINT) == number
 
 
+IMPORTED = """
+import os, time
+os.kill(os.getpid(), {number})
+time.sleep(0.1)
+complete = True
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_signals_wait_for_the_end_of_an_import(number, tmp_path, monkeypatch):
+    (tmp_path / "interrupted.py").write_text(IMPORTED.format(number=int(number)))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "interrupted", raising=False)
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
+            importlib.import_module("interrupted")
+            time.sleep(5)
+            raise AssertionError(f"{number.name} was lost")
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert sys.modules["interrupted"].complete
+
+
 def test_interrupt_at_exit_prints_no_traceback():
     """The function runs at Python's exit, as those of JAX do."""
     code = "import atexit, time; atexit.register(lambda: (print(flush=True), time.sleep(20)))"

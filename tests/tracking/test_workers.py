@@ -13,6 +13,7 @@ import time
 import pytest
 
 from drivax.datasets import spool
+from drivax.errors import DataError
 from drivax.scenario.schema import CAPACITIES
 from drivax.synthetic import generate
 from drivax.tracking.workers import one_core_each, worker_pool
@@ -44,6 +45,20 @@ def group_is_gone(leader, seconds):
 def test_pool_runs_tasks():
     with worker_pool(1) as pool:
         assert list(pool.map(abs, [-1, 2])) == [1, 2]
+
+
+@pytest.mark.parametrize("tasks", [1, 50])
+def test_dead_worker_is_one_line(tasks):
+    """Also where a later task is submitted to the broken pool."""
+    with (
+        pytest.raises(DataError, match=r"a worker process died .*; use fewer --workers"),
+        worker_pool(1) as pool,
+    ):
+        futures = [pool.submit(os._exit, 1)]
+        for _ in range(1, tasks):
+            time.sleep(0.1)
+            futures.append(pool.submit(abs, 1))
+        futures[0].result()
 
 
 @pytest.mark.parametrize("end", ["time.sleep(60)", "pool.submit(time.sleep, 60); time.sleep(60)"])

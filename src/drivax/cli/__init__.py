@@ -22,6 +22,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 from importlib import metadata
 from inspect import getdoc
+from types import FrameType
 from typing import Any, TypeVar
 
 from drivax.compilation import report_compilation, use_compilation_cache
@@ -51,8 +52,8 @@ class Command:
 _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of help that is not printed to a terminal.
 _COLUMNS = 100
-#: A callback ends within this time (s).
-_CALLBACK_S = 0.01
+#: Until a signal that came at a bad moment is sent again (s).
+_LATER_S = 0.01
 COMMANDS = {
     "demo": Command(
         "drivax.cli.demo",
@@ -147,18 +148,24 @@ class Stopped(KeyboardInterrupt):
 def _stop_at_signals() -> Iterator[None]:
     """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed; ignore them from then on.
 
-    A signal that the process ignores already (nohup) stays so. Threads but the main one have no signals.
+    These and Ctrl-C wait until an import is done, because modules of C++ crash when an exception interrupts their
+    initialisation. A signal that the process ignores already (nohup) stays so. Only the main thread has signals.
     """
-    handled: list[signal.Signals] = []
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
+    found = {number: signal.getsignal(number) for number in signals}
+    handled = [n for n in signals if found[n] in (signal.SIG_DFL, signal.default_int_handler)]
     report_unraisable = sys.unraisablehook
-    if threading.current_thread() is threading.main_thread():
-        signals = (signal.SIGTERM, signal.SIGHUP)
-        handled = [number for number in signals if signal.getsignal(number) == signal.SIG_DFL]
 
-    def stop(number: int, _: Any) -> None:
-        for other in handled:
-            signal.signal(other, signal.SIG_IGN)
-        raise Stopped(signal.Signals(number))
+    def stop(number: int, frame: FrameType | None) -> None:
+        if _is_importing(frame):
+            _send_later(number)
+        elif number == signal.SIGINT:
+            raise KeyboardInterrupt
+        else:
+            for other in (signal.SIGTERM, signal.SIGHUP):
+                signal.signal(other, signal.SIG_IGN)
+            raise Stopped(signal.Signals(number))
 
     def stop_later(lost: sys.UnraisableHookArgs) -> None:
         # Python drops what is raised in a callback, such as JAX's of the garbage collector.
@@ -167,8 +174,7 @@ def _stop_at_signals() -> Iterator[None]:
             return
         for number in handled:
             signal.signal(number, stop)
-        number = error.signal if isinstance(error, Stopped) else signal.SIGINT
-        threading.Timer(_CALLBACK_S, os.kill, (os.getpid(), number)).start()
+        _send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT)
 
     try:
         sys.unraisablehook = stop_later
@@ -179,7 +185,23 @@ def _stop_at_signals() -> Iterator[None]:
         if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
             sys.unraisablehook = report_unraisable
         for number in handled:
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, found[number])
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return whether the command imports a module, directly or not."""
+    while frame is not None and frame.f_code is not main.__code__:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _send_later(number: int) -> None:
+    """Send a signal to this process again, from a thread."""
+    timer = threading.Timer(_LATER_S, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
 
 
 def describe(error: BaseException) -> tuple[str, int]:

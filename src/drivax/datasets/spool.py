@@ -7,7 +7,6 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets.reader import BadRecord
-from drivax.errors import DataError
 from drivax.scenario.schema import Capacity, Scenario, record_dtype
-from drivax.tracking.workers import await_interrupt, worker_pool
+from drivax.tracking.workers import worker_pool
 
 #: In place of a record that is in the spool file.
 _SPOOLED = np.zeros(())
@@ -54,7 +52,7 @@ def convert_ahead(
                 if not waiting:
                     return
                 path, future = waiting.popleft()
-                yield _unspool(future, path, capacity)
+                yield _unspool(future.result(), path, capacity)
                 path.unlink(missing_ok=True)
     finally:
         shutil.rmtree(spool, ignore_errors=True)
@@ -74,17 +72,9 @@ def _spool(
 
 
 def _unspool(
-    future: Future[list[Scenario | BadRecord]], path: Path, capacity: Capacity
+    items: Sequence[Scenario | BadRecord], path: Path, capacity: Capacity
 ) -> Iterator[Scenario | BadRecord]:
     """Yield the results of a task, with their records from ``path``."""
-    try:
-        items = future.result()
-    except BrokenProcessPool as error:
-        await_interrupt()
-        raise DataError(
-            "a worker process died (out of memory, or a script without a main guard)",
-            cure="use fewer --workers; what is finished is kept, the same command continues",
-        ) from error
     dtype = record_dtype(capacity)
     with path.open("rb") as file:
         for item in items:

@@ -17,7 +17,6 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
@@ -25,12 +24,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from drivax.errors import DrivaxError, UsageError
+from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
 from drivax.scenario.store import ScenarioWriter, check_set_space
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_many
-from drivax.tracking.workers import await_interrupt, worker_pool
+from drivax.tracking.workers import worker_pool
 
 #: CPU features beyond the baseline that NumPy can use, and the variable that disables them.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
@@ -303,18 +302,14 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
         return
     spans = _spans(scenarios, options.workers)
     waiting: deque[Future[list[_Draw]]] = deque()
-    try:
-        with worker_pool(min(options.workers, len(spans))) as pool:
-            for first, last in spans:
-                with portable_workers():  # processes are started as they are needed
-                    waiting.append(pool.submit(_draw_in_worker, first, last, seed, options))
-                if len(waiting) > _AHEAD * options.workers:
-                    yield from waiting.popleft().result()
-            while waiting:
+    with worker_pool(min(options.workers, len(spans))) as pool:
+        for first, last in spans:
+            with portable_workers():  # processes are started as they are needed
+                waiting.append(pool.submit(_draw_in_worker, first, last, seed, options))
+            if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
-    except BrokenProcessPool as error:
-        await_interrupt()
-        raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
+        while waiting:
+            yield from waiting.popleft().result()
 
 
 @dataclass(frozen=True)

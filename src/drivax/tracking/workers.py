@@ -10,26 +10,37 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 
 #: Errors of semaphores, which lie in /dev/shm on Linux.
 _NO_SHARED_MEMORY = (errno.ENOENT, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
+#: A Ctrl-C that killed a worker raises KeyboardInterrupt in its parent within this time (s).
+_INTERRUPT_S = 0.3
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
 class WorkerPool(ProcessPoolExecutor):
-    """A pool whose workers end at once if the ``with`` block does not reach its end."""
+    """A pool whose workers end at once if the ``with`` block does not reach its end.
+
+    Raises:
+        DataError: At the end of the block, if a worker died in it.
+    """
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         """Wait for the workers, or after an exception (a signal reaches this process alone) terminate them."""
         if kind is not None:
             self._stop()
         self.shutdown()
+        if isinstance(error, BrokenProcessPool):
+            time.sleep(_INTERRUPT_S)
+            problem = "a worker process died (out of memory, or a script without a main guard)"
+            raise DataError(problem, cure="use fewer --workers") from error
 
     def _stop(self) -> None:
         running = list((self._processes or {}).values())
@@ -77,11 +88,6 @@ def one_core_each(
         futures = {pool.submit(call, task): task for task in tasks}
         for future in as_completed(futures):
             yield futures[future], future.result()
-
-
-def await_interrupt() -> None:
-    """Wait for 0.3 s after the death of a worker: a Ctrl-C that caused it raises KeyboardInterrupt in this time."""
-    time.sleep(0.3)
 
 
 def _start_tracker() -> None:
