@@ -52,6 +52,8 @@ class Command:
 _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of help that is not printed to a terminal.
 _COLUMNS = 100
+#: Files of Python's functions that no exception may interrupt.
+_BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
 #: Until a signal that came at a bad moment is sent again (s).
 _LATER_S = 0.01
 COMMANDS = {
@@ -149,7 +151,8 @@ def _stop_at_signals() -> Iterator[None]:
     """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed; ignore them from then on.
 
     These and Ctrl-C wait until an import is done, because modules of C++ crash when an exception interrupts their
-    initialisation. A signal that the process ignores already (nohup) stays so. Only the main thread has signals.
+    initialisation, and until a worker process has its arguments. A signal that the process ignores already (nohup)
+    stays so. Only the main thread has signals.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
@@ -158,7 +161,7 @@ def _stop_at_signals() -> Iterator[None]:
     report_unraisable = sys.unraisablehook
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _is_importing(frame):
+        if _is_bad_moment(frame):
             _send_later(number)
         elif number == signal.SIGINT:
             raise KeyboardInterrupt
@@ -188,10 +191,10 @@ def _stop_at_signals() -> Iterator[None]:
             signal.signal(number, found[number])
 
 
-def _is_importing(frame: FrameType | None) -> bool:
-    """Return whether the command imports a module, directly or not."""
+def _is_bad_moment(frame: FrameType | None) -> bool:
+    """Return whether the command imports a module or starts a process, directly or not."""
     while frame is not None and frame.f_code is not main.__code__:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+        if frame.f_code.co_filename.endswith(_BAD_MOMENTS):
             return True
         frame = frame.f_back
     return False

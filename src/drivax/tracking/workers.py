@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import multiprocessing
 import os
@@ -9,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar
@@ -42,6 +43,11 @@ class WorkerPool(ProcessPoolExecutor):
             problem = "a worker process died (out of memory, or a script without a main guard)"
             raise DataError(problem, cure="use fewer --workers") from error
 
+    def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
+        """Submit a call; a worker that starts for it gets Ctrl-C only when it has set up its signals."""
+        with _block(signal.SIGINT):
+            return super().submit(*arguments, **options)
+
     def _stop(self) -> None:
         running = list((self._processes or {}).values())
         results: Any = self._result_queue
@@ -61,7 +67,10 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
     processes = multiprocessing.get_context("spawn")
     core_queue: Any = None
     try:
-        _start_tracker()
+        with _block(
+            signal.SIGHUP
+        ):  # A closed terminal must not end Python's process that removes semaphores.
+            resource_tracker.ensure_running()
         if cores is not None:
             core_queue = processes.SimpleQueue()
             for core in cores:
@@ -90,11 +99,12 @@ def one_core_each(
             yield futures[future], future.result()
 
 
-def _start_tracker() -> None:
-    """Start Python's process that removes semaphores, with SIGHUP blocked: a closed terminal must not end it first."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGHUP,))
+@contextlib.contextmanager
+def _block(number: signal.Signals) -> Iterator[None]:
+    """Block a signal in this thread and in the processes that it starts."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, (number,))
     try:
-        resource_tracker.ensure_running()
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
@@ -106,6 +116,7 @@ def _start(core_queue: Any) -> None:
         os.sched_setaffinity(0, {core_queue.get()})
     # On Ctrl-C, workers exit at once and silently; the parent cleans up.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
