@@ -556,7 +556,7 @@ def test_18_large_files_are_not_opened(tmp_path, monkeypatch):
     path = sample.write(tmp_path)
     monkeypatch.setattr(pickles, "MOST_BYTES", 1000)
     (bad,) = ScenarioNet().read(path)
-    assert isinstance(bad, BadRecord) and "larger than" in bad.problem
+    assert isinstance(bad, BadRecord) and "more than the" in bad.problem
 
 
 def test_broken_features_are_left_out_and_counted(tree):

@@ -21,7 +21,7 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
-from drivax.datasets.reader import BadRecord, Reader, of_length
+from drivax.datasets.reader import BadRecord, Reader, with_steps
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
 from drivax.reading import check_regular
@@ -122,7 +122,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
         yield BadRecord.of(error, path)
         return
     count = 0
-    for item in _read(of_length(reader, options.sizes.steps), path):
+    for item in _read(with_steps(reader, options.sizes.steps), path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
             count += isinstance(result, Scenario)

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, find_reader, survey
-from drivax.datasets.reader import BadRecord, Description, Reader, of_length
+from drivax.datasets.reader import BadRecord, Description, Reader, with_steps
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
@@ -206,7 +206,7 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         sample = paths[::step]
         sampled |= step > 1
         scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
-        reader = of_length(find_reader(name), capacity.steps)
+        reader = with_steps(find_reader(name), capacity.steps)
         total += scale * sum(count(reader, path, stride, capacity.steps) for path in sample)
     scenarios = round(total) if limit is None else min(round(total), limit)
     return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)

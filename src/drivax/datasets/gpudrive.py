@@ -15,7 +15,7 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.export.recording import restore
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
@@ -86,11 +86,7 @@ class GpuDrive:
 
     def recognise(self, path: Path) -> bool:
         """Whether the file begins like a GPUDrive scene."""
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError:
-            return False
+        head = read_head(path, _HEAD_BYTES)
         objects = b'"objects"' in head and b'"position"' in head
         return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
 
@@ -113,10 +109,7 @@ class GpuDrive:
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a file, or the bad record in its place."""
-        try:
-            yield decode(parsing.load_json(path))
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        yield attempt(lambda: decode(parsing.load_json(path)), file=path)
 
 
 def decode(scene: Any) -> Recording:

@@ -15,7 +15,7 @@ from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse.tables import Kind, Table, Words, read_table
 from drivax.datasets.parsing import lift, place_tags
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Recording, Tracks
@@ -62,7 +62,7 @@ class ArgoverseMotion:
 
     def recognise(self, path: Path) -> bool:
         """Whether a parquet file has the name of a scenario."""
-        return path.match(self.patterns[0]) and tables.has_magic(path, tables.PARQUET_MAGIC)
+        return path.match(self.patterns[0]) and bool(self.count(path))
 
     def describe(self, path: Path) -> Description:
         """Tracks, steps and city of one scenario."""
@@ -82,14 +82,11 @@ class ArgoverseMotion:
 
     def count(self, path: Path) -> int:
         """Return 1, since every scenario becomes one window; 0 for another kind of file."""
-        return int(tables.has_magic(path, tables.PARQUET_MAGIC))
+        return int(read_head(path, 4) == tables.PARQUET_MAGIC)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of a scenario, or the bad record in its place."""
-        try:
-            yield decode(path)
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        """Yield the recording of a scenario, or the bad record in its place."""
+        yield attempt(decode, path, file=path)
 
 
 def _map_path(path: Path) -> Path:

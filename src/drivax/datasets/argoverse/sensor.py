@@ -15,7 +15,7 @@ from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse.tables import Kind, Table, read_table
 from drivax.datasets.parsing import place_tags
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.scenario.recording import Recording, Tracks, differentiate
 from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag
@@ -66,7 +66,7 @@ class ArgoverseSensor:
 
     def recognise(self, path: Path) -> bool:
         """Whether a feather file has the name of a log's annotations."""
-        return path.name in self.patterns and tables.has_magic(path, tables.FEATHER_MAGIC)
+        return path.name in self.patterns and read_head(path, 6) == b"ARROW1"
 
     def describe(self, path: Path) -> Description:
         """Frames, tracks and city of a log."""
@@ -91,11 +91,8 @@ class ArgoverseSensor:
         return parsing.windows_of(len(np.unique(times)))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of a log, or the bad record in its place."""
-        try:
-            yield decode(path)
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        """Yield the recording of a log, or the bad record in its place."""
+        yield attempt(decode, path, file=path)
 
 
 def _map_path(path: Path) -> Path | None:

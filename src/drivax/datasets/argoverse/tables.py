@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
+from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
 from drivax.reading import check_regular
 
@@ -23,7 +24,7 @@ CENTRE_AHEAD_M = 1.34
 AXLE_HEIGHT_M = 0.33
 #: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
-PARQUET_MAGIC, FEATHER_MAGIC = b"PAR1", b"ARROW1"
+PARQUET_MAGIC = b"PAR1"
 #: The longest logs have some ten thousand rows; damaged files can claim any number.
 MOST_ROWS = 1_000_000
 _AGAIN = "download it again"
@@ -55,15 +56,6 @@ class Table:
     def stack(self, names: Sequence[str]) -> Array:
         """Stack columns of numbers, float64 ``[row, name]``."""
         return np.stack([self.numbers[name] for name in names], axis=1).astype(np.float64)
-
-
-def has_magic(path: Path, magic: bytes) -> bool:
-    """Whether a file begins with these bytes; False where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(magic)) == magic
-    except OSError:
-        return False
 
 
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
@@ -102,7 +94,7 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[
     import pyarrow.parquet as pq
 
     with pa.OSFile(str(path)) as source:
-        if has_magic(path, PARQUET_MAGIC):
+        if read_head(path, 4) == PARQUET_MAGIC:
             file = pq.ParquetFile(source)
             names = file.schema_arrow.names
             columns = [name for name in columns if name in names or name not in optional]

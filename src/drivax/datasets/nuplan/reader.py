@@ -17,7 +17,7 @@ from drivax.datasets import parsing
 from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, features_around, find_map
 from drivax.datasets.nuplan.sqlite import Database, open_database
 from drivax.datasets.parsing import flatten
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt
 from drivax.errors import DataError
 from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
@@ -125,10 +125,7 @@ class NuPlan:
                 city = city_map(find_map(path, log.map_name))
                 agents_by_token = agents(database)
                 for piece in pieces(log.line, self.steps):
-                    try:
-                        yield _recording(log, piece, agents_by_token, city)
-                    except DataError as error:
-                        yield BadRecord.of(error, path, piece.name)
+                    yield attempt(_recording, log, piece, agents_by_token, city, file=path, record=piece.name)
         except DataError as error:
             yield BadRecord.of(error, path)
 

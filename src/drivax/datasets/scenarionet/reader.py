@@ -19,7 +19,7 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
 from drivax.datasets.parsing import flatten, lift
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
 from drivax.datasets.scenarionet.pickles import (
@@ -35,6 +35,7 @@ from drivax.datasets.scenarionet.pickles import (
 )
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
+from drivax.reading import read_bytes
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, is_even
 from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, AgentKind, Flag, LightState
 
@@ -98,7 +99,7 @@ class ScenarioNet:
 
     def recognise(self, path: Path) -> bool:
         """Whether it is a pickle that begins with the keys of a scenario."""
-        head = _head(path)
+        head = read_head(path, _HEAD_BYTES)
         keys = all(sign in head for sign in _SIGNS) and any(part in head for part in _PARTS)
         return head[:1] in (b"\x80", b"(", b"}") and keys
 
@@ -123,40 +124,21 @@ class ScenarioNet:
 
     def count(self, path: Path) -> int:
         """Return the number of windows, by the length that the file names at its beginning."""
-        steps = _length_of(_head(path))
+        steps = _length_of(read_head(path, _HEAD_BYTES))
         return 0 if steps is None else parsing.windows_of(steps)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a file, or the bad record in its place."""
-        try:
-            yield decode(_load(path))
-        except DataError as error:
-            yield BadRecord.of(error, path)
-
-
-def _head(path: Path) -> bytes:
-    """The beginning of a file; empty if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
-    except OSError:
-        return b""
+        yield attempt(lambda: decode(_load(path)), file=path)
 
 
 def _load(path: Path) -> Any:
-    """Read a pickle of plausible size as data."""
-    try:
-        if path.stat().st_size > pickles.MOST_BYTES:
-            raise DataError(
-                f"larger than {pickles.MOST_BYTES >> 20} MB", file=path, cure="it is not a scenario"
-            )
-        return pickles.load(path.read_bytes())
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
+    """Return the content of a pickle."""
+    return pickles.load(read_bytes(path, "check the path, and that it is a scenario", pickles.MOST_BYTES))
 
 
 def _length_of(head: bytes) -> int | None:
-    """The value of the key ``length`` in the beginning of a pickle."""
+    """Return the value of the key ``length`` in the beginning of a pickle, None without a plausible one."""
     last = None
     with contextlib.suppress(ValueError):  # the beginning is cut anywhere
         for operation, argument, _ in pickletools.genops(head):

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
 
 _Array = np.ndarray[Any, Any]
@@ -167,15 +168,11 @@ def count_records(path: str | Path) -> int:
         return 0
 
 
-def looks_framed(path: str | Path) -> bool:
+def looks_framed(path: Path) -> bool:
     """Whether the file begins with a length and its checksum. Needs no package, never raises."""
-    try:
-        with Path(path).open("rb") as file:
-            header = file.read(_HEADER_BYTES)
-    except (OSError, ValueError):
-        return False
-    whole = len(header) == _HEADER_BYTES
-    return whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
+    header = read_head(path, _HEADER_BYTES)
+    is_whole = len(header) == _HEADER_BYTES
+    return is_whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
 
 
 def _crc32c_slowly(data: bytes) -> int:
