@@ -34,6 +34,8 @@ from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, manifest_entry
 
 _Result = TypeVar("_Result")
+#: Options that do not change the bytes of a set.
+_WITHOUT_EFFECT = ("workers", "strict", "overwrite")
 #: Scenarios that are audited together.
 _BATCH = 64
 #: Bytes of the head and of the tail of a source that identify it.
@@ -152,10 +154,10 @@ def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterato
         yield _attempt(partial(assemble, piece, capacity, options.routes), path, piece.scenario_id)
 
 
-def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    """Return the result of a call, or the bad record that its error describes."""
+def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
+    """Call a function; return the bad record of any error in place of a result."""
     try:
-        return call()
+        return function()
     except DrivaxError as error:
         return BadRecord.of(error, path, record)
     except Exception as error:  # one odd recording must not end a conversion of a hundred thousand
@@ -271,24 +273,12 @@ def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, A
     for entry in data.inputs:
         size, ends = _ends(entry.path)
         digest.update(f"{data.relative(entry.path)}\t{size}\t{entry.format}\t{ends}\n".encode())
-    names = (
-        "format",
-        "capacity",
-        "future_s",
-        "egos",
-        "limit",
-        "filters",
-        "routes",
-        "stride",
-        "split",
-        "shard_size",
-    )
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
         "files": digest.hexdigest(),
         "audit": has_audit,
-        **{name: getattr(options, name) for name in names},
+        **{name: value for name, value in vars(options).items() if name not in _WITHOUT_EFFECT},
     }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, find_reader, survey
-from drivax.datasets.reader import BadRecord, Description, Reader, with_steps
+from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with_steps
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
@@ -81,13 +81,11 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     """
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
-    own = unsupported.explain_own(path) if path.is_dir() else None
-    try:
-        if own is not None:
-            raise own
-        data = survey(path, format)
-    except DataError as error:
-        return Diagnosis(path, problems=(BadRecord.of(error, path),))
+    if path.is_dir() and (own := unsupported.explain_own(path)) is not None:
+        return Diagnosis(path, problems=(BadRecord.of(own, path),))
+    data = attempt(survey, path, format, file=path)
+    if isinstance(data, BadRecord):
+        return Diagnosis(path, problems=(data,))
     parts, problems = _parts(data)
     if not parts and path.is_dir() and (error := unsupported.explain_folder(path)) is not None:
         problems.insert(0, BadRecord.of(error, path))
@@ -96,13 +94,13 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
         path=path,
         parts=parts,
         files=data.formats,
-        input_bytes=_size([entry.path for entry in data.inputs]),
+        input_bytes=_size(data.paths()),
         companions=data.companions,
         ignored=data.ignored,
         scenarios=expected.scenarios,
         set_bytes=expected.size_bytes,
         free_bytes=expected.free_bytes,
-        shards=tuple(gaps([entry.path for entry in data.inputs])),
+        shards=tuple(gaps(data.paths())),
         problems=tuple(problems),
         convertible=any(not part.description.missing for part in parts),
     )
@@ -111,18 +109,17 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     """Describe a sample of the files of each format, and list damaged files of it and files of no format."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    unknown = [entry.path for entry in data.inputs if entry.format is None][:_MOST_NAMES]
+    unknown = data.paths(None)[:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
-        files = [entry.path for entry in data.inputs if entry.format == name]
+        files = data.paths(name)
         step = -(-len(files) // _SAMPLE)
         for file in files[::step]:
-            try:
-                description = find_reader(name).describe(file)
-            except DataError as error:
-                problems.append(BadRecord.of(error, file))
-                continue
-            groups[name, description.dataset, description.version, step == 1].append(description)
+            description = attempt(find_reader(name).describe, file, file=file)
+            if isinstance(description, BadRecord):
+                problems.append(description)
+            else:
+                groups[name, description.dataset, description.version, step == 1].append(description)
     return tuple(
         Part(key[0], _merge(sample), len(sample), key[-1]) for key, sample in groups.items()
     ), problems
@@ -201,19 +198,19 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
     """
     total, sampled = 0.0, False
     for name in data.formats:
-        paths = [entry.path for entry in data.inputs if entry.format == name]
+        paths = data.paths(name)
         step = -(-len(paths) // _COUNT_FILES)
         sample = paths[::step]
         sampled |= step > 1
         scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
         reader = with_steps(find_reader(name), capacity.steps)
-        total += scale * sum(count(reader, path, stride, capacity.steps) for path in sample)
+        total += scale * sum(_count(reader, path, stride, capacity.steps) for path in sample)
     scenarios = round(total) if limit is None else min(round(total), limit)
     return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
 
 
-def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS) -> int:
-    """About how many scenarios a file becomes; 0 if it cannot be read."""
+def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
+    """Return about how many scenarios a file becomes; 0 if it cannot be read."""
     try:
         scenarios = reader.count(path)
         if (stride, length) == (STRIDE, STEPS) or scenarios == 0:

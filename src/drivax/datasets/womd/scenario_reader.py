@@ -33,8 +33,41 @@ class WomdScenario(womd.TfRecordReader):
     name: str = womd.SCENARIO_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
-        """The recording in a payload."""
-        return decode(payload)
+        """Return the recording in a serialised ``Scenario``.
+
+        Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad),
+        invalid states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links
+        are kept.
+        """
+        message = parse("Scenario", payload)
+        if message is None or not message.scenario_id:
+            raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
+        steps = len(message.timestamps_seconds)
+        _check(message, steps)
+        features, lost = _features(message.map_features)
+        lights, lost_lights = _lights(message.dynamic_map_states, steps, features)
+        rows = {track.id: row for row, track in enumerate(message.tracks)}
+        return Recording(
+            scenario_id=message.scenario_id,
+            dataset=womd.DATASET,
+            segment=message.scenario_id,
+            timestamps_s=np.array(message.timestamps_seconds, np.float64),
+            current_step=message.current_time_index,
+            ego=message.sdc_track_index,
+            tracks=_tracks(message.tracks, steps),
+            features=features,
+            lights=lights,
+            to_predict=parsing.rows_within(
+                [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
+            ),
+            # These are track ids, tracks_to_predict are rows.
+            of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
+            tags={"source_format": self.name},
+            lost=parsing.nonzero(
+                lost, lights_without_place=lost_lights, unknown_fields=_unknown_fields(message, payload)
+            ),
+            split_gap_m=_SPLIT_GAP_M,
+        )
 
     def describe(self, path: Path) -> Description:
         """Describe the first record: version by kinds of features, lane graph, lights."""
@@ -48,43 +81,6 @@ class WomdScenario(womd.TfRecordReader):
         version = "1.2 or later" if driveways else "1.1 or later" if linked else None
         flavour = "Scenario protos in TFRecord"
         return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
-
-
-def decode(payload: bytes) -> Recording:
-    """The recording in a serialised ``Scenario``.
-
-    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
-    states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links are kept.
-    """
-    message = parse("Scenario", payload)
-    if message is None or not message.scenario_id:
-        raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
-    steps = len(message.timestamps_seconds)
-    _check(message, steps)
-    features, lost = _features(message.map_features)
-    lights, lost_lights = _lights(message.dynamic_map_states, steps, features)
-    rows = {track.id: row for row, track in enumerate(message.tracks)}
-    return Recording(
-        scenario_id=message.scenario_id,
-        dataset=womd.DATASET,
-        segment=message.scenario_id,
-        timestamps_s=np.array(message.timestamps_seconds, np.float64),
-        current_step=message.current_time_index,
-        ego=message.sdc_track_index,
-        tracks=_tracks(message.tracks, steps),
-        features=features,
-        lights=lights,
-        to_predict=parsing.rows_within(
-            [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
-        ),
-        # These are track ids, tracks_to_predict are rows.
-        of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
-        tags={"source_format": womd.SCENARIO_FORMAT},
-        lost=parsing.nonzero(
-            lost, lights_without_place=lost_lights, unknown_fields=_unknown_fields(message, payload)
-        ),
-        split_gap_m=_SPLIT_GAP_M,
-    )
 
 
 def _unknown_fields(message: Any, payload: bytes) -> int:
