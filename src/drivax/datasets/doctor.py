@@ -81,8 +81,8 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     """
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
-    if path.is_dir() and (own := unsupported.explain_own(path)) is not None:
-        return Diagnosis(path, problems=(BadRecord.of(own, path),))
+    if path.is_dir() and (error := unsupported.explain_own(path)) is not None:
+        return Diagnosis(path, problems=(BadRecord.of(error, path),))
     data = attempt(survey, path, format, file=path)
     if isinstance(data, BadRecord):
         return Diagnosis(path, problems=(data,))
@@ -126,7 +126,7 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
 
 
 def _merge(sample: Sequence[Description]) -> Description:
-    """One description for files of one data set and version."""
+    """Merge the descriptions of files of one data set and version."""
     flavours = sorted({description.flavour for description in sample})
     more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
     counts = [description.recordings for description in sample if description.recordings is not None]
@@ -140,7 +140,7 @@ def _merge(sample: Sequence[Description]) -> Description:
 
 
 def _notes(sample: Sequence[Description]) -> Iterator[str]:
-    """The most frequent notes on some files, each with the number of its files unless all have it."""
+    """Yield the most frequent notes on some files, each with the number of its files unless all have it."""
     counts = Counter(note for description in sample for note in dict.fromkeys(description.notes))
     for note, times in counts.most_common(_NOTES):
         yield note if times == len(sample) else f"{note} (in {times} of {len(sample)} files)"
@@ -149,7 +149,7 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Missing shards of numbered families (``NAME-00003-of-00150``), a sentence each; more than 8 runs stay unnamed."""
+    """Describe missing shards of numbered families (``NAME-00003-of-00150``) in a sentence each, with up to 8 runs."""
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
@@ -182,8 +182,8 @@ class Estimate:
 
     def check(self, out: Path, written: int = 0) -> None:
         """Refuse a set that will not fit; ``written`` of its scenarios are on the disk already."""
-        needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
-        check_space(out, needed, "make room, choose another disk, or use --limit")
+        size_bytes = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
+        check_space(out, size_bytes, "make room, choose another disk, or use --limit")
 
 
 def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
@@ -226,8 +226,8 @@ def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
 
 
 def count_text(number: int, noun: str) -> str:
-    """A number with its noun in the singular or plural."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+    """Return a number with its noun in the singular or plural."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _size(paths: Sequence[Path]) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from drivax.datasets.export.recording import restore
-from drivax.datasets.parsing import MPS_PER_MPH
+from drivax.datasets.parsing import MPS_PER_MPH, subdivide
 from drivax.datasets.womd.messages import ORIGIN
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
@@ -259,10 +259,8 @@ def _sample(feature: MapFeature, spacing_m: float) -> _Array:
     if feature.kind in POLYGON_KINDS:
         points = np.concatenate((points, points[:1]))
     step = np.diff(points, axis=0)
-    parts = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing_m), 1).astype(np.int64)
-    row = np.repeat(np.arange(len(step)), parts)
-    fraction = (np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[row]
-    return np.concatenate((points[row] + fraction[:, None] * step[row], points[-1:]))
+    pieces = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing_m), 1).astype(np.int64)
+    return np.concatenate((subdivide(points[:-1], step, pieces), points[-1:]))
 
 
 def _directions(line: _Array) -> _Array:

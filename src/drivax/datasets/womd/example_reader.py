@@ -26,7 +26,7 @@ from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate
-from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, Flag, LightState, RoadKind
+from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, Flag, LightState, RoadKind
 
 #: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
 _EXACT = 2**24
@@ -183,9 +183,13 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
 
 
 def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
-    """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
+    """Return seconds of every step; where no valid state has a time, 10 Hz from the nearest step before, else after."""
     micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
-    return parsing.fill_times(np.where(micros >= 0, micros * 1e-6, np.nan))
+    steps, known = np.arange(len(micros)), np.flatnonzero((micros >= 0) & np.isfinite(micros))
+    if known.size == 0:
+        return steps * DT_S
+    nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
+    return micros[nearest] * 1e-6 + (steps - nearest) * DT_S
 
 
 def _ego_row(features: ExampleFeatures, rows: Array) -> int:
