@@ -80,7 +80,7 @@ class NuScenes:
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
-        """Version, number of scenes, missing tables and maps."""
+        """Describe version, number of scenes, missing tables and maps."""
         folder = path.parent
         absent = (table for table in _TABLES if not (folder / f"{table}.json").is_file())
         missing = [f"{folder.name}/{table}.json" for table in absent]
@@ -97,14 +97,14 @@ class NuScenes:
         return Description("nuScenes", flavour, folder.name, scenes, tuple(notes), tuple(missing))
 
     def count(self, path: Path) -> int:
-        """Scenes times the windows of a usual scene; 0 if the table is unreadable."""
+        """Return the number of scenes times the windows of a usual one; 0 if the table is unreadable."""
         try:
             return len(scene_rows(path.parent)) * windows_of(_SCENE_STEPS)
         except DataError:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The scenes in file order, and a bad record in place of each that cannot be read."""
+        """Yield the scenes in file order, and a bad record in place of each that cannot be read."""
         tables = attempt(Tables.read, path.parent, file=path)
         if isinstance(tables, BadRecord):
             yield tables
@@ -114,7 +114,7 @@ class NuScenes:
 
 
 def _maps(path: Path) -> Path:
-    """The folder of city maps: where the devkit expects it, or where the archive unpacks them."""
+    """Return the folder of city maps: where the devkit expects it, or where the archive unpacks them."""
     root = path.parent.parent
     expansion = root / "maps" / "expansion"
     folders = (expansion, root / "maps", root / "expansion")
@@ -141,8 +141,8 @@ def _recording(tables: Tables, row: int, maps: Path) -> Recording:
     tracks = _tracks(_sort_by_time(poses), *tables.observations(samples), begin + times)
     if not tracks.valid[0].any():
         raise DataError("the ego has no pose during the scene", cure=_AGAIN)
-    whole = city(maps / f"{Path(location).name}.json")
-    tracks, features = flatten(tracks, whole.around(tracks.xy[0][tracks.valid[0]], MARGIN_M))
+    city_map = city(maps / f"{Path(location).name}.json")
+    tracks, features = flatten(tracks, city_map.around(tracks.xy[0][tracks.valid[0]], MARGIN_M))
     return Recording(
         scenario_id=scene["name"],
         dataset="nuscenes",
@@ -153,7 +153,7 @@ def _recording(tables: Tables, row: int, maps: Path) -> Recording:
         tracks=tracks,
         features=features,
         tags={"source_format": "nuscenes"} | place_tags(location),
-        lost=nonzero(whole.lost, unknown_fields=tables.unknown_fields),
+        lost=nonzero(city_map.lost, unknown_fields=tables.unknown_fields),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
@@ -187,7 +187,7 @@ def _tracks(
 def interpolate(
     seen_s: Float64[Array, " row"], pose: Float64[Array, "row 3"], times: Float64[Array, " time"]
 ) -> tuple[Float64[Array, "time 5"], Bool[Array, " time"]]:
-    """Position, heading and velocity between observations.
+    """Interpolate position, heading and velocity between observations.
 
     Positions follow a cubic Hermite spline whose tangents are central differences (one-sided at the ends), velocities
     are its derivative, headings are linear after unwrapping. Steps before the first and after the last observation and
@@ -208,15 +208,15 @@ def interpolate(
     for run in (run for run in runs if len(run)):
         knots, xy = seen_s[run], pose[run, :2]
         # Half a step of tolerance: the ends of a run fall between steps.
-        inside = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
-        time = np.clip(times[inside], knots[0], knots[-1])
+        steps = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
+        time = np.clip(times[steps], knots[0], knots[-1])
         if len(run) == 1:
-            state[inside, :3] = pose[run[0]]
+            state[steps, :3] = pose[run[0]]
         else:
             spline = CubicHermiteSpline(knots, xy, np.gradient(xy, knots, axis=0))
-            state[inside, :2], state[inside, 3:] = spline(time), spline(time, 1)
-            state[inside, 2] = np.interp(time, knots, np.unwrap(pose[run, 2]))
-        valid |= inside
+            state[steps, :2], state[steps, 3:] = spline(time), spline(time, 1)
+            state[steps, 2] = np.interp(time, knots, np.unwrap(pose[run, 2]))
+        valid |= steps
     state[:, 2] = np.where(valid, wrap(state[:, 2]), 0.0)
     return state, valid
 
@@ -290,20 +290,20 @@ class Tables:
 
 
 def _unknown_fields(folder: Path) -> int:
-    """Number of tables, and of fields in the first rows of those that are read, with unknown names."""
+    """Count unknown tables, and unknown fields in the first rows of those that are read."""
     fields = {name for table in _TABLES for name in next(rows(folder / f"{table}.json"), {})}
     tables = {path.stem for path in folder.glob("*.json")}
     return len(fields - _FIELDS) + len(tables.difference(_TABLES, _OTHERS))
 
 
 def _sort_by_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
-    """Rows in the order of their first column, the first of several at one time."""
+    """Return rows in the order of their first column, the first of several at one time."""
     _, first = np.unique(table[:, 0], return_index=True)
     return table[first]
 
 
 def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64[Array, "pose 5"]:
-    """Ego poses of the lidar's frames: scene row, time, x, y, heading."""
+    """Read ego poses of the lidar's frames: scene row, time, x, y, heading."""
     scene_of_pose: dict[str, int] = {}
     for row in _table(folder, "sample_data"):
         sample = samples.get(row.text("sample_token"), -1)
@@ -322,7 +322,7 @@ def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64
 def _annotations(
     folder: Path, samples: Mapping[str, int], instances: Mapping[str, int]
 ) -> Float64[Array, "annotation 8"]:
-    """Annotations: sample row, instance row, x, y, heading, length, width, height."""
+    """Read annotations: sample row, instance row, x, y, heading, length, width, height."""
     table = array("d")
     for row in _table(folder, "sample_annotation"):
         sample = samples.get(row.text("sample_token"), -1)
@@ -337,7 +337,7 @@ def _annotations(
 
 
 def scene_rows(folder: Path) -> list[dict[str, str]]:
-    """The rows of ``scene.json``: token, name and log_token of each."""
+    """Read token, name and log_token of each row of ``scene.json``."""
     names = ("token", "name", "log_token")
     return [{name: row.text(name) for name in names} for row in _table(folder, "scene")]
 
@@ -351,12 +351,12 @@ def has_annotations(folder: Path) -> bool:
 
 
 def kind_of(category: str) -> AgentKind:
-    """The class of a nuScenes category (``vehicle.car``, ``human.pedestrian.adult``, ...)."""
+    """Return the class of a nuScenes category (``vehicle.car``, ``human.pedestrian.adult``, ...)."""
     return next((kind for start, kind in _KINDS if category.startswith(start)), AgentKind.OTHER)
 
 
 def yaw(w: float, x: float, y: float, z: float) -> float:
-    """Heading of a unit quaternion (w, x, y, z): the direction of its x axis in the plane, radians."""
+    """Return the heading of a unit quaternion (w, x, y, z): the direction of its x axis in the plane, radians."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
@@ -390,13 +390,13 @@ def _is_number(value: Any) -> bool:
 
 
 def _table(folder: Path, name: str) -> Iterator[_Row]:
-    """Rows of a table of a version, one by one."""
+    """Yield the rows of a table of a version."""
     file = folder / f"{name}.json"
     return (_Row(row, file) for row in rows(file))
 
 
 def rows(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects of a file that holds one array of objects; it is never held in memory as a whole."""
+    """Yield the objects of a file that holds one array of objects, which is never in memory as a whole."""
     check_regular(path, _AGAIN)
     decoder = json.JSONDecoder()
     number = 0
@@ -415,10 +415,10 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                 try:
                     row, end = decoder.raw_decode(text, position)
                 except ValueError:  # The row goes on in the next chunk, unless the file is damaged.
-                    more = file.read(_CHUNK)
-                    if not more or len(text) - position > _LONGEST:
+                    chunk = file.read(_CHUNK)
+                    if not chunk or len(text) - position > _LONGEST:
                         raise
-                    text, position = text[position:] + more, 0
+                    text, position = text[position:] + chunk, 0
                     continue
                 if not isinstance(row, dict):
                     raise DataError("is not an object", file=path, record=number, cure="download it again")

@@ -120,7 +120,7 @@ def _recording(
     future.
     """
     tracks = _tracks(table, rows)
-    features, truncated = _map_features(table)
+    features, is_full = _map_features(table)
     lights, lost_lights = _lights(table, features)
     scenario_id = table.scenario_id(payload)
     recording = Recording(
@@ -142,14 +142,14 @@ def _recording(
             lights_without_place=lost_lights,
             unknown_fields=table.count_unknown(),
         ),
-        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
+        flags=Flag.TRUNCATED_MAP if is_full else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
     return parsing.shift(recording, table.origin())
 
 
 def _track_ids(features: ExampleFeatures, rows: Array) -> Array:
-    """Ids of the rows, which are stored as floats; refuse those that may have been rounded."""
+    """Return ids of the rows, which are stored as floats; refuse those that may have been rounded."""
     ids = features.numbers("state/id")[rows]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
         raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
@@ -211,8 +211,8 @@ def _lights(features: ExampleFeatures, road_map: Sequence[MapFeature]) -> tuple[
             lanes = features.integers(base + "id", (steps, slots))
             states, valid = (features.numbers(base + name, (steps, slots)) for name in ("state", "valid"))
             points = np.stack([features.numbers(base + axis, (steps, slots)) for axis in "xyz"], axis=-1)
-            observed = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
-            for step, slot in np.argwhere(observed).tolist():
+            is_observed = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
+            for step, slot in np.argwhere(is_observed).tolist():
                 collector.observe(
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
@@ -221,7 +221,7 @@ def _lights(features: ExampleFeatures, road_map: Sequence[MapFeature]) -> tuple[
 
 
 def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
-    """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
+    """Return map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
         return (), False
@@ -242,14 +242,14 @@ def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bo
 
 
 def _groups(ids: Array, keep: Array) -> list[Array]:
-    """Point numbers of each feature, features in order of first appearance."""
+    """Return the point numbers of each feature, features in order of first appearance."""
     order = keep[np.argsort(ids[keep], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(ids[order])) + 1)
     return sorted(groups, key=lambda group: group[0]) if keep.size else []
 
 
 def _limits(features: ExampleFeatures, count: int) -> Array:
-    """Speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
+    """Return speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
     name = "roadgraph_samples/speed_limit"
     if not features.has(name):
         return np.zeros(count)
@@ -258,9 +258,9 @@ def _limits(features: ExampleFeatures, count: int) -> Array:
 
 
 def _open_ring(points: Array) -> Array:
-    """A ring without its repeated last point: map features are closed implicitly."""
-    closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
-    return points[:-1] if closed else points
+    """Drop the repeated last point of a ring: map features are closed implicitly."""
+    is_closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
+    return points[:-1] if is_closed else points
 
 
 def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
@@ -269,7 +269,7 @@ def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
 
 
 def _paths(features: ExampleFeatures) -> int:
-    """Number of paths of the ego in the file."""
+    """Count paths of the ego in the file."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0
     valid = features.numbers("path_samples/valid") == 1

@@ -124,12 +124,12 @@ class TfRecordReader:
 
 
 def agent_kind(code: int) -> AgentKind:
-    """The class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
+    """Return the class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
     return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """Notes for users about recordings like this one: length, future, lights."""
+    """Return notes for users about recordings like this one: length, future, lights."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

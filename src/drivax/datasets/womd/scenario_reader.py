@@ -73,18 +73,18 @@ class WomdScenario(womd.TfRecordReader):
         """Describe the first record: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
-        linked = any(lane.successors or lane.predecessors for lane in lanes)
+        has_links = any(lane.successors or lane.predecessors for lane in lanes)
         notes = list(womd.notes_of(recording))
-        if not linked:
+        if not has_links:
             notes.append("no lane graph in the first record: lanes are chained by geometry")
-        driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
-        version = "1.2 or later" if driveways else "1.1 or later" if linked else None
+        has_driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
+        version = "1.2 or later" if has_driveways else "1.1 or later" if has_links else None
         flavour = "Scenario protos in TFRecord"
         return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
 
 
 def _unknown_fields(message: Any, payload: bytes) -> int:
-    """Number of fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
+    """Count fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
     states = {len(state): state for track in message.tracks for state in track.states}
     pairs = ((parse(STATES.name, blob), blob) for blob in states.values())
     in_states = (unknown_fields(state, blob) for state, blob in pairs if state is not None)
@@ -102,13 +102,13 @@ def _check(message: Any, steps: int) -> None:
     parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
         raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=SKIP)
-    seen = set()
+    ids = set()
     for track in message.tracks:
         if len(track.states) != steps:
             raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=SKIP)
-        if track.id in seen:
+        if track.id in ids:
             raise DataError(f"two tracks have the id {track.id}", cure=SKIP)
-        seen.add(track.id)
+        ids.add(track.id)
 
 
 def _tracks(tracks: Any, steps: int) -> Tracks:
@@ -172,7 +172,7 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
 
 
 def _blobs(kind: str, body: Any) -> Sequence[bytes]:
-    """The serialised points of a feature."""
+    """Return the serialised points of a feature."""
     if kind == "stop_sign":
         return [body.position] if body.HasField("position") else []
     return body.polygon if kind in _POLYGONS else body.polyline
