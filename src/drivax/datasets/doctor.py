@@ -169,12 +169,11 @@ def gaps(paths: Sequence[Path]) -> list[str]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Size of a conversion and free space of the disk; ``sampled`` if only some of the files were counted."""
+    """Size of a conversion and free space of the disk."""
 
     scenarios: int
     size_bytes: int
     free_bytes: int
-    sampled: bool = False
 
     def __str__(self) -> str:
         size, free = format_bytes(self.size_bytes), format_bytes(self.free_bytes)
@@ -196,17 +195,15 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         stride: Steps between the starts of two windows.
         limit: The most scenarios, None for all.
     """
-    total, sampled = 0.0, False
+    total = 0.0
     for name in data.formats:
         paths = data.paths(name)
-        step = -(-len(paths) // _COUNT_FILES)
-        sample = paths[::step]
-        sampled |= step > 1
-        scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
+        sample = paths[:: -(-len(paths) // _COUNT_FILES)]
         reader = with_steps(find_reader(name), capacity.steps)
-        total += scale * sum(_count(reader, path, stride, capacity.steps) for path in sample)
+        count = sum(_count(reader, path, stride, capacity.steps) for path in sample)
+        total += _size(paths) / max(_size(sample), 1) * count
     scenarios = round(total) if limit is None else min(round(total), limit)
-    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
+    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out))
 
 
 def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
