@@ -25,7 +25,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.datasets.formats import detect, find_files
+from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, replay
 from drivax.geometry.boxes import corners
@@ -79,7 +79,7 @@ def cases(data: Path | None, world: int) -> Iterator[Case]:
         yield Case("built-in world: ego", assemble(generate_recording(0, index)))
     if data is None:
         return
-    for file in find_files(data)[0]:
+    for file in survey(data).paths():
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
                 raise SystemExit(str(recording.error()))

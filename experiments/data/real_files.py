@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from drivax.api import find_planner
-from drivax.datasets.formats import detect, find_files
+from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
@@ -43,7 +43,7 @@ TRAFFIC = ("log", "idm")
 
 def read_scenarios(data: Path) -> Iterator[tuple[str, Scenario]]:
     """Yield every scenario of every file, with the name of the file relative to the folder."""
-    for file in find_files(data)[0]:
+    for file in survey(data).paths():
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
                 raise SystemExit(str(recording.error()))

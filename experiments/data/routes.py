@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.datasets.formats import detect, find_files
+from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import BadRecord
 from drivax.geometry.polylines import point_to_segment, project
 from drivax.geometry.vectors import wrap
@@ -122,7 +122,7 @@ def recordings(data: Path | None, world: int) -> Iterator[tuple[str, Recording]]
     """Yield windows of the built-in world and of all real files."""
     for index in range(world):
         yield "built-in world", generate_recording(0, index)
-    for file in find_files(data)[0] if data else ():
+    for file in survey(data).paths() if data else ():
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
                 raise SystemExit(str(recording.error()))

@@ -24,6 +24,7 @@ from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.doctor import estimate
 from drivax.datasets.formats import find_reader, survey
 from drivax.datasets.reader import BadRecord
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario, record_dtype
@@ -412,7 +413,7 @@ def test_plan_is_announced_before_the_work(thirty, tmp_path):
     assert plan.data.formats == {"womd-scenario": 3} and plan.written == 0
     assert plan.estimate.scenarios == 7
     assert plan.estimate.size_bytes == 7 * record_dtype(CAPACITIES["default"]).itemsize
-    assert plan.estimate.free_bytes > 0 and not plan.estimate.sampled
+    assert plan.estimate.free_bytes > 0
 
 
 def test_length_of_scenarios_is_an_option_and_a_property_of_the_set(wire, tmp_path):
@@ -439,9 +440,13 @@ def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
     for number in range(12):
         (tmp_path / "src" / f"{number:02d}.tfrecord").write_bytes(record * (1 + number % 3))
     found = survey(tmp_path / "src")
+    counted, count = [], WomdScenario.count
+    monkeypatch.setattr(
+        WomdScenario, "count", lambda self, path: counted.append(path.stem) or count(self, path)
+    )
     guess = estimate(found, tmp_path / "set", CAPACITIES["default"], 40, None)
     # Files 0, 3, 6 and 9 are counted, one record each; the others are two and three times as large.
-    assert guess.sampled and guess.scenarios == 24
+    assert counted == ["00", "03", "06", "09"] and guess.scenarios == 24
     assert estimate(found, tmp_path / "set", CAPACITIES["default"], 40, 10).scenarios == 10
 
 

@@ -76,7 +76,7 @@ def test_without_a_map_agents_stand_at_zero():
 
 
 def test_a_map_of_absurd_length_costs_no_memory(monkeypatch):
-    monkeypatch.setattr(parsing, "MOST_SAMPLES", 50)
+    monkeypatch.setattr(parsing, "_MOST_SAMPLES", 50)
     far = MapFeature(1, RoadKind.LANE_SURFACE, np.array([[0.0, 0, 0], [1e7, 0, 10]]))
     assert len(parsing._samples([far])) <= 52
     assert lift(tracks([[1e7, 0], [0, 0]]), [far]).z[0, 0] == pytest.approx(10.8)

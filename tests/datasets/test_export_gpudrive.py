@@ -20,7 +20,7 @@ from scenario.recordings import FAR, driving, make_recording, make_tracks, moved
 
 @pytest.fixture(scope="module")
 def source():
-    return protos.decode(womd_scenario.scenario())
+    return protos.WomdScenario().decode(womd_scenario.scenario())
 
 
 @pytest.fixture(scope="module")

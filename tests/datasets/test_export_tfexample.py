@@ -152,7 +152,7 @@ def over_time(found: dict[str, np.ndarray], name: str, kind: str = "state") -> n
 
 @pytest.fixture(scope="module")
 def source():
-    return protos.decode(womd_scenario.scenario())
+    return protos.WomdScenario().decode(womd_scenario.scenario())
 
 
 @pytest.fixture(scope="module")
@@ -375,7 +375,7 @@ def test_coordinates_beyond_float32_become_local():
     for text in (b"1 2", b"1 2 nan", b"x y z"):
         features = tf_example(assemble(make_recording()))[0] | {ORIGIN: text}
         with pytest.raises(DataError, match=f"{ORIGIN} is not a position"):
-            womd_example.decode(example(features))
+            womd_example.WomdExample().decode(example(features))
     near = table(assemble(moved(make_recording(), np.array([8000.0, -9000.0, 12.0]))))
     np.testing.assert_allclose(over_time(near, "x")[0], driving()[:, 0] + 8000.0, atol=1e-3)
 
@@ -408,7 +408,7 @@ def test_item_20_short_recordings_have_no_future():
     stored = assemble(make_recording(tracks=tracks))
     found = table(stored)
     assert over_time(found, "valid")[0].tolist() == [1] * 11 + [0] * 80
-    again = assemble(womd_example.decode(example(tf_example(stored)[0])))
+    again = assemble(womd_example.WomdExample().decode(example(tf_example(stored)[0])))
     assert Flag.NO_FUTURE in again.has
 
 
@@ -433,7 +433,7 @@ def round_trip(recording, tolerance_m: float = 1e-3):
     stored = assemble(recording)
     payload = example(tf_example(stored)[0])
     assert womd.flavour(payload) == womd.EXAMPLE_FORMAT  # not taken for ScenarioMax's
-    back = womd_example.decode(payload)
+    back = womd_example.WomdExample().decode(payload)
     kept = restore(stored)
     rows = [kept.tracks.track_id.tolist().index(number) for number in back.tracks.track_id]
     assert sorted(rows) == list(range(len(kept.tracks.kind)))

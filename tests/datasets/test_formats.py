@@ -11,7 +11,7 @@ import pytest
 
 from datasets import samples
 from drivax.datasets.conversion import convert
-from drivax.datasets.formats import READERS, detect, find_files, find_reader, survey
+from drivax.datasets.formats import READERS, detect, find_reader, survey
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 
@@ -65,7 +65,8 @@ def test_a_mixed_folder_is_sorted_by_content(sampled):
     }
     every = sum(path.is_file() for path in sampled[0].rglob("*"))
     assert found.ignored == 0 and found.companions == every - len(READERS) > 0
-    assert find_files(sampled[0]) == ([one.path for one in found.inputs], 0)
+    assert found.paths() == [one.path for one in found.inputs]
+    assert found.paths("gpudrive") == [sampled[1]["gpudrive"]] and found.paths(None) == []
 
 
 def test_names_are_relative_to_what_was_given(sampled, tmp_path):
@@ -158,16 +159,19 @@ def test_folder_is_searched_to_any_depth_in_order(wire, write_records, tmp_path)
     damaged = write_records("c/damaged.tfrecord")
     write_records("b/.hidden.tfrecord", wire.scenario())
     (tmp_path / "b" / "README.md").write_text("read me")
-    assert find_files(tmp_path) == ([first, second, damaged], 1)
+    found = survey(tmp_path)
+    assert (found.paths(), found.ignored) == ([first, second, damaged], 1)
+    assert found.paths(None) == [damaged]
     # By name the damaged one may belong to either format; by content the renamed one is an example.
-    assert find_files(tmp_path, "womd-example") == ([first, second, damaged], 1)
-    assert find_files(second) == ([second], 0)
+    found = survey(tmp_path, "womd-example")
+    assert (found.paths(), found.ignored) == ([first, second, damaged], 1)
+    assert survey(second).paths() == [second]
 
 
 def test_folder_without_recordings(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"1,2")
     with pytest.raises(DataError, match="none of the 1 files") as caught:
-        find_files(tmp_path)
+        survey(tmp_path)
     assert caught.value.file == tmp_path and caught.value.cure
     with pytest.raises(DataError, match="does not exist"):
-        find_files(tmp_path / "none")
+        survey(tmp_path / "none")

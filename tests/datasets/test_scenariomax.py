@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.datasets.scenariomax import ScenarioMax, decode
-from drivax.datasets.womd.example_reader import WomdExample
-from drivax.datasets.womd.example_reader import decode as decode_womd
+from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.records import flavour
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
+
+decode = ScenarioMax().decode
 
 
 @pytest.fixture(scope="module")
@@ -195,8 +195,8 @@ def test_describe_and_count(wire, write_records):
 def test_womd_reader_would_take_padding_for_tracks(wire):
     """Why the format is detected: WOMD's reader refuses or misreads what ScenarioMax writes."""
     with pytest.raises(DataError, match="names a track twice"):
-        decode_womd(wire.scenariomax(**{"state/id": wire.floats([0, 1, 2, 0, 0])}))
-    assert len(decode_womd(wire.scenariomax()).lights) == 2
+        WomdExample().decode(wire.scenariomax(**{"state/id": wire.floats([0, 1, 2, 0, 0])}))
+    assert len(WomdExample().decode(wire.scenariomax()).lights) == 2
 
 
 def test_mutated_payloads_never_crash(wire):

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.datasets.womd.example_reader import WomdExample, decode
+from drivax.datasets.womd.example_reader import WomdExample
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
+
+decode = WomdExample().decode
 
 
 @pytest.fixture(scope="module")

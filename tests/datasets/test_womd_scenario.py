@@ -15,11 +15,13 @@ from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd import messages
 from drivax.datasets.womd.records import notes_of
-from drivax.datasets.womd.scenario_reader import WomdScenario, decode
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature, Recording, windows
 from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind
+
+decode = WomdScenario().decode
 
 
 @pytest.fixture(scope="module")
@@ -319,10 +321,11 @@ def test_sensor_fields_are_skipped(wire, tmp_path):
     path = tmp_path / "payload"
     path.write_bytes(payload)
     program = (
-        "import resource, sys; from pathlib import Path; from drivax.datasets.womd.scenario_reader import decode\n"
+        "import resource, sys; from pathlib import Path\n"
+        "from drivax.datasets.womd.scenario_reader import WomdScenario\n"
         "payload = Path(sys.argv[1]).read_bytes()\n"
         "def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
-        "before = peak(); decode(payload); print((peak() - before) / len(payload))"
+        "before = peak(); WomdScenario().decode(payload); print((peak() - before) / len(payload))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivax.api import load
-from drivax.datasets.formats import detect, find_files
+from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, audit
 from drivax.evaluation.rollout import drive, episode_keys, evaluation_task
@@ -245,7 +245,7 @@ def test_agents_on_another_level_do_not_collide():
 def test_logged_ego_of_every_real_file_is_clean(real_data):
     """No collision, at most 1 % of the steps off the road, and no false finding on the overpass (by heights)."""
     scenarios = []
-    for file in find_files(real_data)[0]:
+    for file in survey(real_data).paths():
         for recording in detect(file).read(file):
             assert not isinstance(recording, BadRecord), recording
             scenarios += [assemble(window) for window in windows(recording)]

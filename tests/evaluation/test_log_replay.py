@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from drivax.datasets.formats import detect, find_files
+from drivax.datasets.formats import detect, survey
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
@@ -42,7 +42,7 @@ def generated(seed, count):
 def real_windows(folder):
     """Windows of the egos of all real files, and their audit findings."""
     scenarios = []
-    for file in find_files(folder)[0]:
+    for file in survey(folder).paths():
         for recording in detect(file).read(file):
             scenarios += [assemble(window) for window in windows(recording)]
     return scenarios, audit(scenarios)

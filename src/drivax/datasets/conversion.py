@@ -19,9 +19,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from drivax.datasets.doctor import Estimate, estimate
+from drivax.datasets.doctor import Estimate, count_text, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
-from drivax.datasets.reader import BadRecord, Reader, of_length
+from drivax.datasets.reader import BadRecord, Reader, with_steps
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
 from drivax.reading import check_regular
@@ -34,6 +34,8 @@ from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, manifest_entry
 
 _Result = TypeVar("_Result")
+#: Options that do not change the bytes of a set.
+_WITHOUT_EFFECT = ("workers", "strict", "overwrite")
 #: Scenarios that are audited together.
 _BATCH = 64
 #: Bytes of the head and of the tail of a source that identify it.
@@ -86,9 +88,9 @@ class Conversion:
         """Check the options."""
         if self.format != AUTO:
             find_reader(self.format)
-        for name, known in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
-            if (value := getattr(self, name)) not in known:
-                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(known)}")
+        for name, choices in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
+            if (value := getattr(self, name)) not in choices:
+                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(choices)}")
         for name in ("limit", "stride", "workers", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -98,7 +100,7 @@ class Conversion:
 
     @property
     def sizes(self) -> Capacity:
-        """Padded sizes of a scenario of this length."""
+        """Padded sizes of the scenarios."""
         return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
 
     @property
@@ -122,7 +124,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
         yield BadRecord.of(error, path)
         return
     count = 0
-    for item in _read(of_length(reader, options.sizes.steps), path):
+    for item in _read(with_steps(reader, options.sizes.steps), path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
             count += isinstance(result, Scenario)
@@ -152,10 +154,10 @@ def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterato
         yield _attempt(partial(assemble, piece, capacity, options.routes), path, piece.scenario_id)
 
 
-def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    """Return the result of a call, or the bad record that its error describes."""
+def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
+    """Call a function; return the bad record of any error in place of a result."""
     try:
-        return call()
+        return function()
     except DrivaxError as error:
         return BadRecord.of(error, path, record)
     except Exception as error:  # one odd recording must not end a conversion of a hundred thousand
@@ -254,7 +256,7 @@ def convert(
 
 
 def _source(data: Survey, options: Conversion) -> dict[str, Any]:
-    """Source of the set, for its manifest."""
+    """Return the source of the set, for its manifest."""
     return {
         "command": "convert",
         "format": options.format,
@@ -266,29 +268,17 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """All that the bytes of the set depend on; only a conversion with the same identity resumes another."""
+    """Return all that the bytes of the set depend on; only a conversion with the same identity resumes another."""
     digest = hashlib.sha256()
     for entry in data.inputs:
         size, ends = _ends(entry.path)
         digest.update(f"{data.relative(entry.path)}\t{size}\t{entry.format}\t{ends}\n".encode())
-    names = (
-        "format",
-        "capacity",
-        "future_s",
-        "egos",
-        "limit",
-        "filters",
-        "routes",
-        "stride",
-        "split",
-        "shard_size",
-    )
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
         "files": digest.hexdigest(),
         "audit": has_audit,
-        **{name: getattr(options, name) for name in names},
+        **{name: value for name, value in vars(options).items() if name not in _WITHOUT_EFFECT},
     }
 
 
@@ -358,16 +348,17 @@ class _Sink:
             self._write_batch()
 
     def skipped_rows(self) -> dict[str, Any]:
-        """Records that are not in the set, for its manifest."""
-        rows = [_row(self._data, bad) for bad in self.skipped]
-        rows = [{name: value for name, value in row.items() if name != "cure"} for row in rows]
+        """Return the records that are not in the set, for its manifest."""
+        rows = [_row(self._data, record) for record in self.skipped]
+        for row in rows:
+            del row["cure"]
         return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
 
     def _batch_size(self) -> int:
-        """Number of scenarios to wait for: 1 without an audit, else a batch that ends with the shard or the limit."""
+        """Return the number of scenarios to wait for: 1 without an audit, else up to the end of the shard or limit."""
         if self._audit is None:
             return 1
-        if self._options.filters:  # the number of kept scenarios is unknown
+        if self._options.filters:  # the number of scenarios that pass is unknown
             return _BATCH
         remaining = _BATCH if self._options.limit is None else self._options.limit - len(self._writer)
         return min(_BATCH, self._writer.room, remaining)
@@ -392,16 +383,16 @@ class _Sink:
                 return
 
     def _drop_duplicates(self, batch: list[_Item]) -> list[Scenario | BadRecord]:
-        """The items of a batch, with bad records in place of duplicates."""
+        """Return the items of a batch, with bad records in place of duplicates."""
         items: list[Scenario | BadRecord] = []
-        seen: set[tuple[str, str]] = set()
+        keys: set[tuple[str, str]] = set()
         for item, (file, _) in batch:
             if isinstance(item, Scenario):
                 key = item.text("dataset"), item.id
-                if key in self._writer or key in seen:
+                if key in self._writer or key in keys:
                     problem, cure = "the scenario is in the set already", "give each file once"
                     item = BadRecord(self._data.inputs[file].path, item.id, problem, cure)
-                seen.add(key)
+                keys.add(key)
             items.append(item)
         return items
 
@@ -413,15 +404,15 @@ class _Sink:
         if self._writer.room > 1:
             self._writer.add(scenario)
             return False
-        rows = [_row(self._data, bad) for bad in self.skipped[self._notes :]]
+        rows = [_row(self._data, record) for record in self.skipped[self._notes :]]
         self._notes = len(self.skipped)
         self._writer.add(scenario, {"place": place, "filtered": self.filtered, "skipped": rows})
         return True
 
 
-def _row(data: Survey, bad: BadRecord) -> dict[str, Any]:
-    """A bad record as JSON values."""
-    return {"file": data.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
+def _row(data: Survey, record: BadRecord) -> dict[str, Any]:
+    """Return a bad record as JSON values."""
+    return {**vars(record), "file": data.relative(record.file)}
 
 
 def _drain(
@@ -448,7 +439,7 @@ def _drain(
 def _results(
     data: Survey, options: Conversion, first: int, folder: Path
 ) -> Generator[Iterator[Scenario | BadRecord], None, None]:
-    """Scenarios and bad records of every file from number ``first`` on."""
+    """Yield the scenarios and bad records of each file from number ``first`` on."""
     inputs = data.inputs[first:]
     tasks = [(entry.path, replace(options, format=entry.format or options.format)) for entry in inputs]
     if options.workers == 1 or len(tasks) <= 1:
@@ -464,9 +455,8 @@ def _empty_error(data: Survey, sink: _Sink) -> DataError:
         return DataError(problem, file=data.root, cure="use wider filters")
     if not sink.skipped:
         return DataError("contains no recording", file=data.root, cure="run drivax doctor on it")
-    first, *others = sink.skipped
-    if not others:
-        return first.error()
-    records = f"{len(others)} record{'s' if len(others) > 1 else ''}"
-    problem = f"{first.problem} (and none of the other {records} could be converted)"
-    return replace(first, problem=problem).error()
+    first, others = sink.skipped[0], len(sink.skipped) - 1
+    if others:
+        problem = f"{first.problem} (and none of the other {count_text(others, 'record')} could be converted)"
+        first = replace(first, problem=problem)
+    return first.error()

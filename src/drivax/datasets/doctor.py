@@ -12,7 +12,7 @@ import numpy as np
 
 from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, find_reader, survey
-from drivax.datasets.reader import BadRecord, Description, Reader, of_length
+from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with_steps
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
@@ -81,13 +81,11 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     """
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
-    own = unsupported.explain_own(path) if path.is_dir() else None
-    try:
-        if own is not None:
-            raise own
-        data = survey(path, format)
-    except DataError as error:
+    if path.is_dir() and (error := unsupported.explain_own(path)) is not None:
         return Diagnosis(path, problems=(BadRecord.of(error, path),))
+    data = attempt(survey, path, format, file=path)
+    if isinstance(data, BadRecord):
+        return Diagnosis(path, problems=(data,))
     parts, problems = _parts(data)
     if not parts and path.is_dir() and (error := unsupported.explain_folder(path)) is not None:
         problems.insert(0, BadRecord.of(error, path))
@@ -96,13 +94,13 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
         path=path,
         parts=parts,
         files=data.formats,
-        input_bytes=_size([entry.path for entry in data.inputs]),
+        input_bytes=_size(data.paths()),
         companions=data.companions,
         ignored=data.ignored,
         scenarios=expected.scenarios,
         set_bytes=expected.size_bytes,
         free_bytes=expected.free_bytes,
-        shards=tuple(gaps([entry.path for entry in data.inputs])),
+        shards=tuple(gaps(data.paths())),
         problems=tuple(problems),
         convertible=any(not part.description.missing for part in parts),
     )
@@ -111,25 +109,24 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     """Describe a sample of the files of each format, and list damaged files of it and files of no format."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    unknown = [entry.path for entry in data.inputs if entry.format is None][:_MOST_NAMES]
+    unknown = data.paths(None)[:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
-        files = [entry.path for entry in data.inputs if entry.format == name]
+        files = data.paths(name)
         step = -(-len(files) // _SAMPLE)
         for file in files[::step]:
-            try:
-                description = find_reader(name).describe(file)
-            except DataError as error:
-                problems.append(BadRecord.of(error, file))
-                continue
-            groups[name, description.dataset, description.version, step == 1].append(description)
+            description = attempt(find_reader(name).describe, file, file=file)
+            if isinstance(description, BadRecord):
+                problems.append(description)
+            else:
+                groups[name, description.dataset, description.version, step == 1].append(description)
     return tuple(
         Part(key[0], _merge(sample), len(sample), key[-1]) for key, sample in groups.items()
     ), problems
 
 
 def _merge(sample: Sequence[Description]) -> Description:
-    """One description for files of one data set and version."""
+    """Merge the descriptions of files of one data set and version."""
     flavours = sorted({description.flavour for description in sample})
     more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
     counts = [description.recordings for description in sample if description.recordings is not None]
@@ -143,7 +140,7 @@ def _merge(sample: Sequence[Description]) -> Description:
 
 
 def _notes(sample: Sequence[Description]) -> Iterator[str]:
-    """The most frequent notes on some files, each with the number of its files unless all have it."""
+    """Yield the most frequent notes on some files, each with the number of its files unless all have it."""
     counts = Counter(note for description in sample for note in dict.fromkeys(description.notes))
     for note, times in counts.most_common(_NOTES):
         yield note if times == len(sample) else f"{note} (in {times} of {len(sample)} files)"
@@ -152,7 +149,7 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Missing shards of numbered families (``NAME-00003-of-00150``), a sentence each; more than 8 runs stay unnamed."""
+    """Describe missing shards of numbered families (``NAME-00003-of-00150``) in a sentence each, with up to 8 runs."""
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
@@ -172,12 +169,11 @@ def gaps(paths: Sequence[Path]) -> list[str]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Size of a conversion and free space of the disk; ``sampled`` if only some of the files were counted."""
+    """Size of a conversion and free space of the disk."""
 
     scenarios: int
     size_bytes: int
     free_bytes: int
-    sampled: bool = False
 
     def __str__(self) -> str:
         size, free = format_bytes(self.size_bytes), format_bytes(self.free_bytes)
@@ -185,8 +181,8 @@ class Estimate:
 
     def check(self, out: Path, written: int = 0) -> None:
         """Refuse a set that will not fit; ``written`` of its scenarios are on the disk already."""
-        needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
-        check_space(out, needed, "make room, choose another disk, or use --limit")
+        size_bytes = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
+        check_space(out, size_bytes, "make room, choose another disk, or use --limit")
 
 
 def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
@@ -199,21 +195,19 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         stride: Steps between the starts of two windows.
         limit: The most scenarios, None for all.
     """
-    total, sampled = 0.0, False
+    total = 0.0
     for name in data.formats:
-        paths = [entry.path for entry in data.inputs if entry.format == name]
-        step = -(-len(paths) // _COUNT_FILES)
-        sample = paths[::step]
-        sampled |= step > 1
-        scale = _size(paths) / max(_size(sample), 1) if step > 1 else 1.0
-        reader = of_length(find_reader(name), capacity.steps)
-        total += scale * sum(count(reader, path, stride, capacity.steps) for path in sample)
+        paths = data.paths(name)
+        sample = paths[:: -(-len(paths) // _COUNT_FILES)]
+        reader = with_steps(find_reader(name), capacity.steps)
+        count = sum(_count(reader, path, stride, capacity.steps) for path in sample)
+        total += _size(paths) / max(_size(sample), 1) * count
     scenarios = round(total) if limit is None else min(round(total), limit)
-    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out), sampled)
+    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out))
 
 
-def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS) -> int:
-    """About how many scenarios a file becomes; 0 if it cannot be read."""
+def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
+    """Return about how many scenarios a file becomes; 0 if it cannot be read."""
     try:
         scenarios = reader.count(path)
         if (stride, length) == (STRIDE, STEPS) or scenarios == 0:
@@ -229,8 +223,8 @@ def count(reader: Reader, path: Path, stride: int = STRIDE, length: int = STEPS)
 
 
 def count_text(number: int, noun: str) -> str:
-    """A number with its noun in the singular or plural."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+    """Return a number with its noun in the singular or plural."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _size(paths: Sequence[Path]) -> int:

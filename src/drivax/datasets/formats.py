@@ -13,9 +13,8 @@ from drivax.datasets.gpudrive import GpuDrive
 from drivax.datasets.nuplan.reader import NuPlan
 from drivax.datasets.nuscenes.reader import NuScenes
 from drivax.datasets.reader import Reader
-from drivax.datasets.scenariomax import ScenarioMax
 from drivax.datasets.scenarionet.reader import ScenarioNet
-from drivax.datasets.womd.example_reader import WomdExample
+from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError, did_you_mean
 
@@ -48,14 +47,14 @@ def find_reader(name: str) -> Reader:
 
 
 def recognise(path: Path) -> Reader | None:
-    """The reader whose format a file's content is, if there is one."""
+    """Return the reader whose format a file's content is, if there is one."""
     # Readers whose patterns match come first: most files of a large folder are opened once.
     readers = sorted(READERS, key=lambda reader: not _matches(path, reader.patterns))
     return next((reader for reader in readers if reader.recognise(path)), None)
 
 
 def detect(path: str | Path) -> Reader:
-    """The reader whose format a file's content is.
+    """Return the reader whose format a file's content is.
 
     Raises:
         DataError: The file is missing, damaged at its beginning, or of no format that drivax reads.
@@ -93,8 +92,12 @@ class Survey:
         """Number of files by format, recognised ones only."""
         return Counter(entry.format for entry in self.inputs if entry.format is not None)
 
+    def paths(self, *formats: str | None) -> list[Path]:
+        """Return the files of some formats (None: of an unknown one); all without an argument."""
+        return [entry.path for entry in self.inputs if not formats or entry.format in formats]
+
     def relative(self, path: Path) -> str:
-        """A file's name in messages and manifests: its path below the root, or its own name."""
+        """Return a file's name in messages and manifests: its path below the root, or its own name."""
         inside = self.root.is_dir() and path.is_relative_to(self.root)
         return path.relative_to(self.root).as_posix() if inside else path.name
 
@@ -121,19 +124,12 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
         reader = only or recognise(src)
         return Survey(src, (Input(src, None if reader is None else reader.name),))
     readers = READERS if only is None else (only,)
-    visible = (path for path in sorted(src.rglob("*")) if not _hidden(path.relative_to(src)))
-    kinds = [_kind(path, readers) for path in visible if path.is_file()]
+    kinds = [_kind(path, readers) for path in sorted(src.rglob("*")) if _is_visible_file(path, src)]
     inputs = tuple(kind for kind in kinds if isinstance(kind, Input))
     companions = kinds.count("companion")
     if not inputs:
         raise _no_input_error(src, len(kinds), readers)
     return Survey(src, inputs, companions, len(kinds) - len(inputs) - companions)
-
-
-def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
-    """The files that :func:`survey` finds (it raises the same errors), and how many belong to no format."""
-    data = survey(src, name)
-    return [entry.path for entry in data.inputs], data.ignored
 
 
 def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
@@ -156,8 +152,8 @@ def _matches(path: Path, patterns: tuple[str, ...]) -> bool:
     return any(path.match(pattern) for pattern in patterns)
 
 
-def _hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
+def _is_visible_file(path: Path, folder: Path) -> bool:
+    return not any(part.startswith(".") for part in path.relative_to(folder).parts) and path.is_file()
 
 
 def _no_input_error(folder: Path, files: int, readers: tuple[Reader, ...]) -> DataError:

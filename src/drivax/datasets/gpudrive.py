@@ -15,7 +15,7 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.export.recording import restore
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
@@ -71,14 +71,14 @@ _KINDS = {int(kind): kind for kind in RoadKind}
 #: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
 #: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
-_ABSENT = ("z", "height")
+_OPTIONAL = ("z", "height")
 #: Decimals of metres (a tenth of a millimetre) and of headings.
 _DIGITS, _HEADING_DIGITS = 4, 6
 
 
 @dataclass(frozen=True)
 class GpuDrive:
-    """Reads GPUDrive JSON: tracks with one size each, map elements without links, lights where a file has any."""
+    """Reader of GPUDrive JSON: tracks with one size each, map elements without links, lights where a file has any."""
 
     name: str = "gpudrive"
     patterns: tuple[str, ...] = ("tfrecord-*_*.json",)
@@ -86,13 +86,9 @@ class GpuDrive:
 
     def recognise(self, path: Path) -> bool:
         """Whether the file begins like a GPUDrive scene."""
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError:
-            return False
-        objects = b'"objects"' in head and b'"position"' in head
-        return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
+        head = read_head(path, _HEAD_BYTES)
+        keys = ((b'"objects"', b'"position"'), (b'"roads"', b'"geometry"'))
+        return head.lstrip().startswith(b"{") and any(a in head and b in head for a, b in keys)
 
     def describe(self, path: Path) -> Description:
         """Describe the content of the file."""
@@ -108,15 +104,12 @@ class GpuDrive:
         return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
 
     def count(self, path: Path) -> int:
-        """Return 1 for a scene: a file holds one scenario."""
+        """Return 1 for a scene, else 0."""
         return int(self.recognise(path))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a file, or the bad record in its place."""
-        try:
-            yield decode(parsing.load_json(path))
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        yield attempt(lambda: decode(parsing.load_json(path)), file=path)
 
 
 def decode(scene: Any) -> Recording:
@@ -146,8 +139,7 @@ def decode(scene: Any) -> Recording:
     lights, lost_lights = _lights(scene.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
-    interest = _read_list(metadata, "objects_of_interest")
-    interest = [_integer(track, "objects_of_interest") for track in interest]
+    ids = [_integer(track, "objects_of_interest") for track in _read_list(metadata, "objects_of_interest")]
     to_predict = [
         entry.get("track_index") if isinstance(entry, Mapping) else entry
         for entry in _read_list(metadata, "tracks_to_predict")
@@ -164,7 +156,7 @@ def decode(scene: Any) -> Recording:
         lights=lights,
         to_predict=_row_numbers(to_predict, count, "tracks_to_predict"),
         # These are ids, tracks_to_predict are rows.
-        of_interest=tuple(rows[track] for track in interest if track in rows),
+        of_interest=tuple(rows[track] for track in ids if track in rows),
         tags={"source_format": "gpudrive"},
         lost=parsing.nonzero(
             unknown_roads=unknown,
@@ -204,21 +196,21 @@ def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
-    """Numbers of a list of dictionaries, ``[row, key]``; zeros where the first lacks a key that may be absent."""
+    """Return numbers of a list of dictionaries, ``[row, key]``; zeros where the first lacks an optional key."""
     try:
-        present_keys = [key for key in keys if key not in _ABSENT or key in rows[0]] if rows else keys
-        values = np.array([[row[key] for key in present_keys] for row in rows], np.float64)
-        if values.size and values.shape != (len(rows), len(present_keys)):
+        columns = [i for i, key in enumerate(keys) if key not in _OPTIONAL or not rows or key in rows[0]]
+        values = np.array([[row[keys[i]] for i in columns] for row in rows], np.float64)
+        if values.size and values.shape != (len(rows), len(columns)):
             raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"{what} is not a list of numbers {', '.join(keys)}", cure=_SKIP) from error
     table = np.zeros((len(rows), len(keys)))
-    table[:, [keys.index(key) for key in present_keys]] = values.reshape(-1, len(present_keys))
+    table[:, columns] = values.reshape(-1, len(columns))
     return table
 
 
 def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
-    """Lists of equal length in a dictionary."""
+    """Return lists of one length in a dictionary."""
     lists = [row.get(name) for name in names] if isinstance(row, Mapping) else []
     columns = [values for values in lists if isinstance(values, list)]
     if len(columns) < len(names) or len({len(values) for values in columns}) != 1:
@@ -227,7 +219,7 @@ def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
 
 
 def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
-    """Ids of objects or roads; their indices where none has an id."""
+    """Return the ids of objects or roads, their indices if none has an id."""
     numbers = [row.get("id") for row in rows]
     if all(number is None for number in numbers):
         return list(range(len(numbers)))
@@ -250,8 +242,8 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> tuple[Tracks, int]:
     size = _table(objects, ("length", "width", "height"), "the size of objects")
     plausible = (size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M)
     size = np.where(plausible, size, 0.0)
-    measured = slice(None if "height" in objects[0] else -1)
-    lost = int((~plausible[:, measured].all(axis=1) & valid.any(axis=1)).sum())
+    columns = slice(None if "height" in objects[0] else -1)
+    lost = int((~plausible[:, columns].all(axis=1) & valid.any(axis=1)).sum())
     kinds = [str(row.get("type")) for row in objects]
     tracks = Tracks(
         xy=table[..., 0:2].copy(),
@@ -267,7 +259,7 @@ def _tracks(objects: Sequence[Mapping[str, Any]]) -> tuple[Tracks, int]:
 
 
 def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
-    """x, y, z, heading, vx, vy of every object and step, and their mask."""
+    """Return x, y, z, heading, vx, vy of every object and step, and their mask."""
     if not objects:
         raise DataError("has no objects", cure=_SKIP)
     first = objects[0].get("valid")
@@ -292,7 +284,7 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
 
 
 def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...], int]:
-    """Map features in order of the file, and the number of roads of unknown kind."""
+    """Return map features in order of the file, and the number of roads of unknown kind."""
     ids = _ids(roads, "roads")
     features, unknown = [], 0
     for number, road in zip(ids, roads, strict=True):
@@ -310,7 +302,7 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
 
 
 def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-    """Lights by lane, from lists with one entry per observation, and the number of those without a position."""
+    """Return lights by lane from lists with an entry per observation, and the number of those without a position."""
     if not states:
         return (), 0
     if not isinstance(states, Mapping):
@@ -332,12 +324,12 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
 
 
 def _light_state(state: Any) -> int:
-    """A state by its name, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
+    """Return a state by its name, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
     name = str(state).upper()
     if name in LightState.__members__ and name != LightState.UNOBSERVED.name:
         return int(LightState[name])
-    known = type(state) is int and LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
-    return state if known else int(LightState.UNKNOWN)
+    is_number = type(state) is int and LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
+    return state if is_number else int(LightState.UNKNOWN)
 
 
 def file_name(row: int) -> str:
@@ -407,11 +399,11 @@ def _object(recording: Recording, row: int) -> dict[str, Any]:
 
 
 def _light(light: Light) -> dict[str, list[Any]]:
-    """One entry per observation, as GPUDrive's converter writes them."""
-    seen = np.flatnonzero(light.states >= 0)
+    """Return lists with an entry per observation, as GPUDrive's converter writes them."""
+    steps = np.flatnonzero(light.states >= 0)
     (point,) = _points(light.stop_point[None])
     return {
-        "state": [LightState(int(light.states[step])).name.lower() for step in seen],
-        **{axis: [value] * len(seen) for axis, value in point.items()},
-        "time_index": seen.tolist(),
+        "state": [LightState(int(light.states[step])).name.lower() for step in steps],
+        **{axis: [value] * len(steps) for axis, value in point.items()},
+        "time_index": steps.tolist(),
     }

@@ -1,4 +1,4 @@
-"""Common parts of readers: imports of extras, checks, time bases, lights by lane, city names, JSON files, heights."""
+"""Common parts of readers: city names, ids of windows, lights by lane, checks, counts of losses, heights."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Int
 
 from drivax.errors import DataError
 from drivax.geometry.polylines import Polylines, cut_counts
 from drivax.reading import read_json
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
+from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, LightState, RoadKind
 
 Array = np.ndarray[Any, Any]
 
@@ -36,29 +36,30 @@ PLACES: Mapping[str, tuple[str, ...]] = {
 }
 _CITY_OF = {name: city for city, names in PLACES.items() for name in (city, *names)}
 _LONGEST = 64
+#: Metres per second in a mile per hour.
+MPS_PER_MPH = 0.44704
+_UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
+_LAST_STATE = int(max(LightState))
+#: Ids of windows: ``scene-0001_<token>`` of nuScenes, with one or two tokens; of drivax ``<id>@<first step>`` or, with
+#: another ego, ``<id>@<first step>#<track>``.
+_WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
+#: Note of ``drivax doctor`` where the frames of a recording do not come evenly.
+UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
+#: Spacing of the samples of map lines among which the nearest point is searched, m; wider if there would be too many.
+_SPACING_M = 1.0
+_MOST_SAMPLES = 1_000_000
 
 
 def place_tags(location: str | None) -> dict[str, str]:
-    """The tags ``place`` (the city, if it is a known one) and ``location`` (the source's name); none without it."""
+    """Return the tags ``place`` (the city, if it is a known one) and ``location`` (the name in the source)."""
     if not location:
         return {}
     city = _CITY_OF.get(location.lower().replace("_", "-"))
     return ({} if city is None else {"place": city}) | {"location": location[:_LONGEST]}
 
 
-#: Metres per second in a mile per hour.
-MPS_PER_MPH = 0.44704
-_UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
-_LAST_STATE = int(max(LightState))
-
-
-#: Ids of windows: ``scene-0001_<token>`` of nuScenes, with one or two tokens; of drivax ``<id>@<first step>`` or, with
-#: another ego, ``<id>@<first step>#<track>``.
-_WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
-
-
 def segment_of(scenario_id: str) -> str:
-    """The recording that a window is part of, from the window's id; the id itself if it is not that of a window."""
+    """Return the id of the recording that a window is part of, or the id itself if it is not that of a window."""
     window = _WINDOW.fullmatch(scenario_id)
     return scenario_id if window is None else segment_of(window[1] or window[2])
 
@@ -98,7 +99,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Row numbers as ints, each checked to be less than ``count``."""
+    """Return row numbers as ints; refuse those that are not from 0 to less than ``count``."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
@@ -111,38 +112,30 @@ def check_finite(*arrays: np.ndarray[Any, Any]) -> None:
         raise DataError("valid states contain numbers that are not finite", cure="skip this record")
 
 
-def fill_times(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
-    """Timestamps with unknown ones (NaN) filled at 10 Hz from the nearest known one before, else after."""
-    known = np.flatnonzero(np.isfinite(timestamps))
-    steps = np.arange(len(timestamps))
-    if known.size == 0:
-        return steps * DT_S
-    nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
-    return timestamps[nearest] + (steps - nearest) * DT_S
-
-
 def shift(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
-    """The recording moved by ``offset`` (x, y, z), metres."""
+    """Move a recording by ``offset`` (x, y, z), metres."""
     if not offset.any():
         return recording
     tracks = recording.tracks
     xy = np.where(tracks.valid[..., None], tracks.xy + offset[:2], 0.0)
     z = np.where(tracks.valid, tracks.z + offset[2], 0.0)
-    lights = (replace(light, stop_point=light.stop_point + offset) for light in recording.lights)
-    features = (replace(feature, points=feature.points + offset) for feature in recording.features)
-    tracks = replace(tracks, xy=xy, z=z)
-    return replace(recording, tracks=tracks, lights=tuple(lights), features=tuple(features))
+    return replace(
+        recording,
+        tracks=replace(tracks, xy=xy, z=z),
+        lights=tuple(replace(light, stop_point=light.stop_point + offset) for light in recording.lights),
+        features=tuple(replace(feature, points=feature.points + offset) for feature in recording.features),
+    )
 
 
 def box_centre(
     rear_axle: Float[np.ndarray, "step 2"], heading: Float[np.ndarray, " step"], ahead_m: float
 ) -> Float[np.ndarray, "step 2"]:
-    """Positions of the box centre, ``ahead_m`` ahead of the rear axle, where sources locate the recording car."""
+    """Return positions of the box centre from those of the rear axle, which it is ``ahead_m`` ahead of."""
     return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
 
 
 def spacing_m(features: Sequence[MapFeature]) -> float | None:
-    """Median distance of neighbouring points of lines without polygons, metres; None without any."""
+    """Return the median distance of neighbouring points of lines without polygons, metres; None without any."""
     gaps = [
         np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
         for feature in features
@@ -152,26 +145,22 @@ def spacing_m(features: Sequence[MapFeature]) -> float | None:
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file."""
+    """Return the content of a JSON file."""
     return read_json(path, "download it again")
 
 
 def windows_of(steps: int) -> int:
-    """Number of windows that a recording of ``steps`` steps becomes."""
+    """Return the number of windows that a recording of ``steps`` steps becomes."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
-#: Note of ``drivax doctor`` where the frames of a recording do not come evenly.
-UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
-
-
 def nonzero(*lost: Mapping[str, int], **counts: int) -> dict[str, int]:
-    """Return the sums of counts by name that are not zero, for ``Recording.lost``."""
+    """Add up counts by name for ``Recording.lost``; drop zeros."""
     return {name: int(count) for name, count in sum(map(Counter, lost), Counter(counts)).items() if count}
 
 
 def one_point_features(features: Sequence[MapFeature]) -> int:
-    """Number of lines and polygons of one point, which have neither direction nor extent."""
+    """Count lines and polygons of one point, which have neither direction nor extent."""
     return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
 
 
@@ -179,11 +168,6 @@ def check_within(most: float, *arrays: np.ndarray[Any, Any]) -> None:
     """Refuse NaN, infinities, and numbers further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in arrays):  # NaN compares false
         raise DataError(f"contains numbers that are not finite or beyond {most:g}", cure="skip this record")
-
-
-#: Spacing of the samples of map lines among which the nearest point is searched, m; wider if there would be too many.
-SPACING_M = 1.0
-MOST_SAMPLES = 1_000_000
 
 
 def lift(tracks: Tracks, features: Sequence[MapFeature]) -> Tracks:
@@ -209,22 +193,27 @@ def flatten(tracks: Tracks, features: Sequence[MapFeature]) -> tuple[Tracks, tup
 
 
 def _half_heights(tracks: Tracks) -> Float[Array, "track time"]:
-    """Half the height of every track and step; of its class if it was not measured."""
+    """Return half the height of every track and step; of its class if it was not measured."""
     default = np.array([DEFAULT_SIZES[AgentKind(kind)][2] for kind in tracks.kind]).reshape(-1, 1)
     return np.where(tracks.size[..., 2] > 0.0, tracks.size[..., 2], default) / 2
 
 
 def _samples(features: Sequence[MapFeature]) -> Float[Array, "sample 3"]:
-    """Points of all map lines, about ``SPACING_M`` apart along them, without the closing edges of polygons."""
+    """Sample all map lines about every ``_SPACING_M``, without the closing edges of polygons."""
     lines = Polylines.of([np.asarray(f.points, np.float64) for f in features if len(f.points)])
     if len(lines.points) == 0:
         return np.zeros((0, 3))
     inner = np.append(lines.row[1:] == lines.row[:-1], False)
     a, b = lines.points[inner], lines.points[np.flatnonzero(inner) + 1]
     length = np.hypot(*(b - a)[:, :2].T)
-    pieces = cut_counts(length, max(SPACING_M, float(length.sum()) / MOST_SAMPLES))
-    owner = np.repeat(np.arange(len(a)), pieces)
-    part = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    samples = a[owner] + (part / pieces[owner])[:, None] * (b - a)[owner]
-    # Cuts hold the first points of segments; the last point of a line begins none.
-    return np.concatenate((samples, lines.points[~inner]))
+    pieces = cut_counts(length, max(_SPACING_M, float(length.sum()) / _MOST_SAMPLES))
+    return np.concatenate((subdivide(a, b - a, pieces), lines.points[~inner]))
+
+
+def subdivide(
+    start: Float[Array, "segment 3"], step: Float[Array, "segment 3"], counts: Int[Array, " segment"]
+) -> Float[Array, "piece 3"]:
+    """Return the first points of ``counts`` equal pieces of each segment; the last point of a line begins none."""
+    segment = np.repeat(np.arange(len(start)), counts)
+    piece = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return start[segment] + (piece / counts[segment])[:, None] * step[segment]

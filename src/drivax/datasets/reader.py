@@ -1,14 +1,16 @@
-"""Protocol of the readers of public formats, and their report of unreadable records."""
+"""Protocol of the readers of public formats, their report of unreadable records, and the head of a file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from drivax.errors import DataError, DrivaxError
 from drivax.scenario.recording import Recording
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,32 @@ class BadRecord:
 
     @classmethod
     def of(cls, error: DrivaxError, file: Path, record: int | str | None = None) -> BadRecord:
-        """The bad record that an error describes; ``file`` and ``record`` count if the error names none."""
+        """Return the bad record of an error; ``file`` and ``record`` count if the error names none."""
         record = record if error.record is None else error.record
         return cls(error.file or file, record, error.problem, error.cure)
 
     def error(self) -> DataError:
-        """The error to raise for it."""
+        """Return the error to raise."""
         return DataError(self.problem, file=self.file, record=self.record, cure=self.cure)
+
+
+def attempt(
+    function: Callable[..., _Result], *args: Any, file: Path, record: int | str | None = None
+) -> _Result | BadRecord:
+    """Call a function; return the bad record of its DataError in place of a result."""
+    try:
+        return function(*args)
+    except DataError as error:
+        return BadRecord.of(error, file, record)
+
+
+def read_head(path: Path, size: int) -> bytes:
+    """Return the first bytes of a file, none if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except (OSError, ValueError):  # ValueError: a path with a null character
+        return b""
 
 
 @dataclass(frozen=True)
@@ -90,15 +111,14 @@ class Reader(Protocol):
         ...
 
     def count(self, path: Path) -> int:
-        """About how many scenarios the file becomes, quickly; 0 if it cannot be read."""
+        """Return about how many scenarios the file becomes, quickly; 0 if it cannot be read."""
         ...
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings of a file in file order, and a bad record in place of each that cannot be read."""
+        """Yield the recordings of a file in file order, and a bad record in place of each that cannot be read."""
         ...
 
 
-def of_length(reader: Reader, steps: int) -> Reader:
-    """The reader for scenarios of ``steps`` steps; only those that cut logs into recordings (nuPlan) differ."""
-    record: Any = reader  # a dataclass, which the protocol does not say
-    return replace(record, steps=steps) if hasattr(reader, "steps") else reader
+def with_steps(reader: Any, steps: int) -> Reader:
+    """Return the reader for scenarios of ``steps`` steps; only those that cut logs into recordings (nuPlan) differ."""
+    return replace(reader, steps=steps) if hasattr(reader, "steps") else reader

@@ -29,7 +29,7 @@ _AGAIN = "download the map again"
 
 
 def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
-    """The boundary of all drivable areas together: one closed EDGE_BOUNDARY per ring, drivable side on the left.
+    """Return the boundary of all drivable areas: one closed EDGE_BOUNDARY per ring, drivable side on the left.
 
     Self-intersecting polygons are repaired, overlapping and touching ones joined, gaps of up to 10 cm between them
     closed (morphological closing); rings of fewer than three different points are dropped. Exteriors become
@@ -57,7 +57,7 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
 
 
 def _polygons(shapely: Any, area: Area) -> list[Any]:
-    """An area as valid polygons."""
+    """Return an area as valid polygons."""
     exterior, holes = area
     if len(np.unique(exterior[:, :2], axis=0)) < 3:
         return []
@@ -70,7 +70,7 @@ def _polygons(shapely: Any, area: Area) -> list[Any]:
 
 
 def _outlines(shapely: Any, union: Any) -> Iterator[Float[Array, "_ 2"]]:
-    """The rings of large enough pieces and holes as points, exteriors anticlockwise and holes clockwise."""
+    """Yield the rings of large enough pieces and holes as points, exteriors anticlockwise and holes clockwise."""
     for polygon in shapely.get_parts(shapely.orient_polygons(union)):
         if polygon.geom_type != "Polygon" or polygon.area < LEAST_PIECE_M2:
             continue
@@ -83,15 +83,15 @@ def _outlines(shapely: Any, union: Any) -> Iterator[Float[Array, "_ 2"]]:
 def _heights(
     shapely: Any, rings: Sequence[Float[Array, "_ _"]], xy: Float[Array, "query 2"]
 ) -> Float[Array, " query"]:
-    """Height of each point, interpolated along the nearest edge of the input rings; 0 if they have no heights."""
-    with_z = [ring for ring in rings if ring.shape[1] > 2 and len(ring)]
-    if not with_z or not len(xy):
+    """Interpolate the height of each point along the nearest edge of the input rings; 0 if they have no heights."""
+    rings = [ring for ring in rings if ring.shape[1] > 2 and len(ring)]
+    if not rings or not len(xy):
         return np.zeros(len(xy))
-    a = np.concatenate(with_z)
-    b = np.concatenate([np.roll(ring, -1, axis=0) for ring in with_z])
+    a = np.concatenate(rings)
+    b = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
     edges = shapely.linestrings(np.stack((a[:, :2], b[:, :2]), axis=1))
     points = shapely.points(xy)
     nearest = shapely.STRtree(edges).nearest(points)
     # NaN on an edge without length.
-    along = np.nan_to_num(shapely.line_locate_point(edges[nearest], points, normalized=True))
-    return a[nearest, 2] + along * (b[nearest, 2] - a[nearest, 2])
+    fraction = np.nan_to_num(shapely.line_locate_point(edges[nearest], points, normalized=True))
+    return a[nearest, 2] + fraction * (b[nearest, 2] - a[nearest, 2])

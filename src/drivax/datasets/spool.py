@@ -67,7 +67,8 @@ def _spool(
         for item in convert(*task):
             if isinstance(item, Scenario):
                 file.write(item.record.tobytes())
-            items.append(replace(item, record=_SPOOLED) if isinstance(item, Scenario) else item)
+                item = replace(item, record=_SPOOLED)
+            items.append(item)
     return items
 
 
@@ -78,8 +79,7 @@ def _unspool(
     dtype = record_dtype(capacity)
     with path.open("rb") as file:
         for item in items:
-            if isinstance(item, BadRecord):
-                yield item
-            else:
+            if isinstance(item, Scenario):
                 record = np.frombuffer(file.read(dtype.itemsize), dtype).reshape(())
-                yield replace(item, record=record)
+                item = replace(item, record=record)
+            yield item

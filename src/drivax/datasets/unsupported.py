@@ -60,7 +60,7 @@ _INDICES = ("dataset_summary.pkl", "dataset_mapping.pkl")
 
 
 def explain(path: Path) -> DataError:
-    """The error for a file whose content no reader recognises."""
+    """Return the error for a file whose content no reader recognises."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)
@@ -84,7 +84,7 @@ def explain(path: Path) -> DataError:
 
 
 def _tfrecord(path: Path) -> DataError:
-    """The error for a file by its first TFRecord record, or for one that is no TFRecord file."""
+    """Return the error for a file by its first TFRecord record, or for one that is no TFRecord file."""
     try:
         _, payload = next(read_records(path))
         if isinstance(payload, DataError):
@@ -128,29 +128,26 @@ _RECORDS: tuple[tuple[Callable[[bytes], bool], str], ...] = (
 )
 
 
-#: Tests of a folder and the names in it, problems and cures.
-_Folders = tuple[tuple[Callable[[Path, set[str]], bool], str, str], ...]
+#: Tests of a folder, problems and cures.
+_Folders = tuple[tuple[Callable[[Path], bool], str, str], ...]
 
 
 def explain_folder(folder: Path) -> DataError | None:
-    """The error for a known kind of folder without any file to convert; None for others."""
+    """Return the error for a known kind of folder without any file to convert; None for others."""
     return _first_match(folder, (*_OWN_FOLDERS, *_FOLDERS))
 
 
 def explain_own(folder: Path) -> DataError | None:
-    """The error for a folder that drivax wrote, whatever files are in it; None for others."""
+    """Return the error for a folder that drivax wrote, whatever files are in it; None for others."""
     return _first_match(folder, _OWN_FOLDERS)
 
 
-def _first_match(folder: Path, known: _Folders) -> DataError | None:
-    names = {path.name for path in folder.iterdir()}
-    errors = (
-        DataError(problem, file=folder, cure=cure) for test, problem, cure in known if test(folder, names)
-    )
+def _first_match(folder: Path, kinds: _Folders) -> DataError | None:
+    errors = (DataError(problem, file=folder, cure=cure) for test, problem, cure in kinds if test(folder))
     return next(errors, None)
 
 
-def _is_scenario_set(folder: Path, names: set[str]) -> bool:
+def _is_scenario_set(folder: Path) -> bool:
     """Whether a folder is a scenario set of drivax, of any version."""
     try:
         manifest = read_json(folder / MANIFEST, AGAIN)
@@ -159,38 +156,38 @@ def _is_scenario_set(folder: Path, names: set[str]) -> bool:
     return isinstance(manifest, dict) and "schema_version" in manifest
 
 
-def _inside(folder: Path, *patterns: str) -> bool:
+def _contains(folder: Path, *patterns: str) -> bool:
     return any(next(folder.rglob(pattern), None) is not None for pattern in patterns)
 
 
 _OWN_FOLDERS: _Folders = (
     (_is_scenario_set, "a scenario set of drivax already", "run drivax inspect on it"),
     (
-        lambda folder, names: "run.json" in names,
+        lambda folder: (folder / "run.json").exists(),
         "a run folder of drivax, not recordings",
         "run drivax report on it",
     ),
 )
 _FOLDERS: _Folders = (
     (
-        lambda folder, names: "dataset_summary.pkl" in names,
+        lambda folder: (folder / "dataset_summary.pkl").exists(),
         "a ScenarioNet database with its index (dataset_summary.pkl) but without its scenarios",
         "copy the sd_*.pkl files as well",
     ),
     (
-        lambda folder, names: (
-            _inside(folder, "city_SE3_egovehicle.feather") and not _inside(folder, "annotations*.feather")
+        lambda folder: (
+            _contains(folder, "city_SE3_egovehicle.feather") and not _contains(folder, "annotations*.feather")
         ),
         "a sensor log of Argoverse 2 without annotations, as those of the test split",
         "use the train or val split",
     ),
     (
-        lambda folder, names: _inside(folder, "*.gpkg") and not _inside(folder, "*.db"),
+        lambda folder: _contains(folder, "*.gpkg") and not _contains(folder, "*.db"),
         "maps of nuPlan without logs",
         "put the logs (splits/*/*.db) next to maps/ and name the folder of both",
     ),
     (
-        lambda folder, names: _inside(folder, "sample_annotation.json", "ego_pose.json"),
+        lambda folder: _contains(folder, "sample_annotation.json", "ego_pose.json"),
         "tables of nuScenes, but not all that are needed",
         "unpack the whole metadata archive (v1.0-*.tgz) and the map expansion (maps/expansion/)",
     ),

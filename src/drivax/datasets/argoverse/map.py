@@ -86,13 +86,12 @@ def _decode(content: Any) -> ArgoverseMap:
     first_id = 1 + max((lane.feature_id for lane in lanes), default=0)
     edges = road_edges(rings, first_id)
     shapes = [*lines, *((RoadKind.CROSSWALK, outline) for outline in outlines)]
-    rest = [
-        MapFeature(number, kind, points)
-        for number, (kind, points) in enumerate(shapes, first_id + len(edges))
-    ]
-    unknown = (content.keys() - {*groups}).union(*segments, *areas, *crossings) - _FIELDS
-    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes), unknown_fields=len(unknown))
-    return ArgoverseMap((*lanes, *edges, *rest), lost)
+    drawn = (MapFeature(id, kind, points) for id, (kind, points) in enumerate(shapes, first_id + len(edges)))
+    names = (content.keys() - {*groups}).union(*segments, *areas, *crossings)
+    lost = parsing.nonzero(
+        lanes_without_length=len(segments) - len(lanes), unknown_fields=len(names - _FIELDS)
+    )
+    return ArgoverseMap((*lanes, *edges, *drawn), lost)
 
 
 def _lane(segment: Any) -> MapFeature | None:
@@ -119,13 +118,13 @@ def _lane(segment: Any) -> MapFeature | None:
 
 
 def _at(line: Float[Array, "point 3"], fraction: Float[Array, " sample"]) -> Float[Array, "sample 3"]:
-    """Points at fractions of a line's length."""
+    """Interpolate points at fractions of a line's length."""
     arc = arc_lengths(line)
     return np.column_stack([np.interp(fraction * arc[-1], arc, line[:, axis]) for axis in range(3)])
 
 
 def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "centre 3"]:
-    """The segment's own centre line at the height of the middle (forecasting maps have z = 0), else the middle."""
+    """Return the segment's own centre line at the height of the middle (some have z = 0), else the middle."""
     if segment.get("centerline") is None:
         return middle
     centre = _points(segment, "centerline")
@@ -137,7 +136,7 @@ def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "cent
 
 
 def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]]:
-    """Painted boundaries, each once: adjacent lanes share the line between them."""
+    """Return painted boundaries, each once: adjacent lanes share the line between them."""
     lines: dict[bytes, tuple[RoadKind, Array]] = {}
     for segment in segments:
         for side in ("left", "right"):
@@ -154,7 +153,7 @@ def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]
 
 
 def _points(record: Any, name: str) -> Float[Array, "point 3"]:
-    """A list of points of the map."""
+    """Read a list of points of the map."""
     try:
         rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
         points = np.array(rows, np.float64).reshape(-1, 3)

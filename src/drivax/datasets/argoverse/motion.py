@@ -15,7 +15,7 @@ from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse.tables import Kind, Table, Words, read_table
 from drivax.datasets.parsing import lift, place_tags
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Recording, Tracks
@@ -62,10 +62,10 @@ class ArgoverseMotion:
 
     def recognise(self, path: Path) -> bool:
         """Whether a parquet file has the name of a scenario."""
-        return path.match(self.patterns[0]) and tables.has_magic(path, tables.PARQUET_MAGIC)
+        return path.match(self.patterns[0]) and bool(self.count(path))
 
     def describe(self, path: Path) -> Description:
-        """Tracks, steps and city of one scenario."""
+        """Describe tracks, steps and city of the scenario."""
         table = read_table(path, _COLUMNS, optional=("slice_id",))
         steps = 1 + int(table.numbers["timestep"].max())
         map_path = _map_path(path)
@@ -82,23 +82,20 @@ class ArgoverseMotion:
 
     def count(self, path: Path) -> int:
         """Return 1, since every scenario becomes one window; 0 for another kind of file."""
-        return int(tables.has_magic(path, tables.PARQUET_MAGIC))
+        return int(read_head(path, 4) == tables.PARQUET_MAGIC)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of a scenario, or the bad record in its place."""
-        try:
-            yield decode(path)
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        """Yield the recording of a scenario, or the bad record in its place."""
+        yield attempt(decode, path, file=path)
 
 
 def _map_path(path: Path) -> Path:
-    """The map of a scenario."""
+    """Return the path of a scenario's map."""
     return path.with_name(f"log_map_archive_{path.stem.removeprefix('scenario_')}.json")
 
 
 def decode(path: Path) -> Recording:
-    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
+    """Return the recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
     In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
     those of the map, sizes those of the class, velocities as the source smoothed them.
@@ -128,20 +125,20 @@ def decode(path: Path) -> Recording:
         lost=parsing.nonzero(
             local_map.lost,
             repeated_rows=table.rows - int(tracks.valid.sum()),
-            unknown_fields=len(table.others - _OTHERS),
+            unknown_fields=len(table.unread - _OTHERS),
         ),
         flags=Flag.DEFAULT_SIZES,
     )
 
 
 def _of_track(values: Array, names: Words) -> Array:
-    """The value of the first row of each track."""
+    """Return the value of the first row of each track."""
     _, first = np.unique(names.of_row, return_index=True)
     return values[first]
 
 
 def _tracks(table: Table) -> tuple[Tracks, int]:
-    """All tracks in order of appearance, in the plane, and the row of the ego."""
+    """Return all tracks in order of appearance, in the plane, and the row of the ego."""
     names, step = table.texts["track_id"], table.numbers["timestep"]
     if EGO not in names.words:
         raise DataError(f"has no track {EGO}")
@@ -173,7 +170,7 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
 
 
 def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array, "track 3"]]:
-    """Kinds and sizes of all tracks."""
+    """Return kinds and sizes of all tracks."""
     classes = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
     sizes = np.array([size for _, size in classes], np.float64)
     sizes[ego] = tables.EGO_SIZE
@@ -181,7 +178,7 @@ def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array
 
 
 def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
-    """The ids as numbers, the ego's as 0; row numbers if some id is not a number or not unique."""
+    """Return the ids as numbers, the ego's as 0; row numbers if some id is not a number or not unique."""
     texts = ["0" if name == EGO else name for name in names]
     if all(text.isascii() and text.isdecimal() and len(text) < 10 for text in texts):
         ids = [int(text) for text in texts]
@@ -191,7 +188,7 @@ def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
 
 
 def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
-    """Seconds of every step: the file gives the first, the last and their number."""
+    """Return seconds of every step from the first, the last and their number in the file."""
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
     step_s = (end - start) / intervals if intervals > 0 else DT_S

@@ -15,7 +15,7 @@ from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse.tables import Kind, Table, read_table
 from drivax.datasets.parsing import place_tags
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
 from drivax.scenario.recording import Recording, Tracks, differentiate
 from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag
@@ -66,10 +66,10 @@ class ArgoverseSensor:
 
     def recognise(self, path: Path) -> bool:
         """Whether a feather file has the name of a log's annotations."""
-        return path.name in self.patterns and tables.has_magic(path, tables.FEATHER_MAGIC)
+        return path.name in self.patterns and read_head(path, 6) == b"ARROW1"
 
     def describe(self, path: Path) -> Description:
-        """Frames, tracks and city of a log."""
+        """Describe frames, tracks and city of the log."""
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
@@ -83,7 +83,7 @@ class ArgoverseSensor:
         )
 
     def count(self, path: Path) -> int:
-        """The number of windows of a log."""
+        """Return the number of windows of a log."""
         try:
             times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
         except DataError:
@@ -91,26 +91,23 @@ class ArgoverseSensor:
         return parsing.windows_of(len(np.unique(times)))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recording of a log, or the bad record in its place."""
-        try:
-            yield decode(path)
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        """Yield the recording of a log, or the bad record in its place."""
+        yield attempt(decode, path, file=path)
 
 
 def _map_path(path: Path) -> Path | None:
-    """The map of a log, if it is there."""
+    """Return the path of a log's map, None for a missing one."""
     return next(iter(sorted((path.parent / "map").glob(MAP_PATTERN))), None)
 
 
 def _places(map_path: Path | None) -> dict[str, str]:
-    """Tags of the place in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
+    """Return tags of the place in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
     _, _, ending = ("" if map_path is None else map_path.stem).partition("____")
     return place_tags(ending.split("_")[0])
 
 
 def decode(path: Path) -> Recording:
-    """The recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and ``map/log_map_archive_*.json``.
+    """Return the recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and its map.
 
     In the city's frame, metres. Boxes are moved from the car's frame with its pose of the same time stamp, the ego from
     its rear axle to the middle of its box; velocities are differences of positions.
@@ -141,14 +138,14 @@ def decode(path: Path) -> Recording:
         lost=parsing.nonzero(
             local_map.lost,
             frames_without_pose=lost_frames,
-            unknown_fields=len((boxes.others - _OTHERS) | poses.others),
+            unknown_fields=len((boxes.unread - _OTHERS) | poses.unread),
         ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
 
 def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
-    """Time stamps of the frames with a pose, nanoseconds, and how many frames have none."""
+    """Return time stamps of the frames with a pose, nanoseconds, and how many frames have none."""
     frames = np.unique(boxes.numbers["timestamp_ns"])
     has_pose = np.isin(frames, poses.numbers["timestamp_ns"])
     if not has_pose.any():
@@ -157,7 +154,7 @@ def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
 
 
 def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
-    """All tracks in the city's frame; the ego is row 0 and there at every step."""
+    """Return all tracks in the city's frame; the ego is row 0 and valid at every step."""
     pose = _poses(poses, clock)
     stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row
     category = boxes.texts["category"]
@@ -187,16 +184,16 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
 
 
 def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
-    """The pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
-    known, first = np.unique(poses.numbers["timestamp_ns"], return_index=True)
-    pose = poses.stack(_POSE)[first[np.searchsorted(known, clock)]]
+    """Return the pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
+    stamps, rows = np.unique(poses.numbers["timestamp_ns"], return_index=True)
+    pose = poses.stack(_POSE)[rows[np.searchsorted(stamps, clock)]]
     parsing.check_within(tables.FARTHEST_M, pose[:, 4:])
     pose[:, :4] = _unit(pose[:, :4])
     return pose
 
 
 def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
-    """Boxes in the city's frame: x, y, z, heading, length, width, height."""
+    """Return boxes in the city's frame: x, y, z, heading, length, width, height."""
     table = boxes.stack((*_POSE, *_SIZE))[rows]
     parsing.check_within(tables.FARTHEST_M, table[:, 4:7])
     parsing.check_within(tables.LARGEST_M, table[:, 7:])
@@ -206,7 +203,7 @@ def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) 
 
 
 def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
-    """The ego's boxes like those of :func:`_boxes`."""
+    """Return the ego's boxes in the form of :func:`_boxes`."""
     # Some logs hold boxes of the car itself: the sizes are right, the centres are the rear axle again.
     size = np.median(boxes.stack(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)
     parsing.check_within(tables.LARGEST_M, size)
@@ -218,10 +215,10 @@ def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -
 
 
 def rotate(quaternion: Float[Array, "row 4"], vector: Float[Array, "*rows 3"]) -> Float[Array, "row 3"]:
-    """Vectors turned by unit quaternions (w, x, y, z): v + 2 w (u x v) + 2 u x (u x v)."""
+    """Turn vectors v by unit quaternions (w, u): v + 2 w (u x v) + 2 u x (u x v)."""
     axis = quaternion[:, 1:]
-    across = 2.0 * np.cross(axis, np.broadcast_to(vector, axis.shape))
-    return vector + quaternion[:, :1] * across + np.cross(axis, across)
+    normal = 2.0 * np.cross(axis, np.broadcast_to(vector, axis.shape))
+    return vector + quaternion[:, :1] * normal + np.cross(axis, normal)
 
 
 def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
+from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
 from drivax.reading import check_regular
 
@@ -23,7 +24,7 @@ CENTRE_AHEAD_M = 1.34
 AXLE_HEIGHT_M = 0.33
 #: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
-PARQUET_MAGIC, FEATHER_MAGIC = b"PAR1", b"ARROW1"
+PARQUET_MAGIC = b"PAR1"
 #: The longest logs have some ten thousand rows; damaged files can claim any number.
 MOST_ROWS = 1_000_000
 _AGAIN = "download it again"
@@ -39,31 +40,22 @@ class Words:
     of_row: Int[Array, " row"]
 
     def text(self, row: int) -> str:
-        """The text of a row."""
+        """Return the text of a row."""
         return self.words[self.of_row[row]]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Some columns of a table, one array per name: float64 or int64, or :class:`Words`; ``others`` are not read."""
+    """Columns of a table by name, float64 or int64 arrays or :class:`Words`; ``unread`` are the names of the others."""
 
     rows: int
     numbers: Mapping[str, Array]
     texts: Mapping[str, Words]
-    others: frozenset[str]
+    unread: frozenset[str]
 
     def stack(self, names: Sequence[str]) -> Array:
         """Stack columns of numbers, float64 ``[row, name]``."""
         return np.stack([self.numbers[name] for name in names], axis=1).astype(np.float64)
-
-
-def has_magic(path: Path, magic: bytes) -> bool:
-    """Whether a file begins with these bytes; False where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(magic)) == magic
-    except OSError:
-        return False
 
 
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
@@ -74,15 +66,13 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     pa = import_extra("pyarrow")
     check_regular(path, _AGAIN)
     try:
-        table, others = _load(path, list(columns), optional)
+        table, unread = _load(path, list(columns), optional)
         if table.num_rows == 0:
             raise DataError("contains no rows", file=path, cure=_AGAIN)
-        kinds = {name: columns[name] for name in table.column_names}
-        texts = {name: _words(table.column(name)) for name, kind in kinds.items() if kind == "text"}
+        kinds = [(name, columns[name], table.column(name)) for name in table.column_names]
+        texts = {name: _words(column) for name, kind, column in kinds if kind == "text"}
         numbers = {
-            name: _numbers(table.column(name), kind == "whole", name)
-            for name, kind in kinds.items()
-            if kind != "text"
+            name: _numbers(column, kind == "whole", name) for name, kind, column in kinds if kind != "text"
         }
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
@@ -90,7 +80,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
         raise DataError(error.problem, file=path, cure=error.cure) from error
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
-    return Table(table.num_rows, numbers, texts, others)
+    return Table(table.num_rows, numbers, texts, unread)
 
 
 def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:
@@ -102,7 +92,7 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[
     import pyarrow.parquet as pq
 
     with pa.OSFile(str(path)) as source:
-        if has_magic(path, PARQUET_MAGIC):
+        if read_head(path, 4) == PARQUET_MAGIC:
             file = pq.ParquetFile(source)
             names = file.schema_arrow.names
             columns = [name for name in columns if name in names or name not in optional]
@@ -111,8 +101,8 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[
         else:
             names = pa.ipc.open_file(source).schema.names
             _check(names, columns, 0)
-            included = [names.index(name) for name in columns]
-            options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=included)
+            indices = [names.index(name) for name in columns]
+            options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=indices)
             table = pa.ipc.open_file(source, options=options).read_all()
     _check(table.schema.names, columns, table.num_rows)
     table.validate(full=True)

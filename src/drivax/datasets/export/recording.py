@@ -46,7 +46,7 @@ def restore(scenario: Scenario) -> Recording:
         ego=0,
         tracks=_tracks(scenario, moving, parked),
         features=features,
-        seen=_seen(scenario, moving, parked),
+        seen=_seen_mask(scenario, moving, parked),
         lights=_lights(scenario, new_ids),
         to_predict=tuple(np.flatnonzero(marks & PREDICT_BIT).tolist()),
         of_interest=tuple(np.flatnonzero(marks & INTEREST_BIT).tolist()),
@@ -56,14 +56,14 @@ def restore(scenario: Scenario) -> Recording:
 
 
 def _over_time(scenario: Scenario, moving: _Array, parked: _Array, name: str) -> Bool[_Array, "track time"]:
-    """A mask of both blocks in the order of tracks."""
+    """Return a mask of both blocks in the order of tracks."""
     steps = int(scenario.steps)
     agents, parked_agents = scenario.record["agent_" + name], scenario.record["parked_" + name]
     return np.concatenate((agents[:steps, moving], parked_agents[:steps, parked]), axis=1).T
 
 
 def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
-    """Tracks of the agents in some slots of both blocks, in the source's frame."""
+    """Return tracks of the agents in some slots of both blocks, in the source's frame."""
     steps = int(scenario.steps)
     repeat = np.zeros((steps, len(parked), 1))
     valid = _over_time(scenario, moving, parked, "valid")
@@ -72,8 +72,8 @@ def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
     def join_steps(agents: _Array, poses: _Array) -> _Array:
         """Join time series of moving agents and poses of parked ones: [track, time, number], zero where not valid."""
         series = agents[:steps, moving].reshape(steps, len(moving), -1)
-        both = np.concatenate((series, poses + repeat), axis=1)
-        return np.swapaxes(np.where(mask, both, 0.0), 0, 1).astype(np.float64)
+        series = np.concatenate((series, poses + repeat), axis=1)
+        return np.swapaxes(np.where(mask, series, 0.0), 0, 1).astype(np.float64)
 
     def join(agents: _Array, parked_agents: _Array) -> _Array:
         """Join constants of both blocks."""
@@ -93,14 +93,14 @@ def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
     )
 
 
-def _seen(scenario: Scenario, moving: _Array, parked: _Array) -> Bool[_Array, "track time"] | None:
-    """Mask of what ego's sensors saw; None for all that is valid."""
+def _seen_mask(scenario: Scenario, moving: _Array, parked: _Array) -> Bool[_Array, "track time"] | None:
+    """Return the mask of what ego's sensors saw; None for all that is valid."""
     seen, valid = (_over_time(scenario, moving, parked, name) for name in ("seen", "valid"))
     return None if np.array_equal(seen, valid) else seen.copy()
 
 
 def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]:
-    """Points (local frame, metres) and first row of joined segments, ordered by feature and arc length."""
+    """Join segments to polylines: points (local frame, metres) and first row, ordered by feature and arc length."""
     count = int(scenario.segment_blocks[3])
     begin, end = scenario.segment_a[:count], scenario.segment_b[:count]
     feature, lane, kind = (
@@ -121,7 +121,7 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
 
 
 def _features(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
-    """A feature per polyline; only the first one of a source's feature keeps its id and links."""
+    """Return a feature per polyline; only the first one of a source's feature keeps its id and links."""
     features, numbers = [], set()
     for local, segment in _polylines(scenario):
         kind = RoadKind(int(scenario.segment_kind[segment]))
@@ -138,7 +138,7 @@ def _features(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
 
 
 def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
-    """Fields of a lane from the lane graph, in ids of the source."""
+    """Return fields of a lane from the lane graph, in ids of the source."""
 
     def ids(rows: _Array) -> tuple[int, ...]:
         """Return the source's ids of lanes by index, without missing ones (-1)."""
@@ -159,13 +159,13 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
 
 
 def _stop_signs(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
-    """Stop signs, at the height of the nearest segment."""
+    """Return stop signs, at the height of the nearest segment."""
     rows = np.flatnonzero((scenario.stop_xy != 0).any(axis=1) | (scenario.stop_lane >= 0).any(axis=1))
-    near = scenario.segment_a[: int(scenario.segment_blocks[3])].astype(np.float64)
+    points = scenario.segment_a[: int(scenario.segment_blocks[3])].astype(np.float64)
     signs = []
     for row in rows:
         xy = scenario.stop_xy[row].astype(np.float64)
-        z = near[np.hypot(*(near[:, :2] - xy).T).argmin(), 2] if len(near) else 0.0
+        z = points[np.hypot(*(points[:, :2] - xy).T).argmin(), 2] if len(points) else 0.0
         lanes = tuple(int(scenario.lane_id[lane]) for lane in scenario.stop_lane[row] if lane >= 0)
         point = np.append(xy, z) + scenario.origin
         signs.append(MapFeature(next(new_ids), RoadKind.STOP_SIGN, point[None], lanes=lanes))
@@ -173,7 +173,7 @@ def _stop_signs(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
 
 
 def _lights(scenario: Scenario, new_ids: Iterator[int]) -> tuple[Light, ...]:
-    """Lights that were observed, at the middle of their stop lines."""
+    """Return lights that were observed, at the middle of their stop lines."""
     lights = []
     for row in np.flatnonzero((scenario.light_state >= 0).any(axis=0)):
         line, lane = scenario.light_line[row].astype(np.float64), int(scenario.light_lane[row])

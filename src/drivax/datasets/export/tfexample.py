@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from drivax.datasets.export.recording import restore
-from drivax.datasets.parsing import MPS_PER_MPH
+from drivax.datasets.parsing import MPS_PER_MPH, subdivide
 from drivax.datasets.womd.messages import ORIGIN
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
@@ -92,42 +92,42 @@ def tf_example(
 
 
 def _origin(recording: Recording, local: _Array) -> _Array:
-    """The point that is subtracted from the source's coordinates."""
+    """Return the point that is subtracted from the source's coordinates."""
     points = [recording.tracks.xy[recording.tracks.valid], *(f.points[:, :2] for f in recording.features)]
     largest = max(float(np.abs(xy).max(initial=0.0)) for xy in points)
     return np.zeros(3) if largest < _ABSOLUTE_M else np.asarray(local, np.float64)
 
 
 def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
-    """Tracks over the 91 steps around the current one, and the number of other steps; missing steps are not valid."""
+    """Return tracks over 91 steps around the current one, missing ones not valid, and the number of other steps."""
     tracks = recording.tracks
-    steps, known = _steps(recording)
+    steps, exists = _steps(recording)
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
     series = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
-    valid = tracks.valid[:, index] & known
-    return replace(tracks, **series, valid=valid), Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+    valid = tracks.valid[:, index] & exists
+    return replace(tracks, **series, valid=valid), Counter(steps=int(tracks.valid.shape[1] - exists.sum()))
 
 
 def _steps(recording: Recording) -> tuple[_Array, _Array]:
-    """Steps of the recording around the current one, and whether it has them."""
+    """Return the steps of the recording around the current one, and whether it has them."""
     steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
     return steps, (steps >= 0) & (steps < len(recording.timestamps_s))
 
 
 def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
-    """Rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
+    """Return the rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
     That is: up to 8 tracks to predict by id, then those that are valid now by their distance from ego, then all
     others, those with most valid steps first.
     """
     now = tracks.valid[:, CURRENT_STEP]
     to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
-    first = sorted(to_predict, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
+    to_predict = sorted(to_predict, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
     xy = tracks.xy[:, CURRENT_STEP]
     distance = np.hypot(*(xy - xy[recording.ego]).T)
     # One sort key: distances, with the tracks to predict below all of them and absent tracks above.
     rank = np.where(now, distance, _ABSENT_RANK - tracks.valid.sum(axis=1))
-    rank[first] = -2.0 + np.arange(len(first)) / _FIRST
+    rank[to_predict] = -2.0 + np.arange(len(to_predict)) / _FIRST
     rank[recording.ego] = -np.inf
     order = np.argsort(rank, kind="stable")
     return order[tracks.valid[order].any(axis=1)]
@@ -141,7 +141,7 @@ def _pad(values: _Array, rows: int, fill: int = -1) -> _Array:
 
 
 def _by_span(prefix: str, table: Mapping[str, _Array], axis: int) -> dict[str, _Array]:
-    """Columns cut into past, current step and future along their time axis."""
+    """Cut columns into past, current step and future along their time axis."""
     return {
         f"{prefix}/{span}/{name}": column[(slice(None),) * axis + (steps,)]
         for span, steps in _SPANS.items()
@@ -150,7 +150,7 @@ def _by_span(prefix: str, table: Mapping[str, _Array], axis: int) -> dict[str, _
 
 
 def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> dict[str, _Array]:
-    """Features of agents over time; -1 where not valid."""
+    """Return features of agents over time; -1 where not valid."""
     valid = tracks.valid[order]
     vx, vy = np.moveaxis(tracks.velocity[order], -1, 0)
     columns = {
@@ -173,7 +173,7 @@ def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> di
 
 
 def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Array]:
-    """Features of agents that do not change over time; -1 in rows without an agent."""
+    """Return features of agents that do not change over time; -1 in rows without an agent."""
     ids = tracks.track_id[order]
     if ids.max(initial=0) >= _FLOAT_ID_END:
         ids = np.arange(len(order))
@@ -195,7 +195,7 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
 
 
 def _numbers(recording: Recording) -> dict[int, int]:
-    """Written ids of map features by their ids."""
+    """Return written ids of map features by their ids."""
     ids = [feature.feature_id for feature in recording.features]
     numbers = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in numbers)
@@ -205,35 +205,35 @@ def _numbers(recording: Recording) -> dict[int, int]:
 def _lights(
     recording: Recording, numbers: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
 ) -> dict[str, _Array]:
-    """Lights in slots, time-major; up to 16 keep their slot, of more the first that are observed at a step."""
+    """Return lights in slots, time-major; up to 16 keep their slot, of more the first that are observed at a step."""
     lights = recording.lights
-    steps, known = _steps(recording)
+    steps, exists = _steps(recording)
     states = np.full((STEPS, max(len(lights), LIGHTS)), -1, np.int64)
     for column, light in enumerate(lights):
-        states[known, column] = light.states[steps[known]]
+        states[exists, column] = light.states[steps[exists]]
     slot = np.broadcast_to(np.arange(LIGHTS), (STEPS, LIGHTS))
     if len(lights) > LIGHTS:  # Observed lights first, by step: a slot may change its lane.
         slot = np.argsort(states < 0, axis=1, kind="stable")[:, :LIGHTS]
-        lost["light_states"] += int((states >= 0).sum() - (np.take_along_axis(states, slot, 1) >= 0).sum())
-    observed = np.take_along_axis(states, slot, 1) >= 0
+    state = np.take_along_axis(states, slot, 1)
+    is_observed = state >= 0
+    lost["light_states"] += int((states >= 0).sum() - is_observed.sum())
     lane = np.full(states.shape[1], -1, np.int64)
     point = np.full((states.shape[1], 3), -1.0)
     lane[: len(lights)] = [numbers[light.lane_id] for light in lights]
     point[: len(lights)] = np.array([light.stop_point for light in lights]).reshape(-1, 3) - origin
     table = {
-        "state": np.take_along_axis(states, slot, 1),
-        "id": np.where(observed, lane[slot], -1),
-        "valid": observed.astype(np.int64),
-        **{axis: np.where(observed, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
+        "state": state,
+        "id": np.where(is_observed, lane[slot], -1),
+        "valid": is_observed.astype(np.int64),
+        **{axis: np.where(is_observed, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
         "timestamp_micros": micros,
     }
     return _by_span("traffic_light_state", table, axis=0)
 
 
 def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
-    """Points along every feature, at most 1 m apart; further where 30,000 would not be enough."""
-    rank = {kind: number for number, kind in enumerate(_ORDER)}
-    features = tuple(sorted(features, key=lambda feature: rank[feature.kind]))
+    """Return points along every feature, at most 1 m apart; further where 30,000 would not be enough."""
+    features = tuple(sorted(features, key=lambda feature: _ORDER.index(feature.kind)))
     spacing = _SPACING_M
     lines = [_sample(feature, spacing) for feature in features]
     while sum(map(len, lines)) > POINTS:
@@ -254,26 +254,24 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
 
 
 def _sample(feature: MapFeature, spacing_m: float) -> _Array:
-    """Points along a feature at most ``spacing_m`` apart, its own included; polygons are closed."""
+    """Return points along a feature at most ``spacing_m`` apart, its own included; polygons are closed."""
     points = feature.points
     if feature.kind in POLYGON_KINDS:
         points = np.concatenate((points, points[:1]))
     step = np.diff(points, axis=0)
-    parts = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing_m), 1).astype(np.int64)
-    row = np.repeat(np.arange(len(step)), parts)
-    fraction = (np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[row]
-    return np.concatenate((points[row] + fraction[:, None] * step[row], points[-1:]))
+    pieces = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing_m), 1).astype(np.int64)
+    return np.concatenate((subdivide(points[:-1], step, pieces), points[-1:]))
 
 
 def _directions(line: _Array) -> _Array:
-    """Unit vectors to the next point; zero at the last one, as in the data set."""
+    """Return unit vectors to the next point; zero at the last one, as in the data set."""
     step = np.diff(line, axis=0, append=line[-1:])
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return step / np.where(length > 0, length, 1.0)
 
 
 def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, paths: Paths) -> dict[str, _Array]:
-    """Routes from ego's first logged position; the route to the goal first and on the route.
+    """Return routes from ego's first logged position; the route to the goal first and on the route.
 
     The log route (stored row 1) is privileged and not exported, unless no lane leads to the goal: then it is row 0.
     """

@@ -77,17 +77,17 @@ def export(
     """
     options, out = options or Export(), Path(out)
     options.check()
-    opened = ScenarioSet.open(set_path)
+    scenarios = ScenarioSet.open(set_path)
     names = () if options.ids is None else (options.ids,)
-    rows = select_scenarios(opened, options.filters, names, options.limit)
+    rows = select_scenarios(scenarios, options.filters, names, options.limit)
     if options.format == "set":
-        return write_part(opened, rows, out, options.overwrite, progress)
+        return write_part(scenarios, rows, out, options.overwrite, progress)
     write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]
     _refuse_existing(out, options)
     partial = PartialFolder(out)
     partial.open()
     try:
-        work = _Work(opened, rows, partial.content, out.name, options, progress)
+        work = _Work(scenarios, rows, partial.content, out.name, options, progress)
         with explain_full_disk(out):
             files, lost = write(work)
         write_json(partial.content / NOTE, _note(work, files, +lost))
@@ -99,43 +99,43 @@ def export(
 
 
 def write_part(
-    opened: ScenarioSet,
+    scenarios: ScenarioSet,
     rows: Sequence[int],
     out: Path,
     overwrite: bool = False,
     progress: Progress | None = None,
-    chosen_by: Mapping[str, Any] | None = None,
+    selection: Mapping[str, Any] | None = None,
     further: Callable[[Path], None] | None = None,
 ) -> Exported:
     """Write scenarios of a set as a new set: records and entries unchanged.
 
     Args:
-        opened: The set.
+        scenarios: The set.
         rows: Rows of the set, in the order of the new one.
         out: Folder to create.
         overwrite: Replace an existing scenario set; other folders are never replaced.
         progress: Called with (scenarios done, scenarios).
-        chosen_by: Entries of the manifest that say how the rows were chosen, as plain JSON values.
+        selection: Entries of the manifest that say how the rows were selected, as plain JSON values.
         further: Called with the folder of the complete set before it gets its name, to add files.
 
     Raises:
         UsageError: ``out`` exists, or is the set that is read.
     """
-    refuse_part(opened, out)
-    part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
-    source = {**opened.manifest["source"], "part_of": part}
-    check_set_space(out, opened.capacity, len(rows))
-    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite, further=further) as writer:
-        for done, row in enumerate(rows, start=1):
-            writer.add(opened[row])
+    refuse_part(scenarios, out)
+    part = {"set": scenarios.path.name, "hash": scenarios.hash, **(selection or {})}
+    source = {**scenarios.manifest["source"], "part_of": part}
+    check_set_space(out, scenarios.capacity, len(rows))
+    with ScenarioWriter(out, scenarios.capacity, source, overwrite=overwrite, further=further) as writer:
+        for number, row in enumerate(rows, start=1):
+            writer.add(scenarios[row])
             if progress is not None:
-                progress(done, len(rows))
+                progress(number, len(rows))
     return Exported(out, len(rows), len(ScenarioSet.open(out).manifest["shards"]), {})
 
 
-def refuse_part(opened: ScenarioSet, out: Path) -> None:
+def refuse_part(scenarios: ScenarioSet, out: Path) -> None:
     """Raise a UsageError if ``out`` is the set that is read."""
-    if out.exists() and out.resolve() == opened.path.resolve():
+    if out.exists() and out.resolve() == scenarios.path.resolve():
         raise UsageError("is the set that is read", file=out, cure="choose another name")
 
 
@@ -143,7 +143,7 @@ def refuse_part(opened: ScenarioSet, out: Path) -> None:
 class _Work:
     """An export to write: rows of a set, the folder to write into, and the name that the folder will get."""
 
-    opened: ScenarioSet
+    scenarios: ScenarioSet
     rows: Sequence[int]
     folder: Path
     name: str
@@ -163,7 +163,7 @@ def _write_examples(work: _Work) -> _Written:
         path = work.folder / shard_name(work.name, number, shards)
         with path.open("wb") as file:
             for row in work.rows[number * size : (number + 1) * size]:
-                features, missing = tf_example(work.opened[row], PATHS[work.options.paths])
+                features, missing = tf_example(work.scenarios[row], PATHS[work.options.paths])
                 write_record(file, example(features))
                 lost.update(missing)
                 files.append(path.name)
@@ -175,25 +175,25 @@ def _write_examples(work: _Work) -> _Written:
 def _write_scenes(work: _Work) -> _Written:
     """Write one JSON file per scenario."""
     files = [file_name(number) for number in range(len(work.rows))]
-    for done, (row, name) in enumerate(zip(work.rows, files, strict=True), start=1):
-        scene = gpudrive_scene(work.opened[row], name)
+    for number, (row, name) in enumerate(zip(work.rows, files, strict=True), start=1):
+        scene = gpudrive_scene(work.scenarios[row], name)
         with (work.folder / name).open("wb") as file:
             file.write(json.dumps(scene, allow_nan=False).encode())
             sync_and_close(file)
-        work.report(done)
+        work.report(number)
     return files, Counter()
 
 
 def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:
-    """Content of ``export.json``: what the formats do not keep, such as data sets, segments and files of scenarios."""
-    opened, names = work.opened, ("scenario_id", "dataset", "segment")
+    """Return the content of ``export.json``: data set, segment and file of each scenario, which formats do not keep."""
+    scenarios, names = work.scenarios, ("scenario_id", "dataset", "segment")
     return {
         "drivax_version": metadata.version("drivax"),
         "format": work.options.format,
-        "set": {"name": opened.path.name, "hash": opened.hash, "source": opened.manifest["source"]},
+        "set": {"name": scenarios.path.name, "hash": scenarios.hash, "source": scenarios.manifest["source"]},
         "lost": dict(lost),
         "scenarios": [
-            {**{key: opened.entries[row][key] for key in names}, "file": file}
+            {**{key: scenarios.entries[row][key] for key in names}, "file": file}
             for row, file in zip(work.rows, files, strict=True)
         ],
     }
@@ -201,8 +201,8 @@ def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[st
 
 def _refuse_existing(out: Path, options: Export) -> None:
     """Refuse a path that exists, except an empty folder, or an export if it may be overwritten."""
-    empty = out.is_dir() and not any(out.iterdir())
-    if empty or not (out.exists() or out.is_symlink()):
+    is_empty = out.is_dir() and not any(out.iterdir())
+    if is_empty or not (out.exists() or out.is_symlink()):
         return
     if not (out / NOTE).is_file():
         raise UsageError("exists and is not an export", file=out, cure="choose another name")

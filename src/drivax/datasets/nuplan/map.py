@@ -6,7 +6,6 @@ Feature ids of the layers overlap, so a feature is (layer, fid); both are packed
 from __future__ import annotations
 
 import functools
-import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -91,7 +90,7 @@ def find_map(log: Path, name: str) -> Path:
 
 
 def _listing(log: Path) -> Path:
-    """The file that lists the maps and their versions."""
+    """Find the file that lists the maps and their versions."""
     roots = [root for folder in log.resolve().parents for root in (folder / "maps", folder)]
     if os.environ.get("NUPLAN_MAPS_ROOT"):
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
@@ -170,7 +169,7 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
 
 
 def _read_epsg(database: Database) -> int:
-    """EPSG number of the system of the logs, from the table ``meta``."""
+    """Read the EPSG number of the system of the logs from the table ``meta``."""
     database.require("meta", "key", "value")
     rows = database.rows("SELECT value FROM meta WHERE key = 'projectedCoordSystem'")
     match = re.fullmatch(r"(?:epsg:)?(\d{4,6})", str(rows[0][0]).strip().lower()) if rows else None
@@ -180,7 +179,7 @@ def _read_epsg(database: Database) -> int:
 
 
 def as_integer(value: Any) -> int | None:
-    """A feature id or enumeration, which files hold as integers, floats or texts; None for anything else."""
+    """Return a feature id or enumeration from an integer, float or text; None for anything else."""
     if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 11:
         value = int(value)
     if isinstance(value, float) and value.is_integer():
@@ -189,28 +188,27 @@ def as_integer(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
-    """A limit in m/s, also from a text; None for a missing or implausible one."""
+    """Return a limit in m/s, also from a text; None for a missing or implausible one."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
         value = float(value)
-    good = isinstance(value, int | float) and math.isfinite(value) and 0.0 < value <= _FASTEST_MPS
-    return float(value) if good else None
+    return float(value) if isinstance(value, int | float) and 0.0 < value <= _FASTEST_MPS else None
 
 
 def _lane_id(layer: str, value: Any) -> int | None:
-    """Packed id of a feature whose fid a file gives; None without one."""
+    """Return the packed id of a feature from its fid in a file; None without one."""
     fid = as_integer(value)
     return None if fid is None else feature_id(layer, fid)
 
 
 def _table(layer: Layer | None, *columns: str) -> Iterator[tuple[Any, ...]]:
-    """The fid and some columns of every row."""
+    """Yield the fid and some columns of every row."""
     if layer is None:
         return iter(())
     return zip(layer.fid.tolist(), *(layer.columns[name] for name in columns), strict=True)
 
 
 def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
-    """Lanes and connectors that have a baseline, linked; links may dangle."""
+    """Return lanes and connectors that have a baseline, with their links, which may dangle."""
     baselines: dict[int, int] = {}
     for row, (_, lane, connector) in enumerate(_table(layers["baseline_paths"], *LAYERS["baseline_paths"])):
         owner = _lane_id("lanes_polygons", lane) or _lane_id("lane_connectors", connector)
@@ -219,15 +217,15 @@ def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
     lanes = _plain_lanes(layers["lanes_polygons"], baselines)
     for number, connector in _connectors(layers, baselines):
         lanes[number] = connector
-        for before in lanes.keys() & connector.predecessors:
-            lanes[before].successors.append(number)
-        for after in lanes.keys() & connector.successors:
-            lanes[after].predecessors.append(number)
+        for lane in lanes.keys() & connector.predecessors:
+            lanes[lane].successors.append(number)
+        for lane in lanes.keys() & connector.successors:
+            lanes[lane].predecessors.append(number)
     return lanes
 
 
 def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
-    """Lanes with their neighbours: the next and the last index of the same group, counted from the left."""
+    """Return lanes with their neighbours: the next and the last index of the same group, counted from the left."""
     lanes: dict[int, Lane] = {}
     lane_at: dict[tuple[int, int], int] = {}
     slots: dict[int, tuple[int, int]] = {}
@@ -252,30 +250,32 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
 
 
 def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> Iterator[tuple[int, Lane]]:
-    """Connectors by packed id; the lane before one is its ``exit_lane_fid``, where one leaves that lane."""
+    """Yield connectors by packed id; the lane before one is its ``exit_lane_fid``, where one leaves that lane."""
     name = "gen_lane_connectors_scaled_width_polygons"
     sides = {
         as_integer(connector): (as_integer(left), as_integer(right))
         for _, connector, left, right in _table(layers.get(name), *LAYERS[name])
     }
-    for fid, leave, enter, group, limit in _table(layers["lane_connectors"], *LAYERS["lane_connectors"]):
+    for fid, exit_fid, entry_fid, group, limit in _table(
+        layers["lane_connectors"], *LAYERS["lane_connectors"]
+    ):
         number, block = _lane_id("lane_connectors", fid), as_integer(group)
-        before, after = _lane_id("lanes_polygons", leave), _lane_id("lanes_polygons", enter)
         if number is None or number not in baselines:
             continue
+        predecessor, successor = (_lane_id("lanes_polygons", lane) for lane in (exit_fid, entry_fid))
         lane = Lane(
             baseline=baselines[number],
             roadblock=None if block is None else ("connector", block),
             limit_mps=_limit(limit),
             boundaries=sides.get(as_integer(fid), (None, None)),
-            successors=[] if after is None else [after],
-            predecessors=[] if before is None else [before],
+            successors=[] if successor is None else [successor],
+            predecessors=[] if predecessor is None else [predecessor],
         )
         yield number, lane
 
 
 def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
-    """Lanes and connectors of a route's roadblocks, and the number of roadblocks that the map lacks.
+    """Return lanes and connectors of a route's roadblocks, and the number of roadblocks that the map lacks.
 
     Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
     """
@@ -288,10 +288,9 @@ def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
 def features_around(
     city: City, xy: Float64[np.ndarray, "point 2"]
 ) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """Map features within ``MARGIN_M`` of the bounding box of a drive, in the system of the logs, z = 0.
+    """Return map features within ``MARGIN_M`` of the bounding box of a drive, in the system of the logs, z = 0.
 
-    Returns:
-        The features, and counts of what could not be used: damaged geometries, baselines without a direction.
+    Damaged geometries and baselines without a direction are counted.
     """
     shapely = import_extra("shapely")
     try:
@@ -325,7 +324,7 @@ class _Around:
         self._reach = _FARTHEST_M + max(east - west, north - south)
 
     def near(self, name: str) -> list[int]:
-        """Rows of a layer whose bounds touch the box."""
+        """Return the rows of a layer whose bounds touch the box."""
         layer = self.city.layers.get(name)
         if layer is None:
             return []
@@ -333,7 +332,7 @@ class _Around:
         return layer.touching(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
 
     def types(self, name: str) -> dict[int, int | None]:
-        """Types of the features around the drive by row, for a layer whose only column is the type."""
+        """Return types of the features around the drive by row, for a layer whose only column is the type."""
         (column,) = LAYERS[name]
         return {row: as_integer(self.city.layers[name].columns[column][row]) for row in self.near(name)}
 
@@ -345,7 +344,7 @@ class _Around:
         return [owners[row] for row in rows], self.shapes("baseline_paths", rows)
 
     def shapes(self, name: str, rows: Sequence[int]) -> Array:
-        """Projected geometries of rows; None for one that is damaged, empty or too far away."""
+        """Return projected geometries of rows; None for one that is damaged, empty or too far away."""
         shapely = import_extra("shapely")
         if not len(rows):
             return np.zeros(0, dtype=object)
@@ -355,19 +354,18 @@ class _Around:
             xy, owner = shapely.get_coordinates(shapes, return_index=True)
         forward = _transformer(layer.epsg, self.city.epsg)
         xy = np.column_stack(forward.transform(xy[:, 0], xy[:, 1]))
-        far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
-        bad = np.bincount(owner[far], minlength=len(shapes)) > 0
-        bad |= np.bincount(owner, minlength=len(shapes)) == 0
-        self.damaged.update((name, rows[i]) for i in np.flatnonzero(bad).tolist())
-        result = np.asarray(shapes).copy()
-        result[bad] = None
-        shapely.set_coordinates(result, xy[~bad[owner]])
-        return result
+        is_far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
+        is_damaged = np.bincount(owner[is_far], minlength=len(shapes)) > 0
+        is_damaged |= np.bincount(owner, minlength=len(shapes)) == 0
+        self.damaged.update((name, rows[i]) for i in np.flatnonzero(is_damaged).tolist())
+        shapes = np.asarray(shapes).copy()
+        shapes[is_damaged] = None
+        return shapely.set_coordinates(shapes, xy[~is_damaged[owner]])
 
     def outlines(
         self, name: str, rows: Sequence[int], outline: Callable[[Any], Array | None]
     ) -> Iterator[tuple[int, int, Array]]:
-        """Row, packed id and points of the geometries that have an outline."""
+        """Yield row, packed id and points of the geometries that have an outline."""
         for row, shape in zip(rows, self.shapes(name, rows), strict=True):
             points, fid = outline(shape), as_integer(int(self.city.layers[name].fid[row]))
             if points is not None and fid is not None:
@@ -376,7 +374,7 @@ class _Around:
 
 @functools.lru_cache(maxsize=8)
 def _transformer(source: int, target: int) -> Any:
-    """Projection between two EPSG systems, x (east) first."""
+    """Return the projection between two EPSG systems, x (east) first."""
     pyproj = import_extra("pyproj")
     try:
         systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
@@ -389,7 +387,7 @@ def _transformer(source: int, target: int) -> Any:
 
 
 def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Points of a line, z = 0, without repeated ones; None for fewer than two points or a line in parts."""
+    """Return points of a line, z = 0, without repeated ones; None for fewer than two points or a line in parts."""
     shapely = import_extra("shapely")
     if shape is not None and shape.geom_type == "MultiLineString":
         shape = shapely.line_merge(shape)
@@ -399,7 +397,7 @@ def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
 
 
 def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Outline of a polygon (of the largest part), its first point not repeated."""
+    """Return the outline of a polygon (of the largest part), its first point not repeated."""
     shapely = import_extra("shapely")
     parts = _polygons(shape)
     if not parts:
@@ -409,9 +407,9 @@ def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
 
 
 def _distinct(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "distinct 3"] | None:
-    """Points that differ from the one before, z = 0; None for fewer than two."""
-    moved = np.append(True, (np.diff(xy, axis=0) != 0.0).any(axis=1))
-    return np.pad(xy[moved], ((0, 0), (0, 1))) if moved.sum() >= 2 else None
+    """Return points that differ from the one before, z = 0; None for fewer than two."""
+    xy = xy[np.append(True, (np.diff(xy, axis=0) != 0.0).any(axis=1))]
+    return np.pad(xy, ((0, 0), (0, 1))) if len(xy) >= 2 else None
 
 
 def _polygons(shape: Any) -> list[Any]:
@@ -420,7 +418,7 @@ def _polygons(shape: Any) -> list[Any]:
 
 
 def _lane_features(around: _Around) -> Iterator[MapFeature]:
-    """Lanes and connectors with their links, limits and widths."""
+    """Yield lanes and connectors with their links, limits and widths."""
     city = around.city
     numbers, shapes = around.baselines
     widths = _widths(around, [city.lanes[number] for number in numbers], shapes)
@@ -444,18 +442,18 @@ def _lane_features(around: _Around) -> Iterator[MapFeature]:
 
 
 def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
-    """Width of each lane: the median of the sum of the distances to both boundaries, at five points along it."""
+    """Return the width of each lane: the median sum of the distances to both boundaries at five points along it."""
     shapely = import_extra("shapely")
     row_of = around.city.boundary_rows
     pairs = [[row_of.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
     side_rows = np.unique(rows[rows >= 0])
     # A missing boundary is None, the last of the lines: distances to it, and so the width, are NaN.
-    none = np.array(None, dtype=object)
-    lines = np.append(around.shapes("boundaries", side_rows.tolist()), none)
+    missing = np.array(None, dtype=object)
+    lines = np.append(around.shapes("boundaries", side_rows.tolist()), missing)
     sides = lines[np.where(rows >= 0, np.searchsorted(side_rows, rows), -1)]
-    along = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, none)
-    points = shapely.line_interpolate_point(along[:, None], _WIDTH_FRACTIONS, normalized=True)
+    baselines = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, missing)
+    points = shapely.line_interpolate_point(baselines[:, None], _WIDTH_FRACTIONS, normalized=True)
     gaps = shapely.distance(points[:, None], sides[:, :, None])
     low, high = _WIDTHS_M
     widths = np.median(gaps.sum(axis=1), axis=1)
@@ -463,14 +461,14 @@ def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float
 
 
 def _line_features(around: _Around) -> Iterator[MapFeature]:
-    """Painted boundaries of lanes."""
+    """Yield painted boundaries of lanes."""
     types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _NO_PAINT}
     for row, number, points in around.outlines("boundaries", list(types), _line):
         yield MapFeature(number, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
 
 
 def _polygon_features(around: _Around) -> Iterator[MapFeature]:
-    """Crosswalks, and stop signs with the lanes whose baselines cross their stop polygons."""
+    """Yield crosswalks, and stop signs with the lanes whose baselines cross their stop polygons."""
     shapely = import_extra("shapely")
     for _, number, points in around.outlines("crosswalks", around.near("crosswalks"), _ring):
         yield MapFeature(number, RoadKind.CROSSWALK, points)
@@ -486,7 +484,7 @@ def _polygon_features(around: _Around) -> Iterator[MapFeature]:
 
 
 def _areas(around: _Around) -> Iterator[Area]:
-    """Drivable polygons."""
+    """Yield drivable polygons."""
     shapely = import_extra("shapely")
     for name in _DRIVABLE:
         for part in (part for shape in around.shapes(name, around.near(name)) for part in _polygons(shape)):

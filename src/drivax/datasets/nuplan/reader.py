@@ -17,13 +17,13 @@ from drivax.datasets import parsing
 from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, features_around, find_map
 from drivax.datasets.nuplan.sqlite import Database, open_database
 from drivax.datasets.parsing import flatten
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt
 from drivax.errors import DataError
 from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
 
-FORMAT = DATASET = "nuplan"
+_NAME = "nuplan"
 #: Tables by which a nuPlan log is recognised among SQLite files.
 _SIGNATURE = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
 #: Tables and columns that are read; a file with all of these tables is a nuPlan log.
@@ -73,9 +73,9 @@ _LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": Li
 
 @dataclass(frozen=True)
 class NuPlan:
-    """Reads nuPlan logs: one recording per scene at 10 Hz, all of a log in one segment."""
+    """Reader of nuPlan logs: one recording per scene at 10 Hz, all of a log in one segment."""
 
-    name: str = FORMAT
+    name: str = _NAME
     patterns: tuple[str, ...] = ("*_veh-*.db",)
     companions: tuple[str, ...] = ("map.gpkg", "nuplan-maps-*.json")
     #: Steps of the scenarios that recordings become; a recording goes on beyond its scene for the last of them.
@@ -125,10 +125,7 @@ class NuPlan:
                 city = city_map(find_map(path, log.map_name))
                 agents_by_token = agents(database)
                 for piece in pieces(log.line, self.steps):
-                    try:
-                        yield _recording(log, piece, agents_by_token, city)
-                    except DataError as error:
-                        yield BadRecord.of(error, path, piece.name)
+                    yield attempt(_recording, log, piece, agents_by_token, city, file=path, record=piece.name)
         except DataError as error:
             yield BadRecord.of(error, path)
 
@@ -152,13 +149,13 @@ class Piece:
         name: Token of the scene in hexadecimal digits, and a number where the scene has several pieces.
         scene: Token of the scene.
         sweeps: Rows of the time line, one per step of 0.1 s.
-        own: Sweeps of the scene itself, first and one past the last.
+        scene_sweeps: Sweeps of the scene itself, first and one past the last.
     """
 
     name: str
     scene: Any
     sweeps: Int64[np.ndarray, " step"]
-    own: tuple[int, int]
+    scene_sweeps: tuple[int, int]
 
 
 #: Number and kind of every track of a log by token.
@@ -189,13 +186,9 @@ def _open_log(database: Database, path: Path) -> Log:
 
 
 def _unknown_fields(database: Database) -> int:
-    """Number of tables, and of columns of the tables that are read, with unknown names."""
-    columns = {
-        (table, column)
-        for table, names in TABLES.items()
-        for column in database.columns(table) - _OTHERS.union(names)
-    }
-    return len(database.tables() - TABLES.keys() - _OTHERS) + len(columns)
+    """Count unknown tables, and unknown columns of the tables that are read."""
+    columns = sum(len(database.columns(table) - _OTHERS.union(names)) for table, names in TABLES.items())
+    return len(database.tables() - TABLES.keys() - _OTHERS) + columns
 
 
 def time_line(database: Database) -> TimeLine:
@@ -230,13 +223,13 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
             number = counts[scene] = counts.get(scene, 0) + 1
             name = scene.hex() if isinstance(scene, bytes) and 0 < len(scene) <= 16 else "no-scene"
             name += f".{number}" if number > 1 else ""
-            own = int(sweeps[begin]), int(sweeps[end - 1]) + step
-            recordings.append(Piece(name, scene, sweeps[span], own))
+            scene_sweeps = int(sweeps[begin]), int(sweeps[end - 1]) + step
+            recordings.append(Piece(name, scene, sweeps[span], scene_sweeps))
     return recordings
 
 
 def _sweeps_per_step(time_us: Int64[np.ndarray, " sweep"]) -> int:
-    """Number of sweeps per step of 10 Hz: 2 at 20 Hz, 1 at 10 Hz, within 10 ms."""
+    """Return the number of sweeps per step of 10 Hz: 2 at 20 Hz, 1 at 10 Hz, within 10 ms."""
     median_us = float(np.median(np.diff(time_us))) if len(time_us) > 1 else 1e5
     if 40_000 <= median_us <= 60_000:
         return 2
@@ -247,7 +240,7 @@ def _sweeps_per_step(time_us: Int64[np.ndarray, " sweep"]) -> int:
 
 
 def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[int, int]]:
-    """Steps of each scene, first and one past the last; long scenes in pieces."""
+    """Return the steps of each scene, first and one past the last; long scenes in pieces."""
     scenes = [line.scenes[sweep] for sweep in sweeps]
     begins = [step for step in range(len(scenes)) if step == 0 or scenes[step] != scenes[step - 1]]
     return [
@@ -258,7 +251,7 @@ def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[in
 
 
 def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
-    """Rows of numbers; NaN where a cell is NULL."""
+    """Return rows of numbers; NaN where a cell is NULL."""
     try:
         return np.array(rows, dtype=np.float64).reshape(len(rows), width)
     except (ValueError, TypeError, OverflowError) as error:
@@ -309,7 +302,7 @@ def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, in
 
 
 def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
-    """Box centre, z (0), heading, size and velocity of ego.
+    """Return box centre, z (0), heading, size and velocity of ego.
 
     Poses are of the rear axle and velocities in ego's frame; in a turn the box centre moves sideways too:
     v_centre = R(yaw) (vx, vy + yaw rate x 1.461 m).
@@ -344,7 +337,7 @@ def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " p
 
 
 def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[Any, ...]]:
-    """Step and columns of all rows of a table that belong to sweeps of a piece, in order of steps."""
+    """Read step and columns of all rows of a table that belong to sweeps of a piece, in order of steps."""
     steps = {log.line.tokens[sweep]: step for step, sweep in enumerate(piece.sweeps)}
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
     rows = log.database.rows_in(query, list(steps))
@@ -356,7 +349,7 @@ def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list
 def _boxes(
     log: Log, piece: Piece, agents_by_token: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
-    """Boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and how many have no track."""
+    """Read boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and the number of others."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _read_observations(log, piece, "lidar_box", columns)
     with_track = [row for row in rows if row[1] in agents_by_token]
@@ -372,14 +365,14 @@ def _boxes(
 
 
 def _scenario_types(log: Log, piece: Piece) -> list[str]:
-    """Types of the scenario tags on any sweep of the scene itself, sorted."""
-    tokens = log.line.tokens[slice(*piece.own)]
+    """Read the types of the scenario tags on any sweep of the scene itself, sorted."""
+    tokens = log.line.tokens[slice(*piece.scene_sweeps)]
     rows = log.database.rows_in("SELECT DISTINCT type FROM scenario_tag WHERE lidar_pc_token IN", tokens)
     return sorted({kind for (kind,) in rows if isinstance(kind, str) and kind})
 
 
 def _roadblocks(log: Log, piece: Piece) -> list[int]:
-    """Ids of the roadblocks of the scene's route, separated by spaces in the files, by commas in the documentation."""
+    """Read ids of the roadblocks of the scene's route, separated by spaces (in the documentation by commas)."""
     rows = log.database.rows("SELECT roadblock_ids FROM scene WHERE token = ?", (piece.scene,))
     text = rows[0][0] if rows else None
     words = text.replace(",", " ").split() if isinstance(text, str) else ()
@@ -398,10 +391,10 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
     lanes = {feature.feature_id for feature in features}
     route, lost_roadblocks = corridor(city, _roadblocks(log, piece))
     types, time_us = _scenario_types(log, piece), log.line.time_us
-    tags = {"source_format": FORMAT} | parsing.place_tags(log.map_name)
+    tags = {"source_format": _NAME} | parsing.place_tags(log.map_name)
     return Recording(
         scenario_id=piece.name,
-        dataset=DATASET,
+        dataset=_NAME,
         segment=log.name,
         timestamps_s=(time_us[piece.sweeps] - time_us[0]) * 1e-6,
         current_step=CURRENT_STEP,
@@ -424,13 +417,12 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
 def _lights(
     log: Log, piece: Piece, city: City, features: tuple[MapFeature, ...]
 ) -> tuple[tuple[Light, ...], int]:
-    """Lights of the connectors around the drive, which stop where these begin, and how many connectors are unknown."""
+    """Read lights of the connectors around the drive, which stop where these begin; count unknown connectors."""
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
     lights = parsing.Lights(len(piece.sweeps))
     unknown = set()
-    for step, connector, status in _read_observations(
-        log, piece, "traffic_light_status", "lane_connector_id, status"
-    ):
+    rows = _read_observations(log, piece, "traffic_light_status", "lane_connector_id, status")
+    for step, connector, status in rows:
         is_fid = isinstance(connector, int) and 0 <= connector < 2**32
         lane = feature_id("lane_connectors", connector) if is_fid else -1
         if lane in starts:

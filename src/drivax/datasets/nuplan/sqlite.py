@@ -166,16 +166,18 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
         columns={column: values.get(column, (None,) * len(rows)) for column in columns},
     )
     # Headers without an envelope: the bounds are those of the geometry itself.
-    unknown = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
-    if len(unknown):
-        shapes = geometries(database, layer, unknown)
+    rows_without = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
+    if len(rows_without):
+        shapes = geometries(database, layer, rows_without)
         with np.errstate(invalid="ignore"):
-            layer.bounds[unknown] = [(np.nan,) * 4 if shape is None else shape.bounds for shape in shapes]
+            layer.bounds[rows_without] = [
+                (np.nan,) * 4 if shape is None else shape.bounds for shape in shapes
+            ]
     return layer
 
 
 def _envelope(head: Any) -> tuple[float, float, float, float]:
-    """Bounds in the header of a geometry BLOB; NaN where it has none."""
+    """Return the bounds in the header of a geometry BLOB; NaN without them."""
     complete = isinstance(head, bytes) and len(head) >= _HEAD_BYTES and head[:2] == b"GP"
     # Byte 3 holds flags: bit 0 the byte order, bits 1 to 3 the code of the envelope, bits 4 and 5 empty and extended.
     if not complete or not 1 <= head[3] >> 1 & 7 <= 4:
@@ -206,7 +208,7 @@ def _decode(blob: bytes | None) -> Any:
 
 
 def _wkb(blob: Any) -> bytes | None:
-    """The WKB in a geometry BLOB; None for anything else, empty ones and extensions."""
+    """Return the WKB in a geometry BLOB; None for anything else, empty ones and extensions."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     code = blob[3] >> 1 & 7

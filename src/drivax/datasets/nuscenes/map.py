@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from drivax.datasets.parsing import load_json
 from drivax.datasets.road_edges import Area, road_edges
@@ -21,31 +21,6 @@ from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
 
 Array = np.ndarray[Any, Any]
-
-
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box in the plane, metres."""
-
-    low: Float[Array, "2"]
-    high: Float[Array, "2"]
-
-    @classmethod
-    def around(cls, xy: Float[Array, "point 2"], margin_m: float) -> Box:
-        """The box of some points, widened on all sides."""
-        return cls(xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m)
-
-    def touches(self, a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> Bool[Array, " segment"]:
-        """Whether the bounding boxes of segments touch it."""
-        return np.all((np.maximum(a, b) >= self.low) & (np.minimum(a, b) <= self.high), axis=-1)
-
-    def pieces(self, points: Float[Array, "point dim"]) -> Iterator[Float[Array, "part dim"]]:
-        """The runs of whole segments of a polyline that touch the box; a polyline inside stays as it is."""
-        near = self.touches(points[:-1, :2], points[1:, :2])
-        change = np.flatnonzero(np.diff(np.concatenate(([False], near, [False]))))
-        for start, end in zip(change[::2], change[1::2], strict=True):
-            yield points[start : end + 1]
-
 
 _AGAIN = "unpack the map expansion again"
 #: Layers that are read, row by row, and others of the map expansion.
@@ -76,6 +51,27 @@ _WIDTHS_M, _STOP_M = (2.0, 6.0), 1.0
 
 
 @dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the plane, metres."""
+
+    low: Float[Array, "2"]
+    high: Float[Array, "2"]
+
+    @classmethod
+    def around(cls, xy: Float[Array, "point 2"], margin_m: float) -> Box:
+        """Return the box of some points, widened on all sides."""
+        return cls(xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m)
+
+    def pieces(self, points: Float[Array, "point dim"]) -> Iterator[Float[Array, "part dim"]]:
+        """Yield the runs of segments of a polyline whose bounds touch the box; a polyline inside stays whole."""
+        a, b = points[:-1, :2], points[1:, :2]
+        touches = np.all((np.maximum(a, b) >= self.low) & (np.minimum(a, b) <= self.high), axis=-1)
+        change = np.flatnonzero(np.diff(np.concatenate(([False], touches, [False]))))
+        for start, end in zip(change[::2], change[1::2], strict=True):
+            yield points[start : end + 1]
+
+
+@dataclass(frozen=True)
 class City:
     """The map of one city in metres from its south-west corner, z = 0.
 
@@ -86,7 +82,7 @@ class City:
     lost: Mapping[str, int]
 
     def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
-        """Features in the box around some points; lines are cut there, lanes and polygons stay whole."""
+        """Return the features in the box around some points; lines are cut there, lanes and polygons stay whole."""
         box = Box.around(xy, margin_m)
         number = len(self.features)
         result: list[MapFeature] = []
@@ -106,7 +102,7 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """The map in a file of the map expansion (v1.2 or later)."""
+    """Read the map in a file of the map expansion (v1.2 or later)."""
     content = load_json(path)
     try:
         return _Layers(content).city()
@@ -132,7 +128,7 @@ class _Layers:
         self._count("unknown_fields", len(unknown))
 
     def city(self) -> City:
-        """All features, lanes first, numbered in this order."""
+        """Return all features, lanes first, numbered in this order."""
         lanes = self._lanes()
         lines = [*self._dividers(), *self._crossings()]
         features = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
@@ -142,11 +138,11 @@ class _Layers:
         return City((*lanes, *features, *stops, *edges), self._lost)
 
     def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
-        """Rows of a layer, none if it is missing."""
+        """Return the rows of a layer, none if it is missing."""
         return self._content.get(name, ())
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
-        """Nodes by token; missing ones are counted."""
+        """Return nodes by token; count missing ones."""
         nodes = [self._nodes[token] for token in tokens if token in self._nodes]
         self._count("nodes", len(tokens) - len(nodes))
         return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
@@ -156,7 +152,7 @@ class _Layers:
             self._lost[name] = self._lost.get(name, 0) + number
 
     def _areas(self, tokens: Sequence[str]) -> Iterator[Area]:
-        """Polygons by token; missing ones are counted."""
+        """Yield polygons by token; count missing ones."""
         for token in tokens:
             polygon = self._polygons.get(token)
             if polygon is None:
@@ -166,7 +162,7 @@ class _Layers:
             yield self._points(polygon["exterior_node_tokens"]), holes
 
     def _lanes(self) -> list[MapFeature]:
-        """Lanes and lane connectors along their arc lines, with links and neighbours."""
+        """Return lanes and lane connectors along their arc lines, with links and neighbours."""
         if not {"arcline_path_3", "connectivity"} <= self._content.keys():
             raise DataError("contains no centre lines of lanes", cure="download the map expansion v1.3")
         paths, links = self._content["arcline_path_3"], self._content["connectivity"]
@@ -179,23 +175,26 @@ class _Layers:
         for i, (row, name) in enumerate(with_path):
             connects, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
-            after, before = ([*link.get(direction, ())] for direction in ("outgoing", "incoming"))
-            self._count("dangling_links", sum(token not in index for token in (*after, *before)))
+            successors, predecessors = (
+                [index.get(token) for token in link.get(direction, ())]
+                for direction in ("outgoing", "incoming")
+            )
+            self._count("dangling_links", [*successors, *predecessors].count(None))
             lanes.append(
                 MapFeature(
                     i,
                     RoadKind.LANE_SURFACE,
                     np.column_stack((line, np.zeros(len(line)))),
                     width_m=None if connects else self._width(row, line),
-                    successors=tuple(index[token] for token in after if token in index),
-                    predecessors=tuple(index[token] for token in before if token in index),
+                    successors=tuple(lane for lane in successors if lane is not None),
+                    predecessors=tuple(lane for lane in predecessors if lane is not None),
                     interpolating=connects,
                 )
             )
         return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
-        """Area of the lane's polygon over the length of its centre line; None for an implausible width."""
+        """Return the area of a lane's polygon over the length of its centre line; None for an implausible width."""
         length = float(np.hypot(*np.diff(line, axis=0).T).sum())
         for exterior, _ in self._areas([row["polygon_token"]]):
             x, y = exterior[:, 0], exterior[:, 1]
@@ -205,7 +204,7 @@ class _Layers:
         return None
 
     def _dividers(self) -> Iterator[MapFeature]:
-        """Painted lane dividers in runs of one kind, and road dividers, whose paint is not in the map."""
+        """Yield painted lane dividers in runs of one kind, and road dividers, whose paint is not in the map."""
         for row in self._layer("lane_divider"):
             segments = row["lane_divider_segments"]
             for name, run in groupby(enumerate(segments), key=lambda item: str(item[1]["segment_type"])):
@@ -227,7 +226,7 @@ class _Layers:
                     yield MapFeature(0, RoadKind.CROSSWALK, exterior)
 
     def _stops(self, lanes: Sequence[MapFeature], first_id: int) -> list[MapFeature]:
-        """Stop lines of stop signs: one point each, with the lanes that end in them."""
+        """Return stop lines of stop signs: one point each, with the lanes that end in them."""
         import shapely
 
         stops: list[MapFeature] = []
@@ -244,7 +243,7 @@ class _Layers:
 
 
 def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
-    """Points about 0.5 m apart along a lane's arc lines (Dubins' curves; nuScenes map expansion).
+    """Sample a lane's arc lines (Dubins' curves; nuScenes map expansion) every 0.5 m or less.
 
     Each starts at ``start_pose`` (x, y, heading) and has three segments of lengths ``segment_length``, which turn left
     (L), go straight (S) or turn right (R) by ``shape``, with ``radius``.
@@ -274,7 +273,7 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
 
 
 def marking(name: str) -> RoadKind | None:
-    """The kind of a painted divider by its nuScenes name; None for no paint (NIL)."""
+    """Return the kind of a painted divider by its nuScenes name; None for no paint (NIL)."""
     if name == "NIL":
         return None
     style = "BROKEN" if "DASHED" in name else "SOLID"
@@ -284,7 +283,7 @@ def marking(name: str) -> RoadKind | None:
 
 
 def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
-    """Lanes with their neighbours, parallel lanes at 2.2 to 5.5 m from their middles; lane connectors have none."""
+    """Add neighbours to lanes, parallel lanes at 2.2 to 5.5 m from their middles; lane connectors have none."""
     from scipy.spatial import KDTree
 
     rows = [i for i, lane in enumerate(lanes) if not lane.interpolating and len(lane.points) > 2]
@@ -302,12 +301,12 @@ def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
         near = np.array(tree.query_ball_point(xy, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
         near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
         offset = points[near] - xy
-        ahead = offset @ np.array([np.cos(course), np.sin(course)])
-        left = offset @ np.array([-np.sin(course), np.cos(course)])
-        adjacent = (np.abs(left) >= _NEIGHBOUR_M[0]) & (np.abs(left) <= _NEIGHBOUR_M[1])
-        adjacent &= np.abs(ahead) < _ABREAST_M
+        ahead_m = offset @ np.array([np.cos(course), np.sin(course)])
+        left_m = offset @ np.array([-np.sin(course), np.cos(course)])
+        is_adjacent = (np.abs(left_m) >= _NEIGHBOUR_M[0]) & (np.abs(left_m) <= _NEIGHBOUR_M[1])
+        is_adjacent &= np.abs(ahead_m) < _ABREAST_M
         sides = {
-            side: tuple(int(lane) for lane in owner[near[adjacent & (sign * left > 0)]][:1])
+            side: tuple(int(lane) for lane in owner[near[is_adjacent & (sign * left_m > 0)]][:1])
             for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))
         }
         result[i] = replace(result[i], **sides)

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.datasets.nuscenes.map import city
 from drivax.datasets.parsing import box_centre, check_finite, flatten, nonzero, place_tags, windows_of
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.reading import check_regular
@@ -80,7 +80,7 @@ class NuScenes:
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
-        """Version, number of scenes, missing tables and maps."""
+        """Describe version, number of scenes, missing tables and maps."""
         folder = path.parent
         absent = (table for table in _TABLES if not (folder / f"{table}.json").is_file())
         missing = [f"{folder.name}/{table}.json" for table in absent]
@@ -97,80 +97,89 @@ class NuScenes:
         return Description("nuScenes", flavour, folder.name, scenes, tuple(notes), tuple(missing))
 
     def count(self, path: Path) -> int:
-        """Scenes times the windows of a usual scene; 0 if the table is unreadable."""
+        """Return the number of scenes times the windows of a usual one; 0 if the table is unreadable."""
         try:
             return len(scene_rows(path.parent)) * windows_of(_SCENE_STEPS)
         except DataError:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The scenes in file order, and a bad record in place of each that cannot be read."""
-        try:
-            tables = Tables.read(path.parent)
-        except DataError as error:
-            yield BadRecord.of(error, path)
+        """Yield the scenes in file order, and a bad record in place of each that cannot be read."""
+        tables = attempt(Tables.read, path.parent, file=path)
+        if isinstance(tables, BadRecord):
+            yield tables
             return
         for row, entry in enumerate(tables.scenes):
-            try:
-                scene = tables.scene(row)
-                yield recording(scene, _maps(path) / f"{Path(scene.location).name}.json")
-            except DataError as error:
-                yield BadRecord.of(error, path, entry["name"])
+            yield attempt(_recording, tables, row, _maps(path), file=path, record=entry["name"])
 
 
 def _maps(path: Path) -> Path:
-    """The folder of city maps: where the devkit expects it, or where the archive unpacks them."""
+    """Return the folder of city maps: where the devkit expects it, or where the archive unpacks them."""
     root = path.parent.parent
     expansion = root / "maps" / "expansion"
     folders = (expansion, root / "maps", root / "expansion")
     return next((folder for folder in folders if any(folder.glob("*.json"))), expansion)
 
 
-def recording(scene: Scene, map_file: Path) -> Recording:
-    """The recording of one scene: at 10 Hz, in the city's frame."""
-    begin = scene.keyframes_s[0]
-    duration = float(scene.keyframes_s[-1] - begin)
+def _recording(tables: Tables, row: int, maps: Path) -> Recording:
+    """Return the recording of the scene in a row of ``scenes``: at 10 Hz, in the city's frame.
+
+    Raises:
+        DataError: The scene has no log, fewer than two keyframes or poses, or an implausible duration.
+    """
+    scene, samples = tables.scenes[row], np.flatnonzero(tables.sample_scene == row)
+    location, logfile = tables.logs.get(scene["log_token"], ("", ""))
+    poses = tables.poses[tables.poses[:, 0] == row, 1:]
+    if len(samples) < 2 or len(poses) < 2 or not location:
+        problem = f"{len(samples)} keyframes, {len(poses)} ego poses, log {location or 'unknown'}"
+        raise DataError(f"the scene cannot be used: {problem}", cure=_AGAIN)
+    begin, end = tables.sample_time[samples].min(), tables.sample_time[samples].max()
+    duration = float(end - begin)
     if not duration <= _LONGEST_S:
         raise DataError(f"the scene lasts {duration:.0f} s", cure=_AGAIN)
     times = np.arange(int(round(duration / DT_S, 6)) + 1) * DT_S
-    tracks = _tracks(scene, begin + times)
+    tracks = _tracks(_sort_by_time(poses), *tables.observations(samples), begin + times)
     if not tracks.valid[0].any():
         raise DataError("the ego has no pose during the scene", cure=_AGAIN)
-    whole = city(map_file)
-    tracks, features = flatten(tracks, whole.around(tracks.xy[0][tracks.valid[0]], MARGIN_M))
+    city_map = city(maps / f"{Path(location).name}.json")
+    tracks, features = flatten(tracks, city_map.around(tracks.xy[0][tracks.valid[0]], MARGIN_M))
     return Recording(
-        scenario_id=scene.name,
+        scenario_id=scene["name"],
         dataset="nuscenes",
-        segment=scene.logfile or scene.name,
+        segment=logfile or scene["name"],
         timestamps_s=times,
         current_step=min(CURRENT_STEP, len(times) - 1),
         ego=0,
         tracks=tracks,
         features=features,
-        tags={"source_format": "nuscenes"} | place_tags(scene.location),
-        lost=nonzero(whole.lost, unknown_fields=scene.unknown_fields),
+        tags={"source_format": "nuscenes"} | place_tags(location),
+        lost=nonzero(city_map.lost, unknown_fields=tables.unknown_fields),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
 
-def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
-    """The ego (row 0) and every instance at some times; the size of each is its median."""
-    poses = scene.poses[:, 1:].copy()
-    poses[:, :2] = box_centre(poses[:, :2], poses[:, 2], CENTRE_AHEAD_M)
-    check_finite(poses, *scene.observations)
-    motions = [interpolate(scene.poses[:, 0], poses, times)]
-    motions += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations]
-    sizes = [EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in scene.observations)]
-    state = np.stack([states for states, _ in motions])
-    valid = np.stack([mask for _, mask in motions])
+def _tracks(
+    poses: Float64[Array, "pose 4"],
+    observations: Sequence[Float64[Array, "_ 7"]],
+    kinds: Sequence[AgentKind],
+    times: Float64[Array, " time"],
+) -> Tracks:
+    """Return the tracks of the ego (row 0) and every instance at some times; the size of each is its median."""
+    centres = poses[:, 1:].copy()
+    centres[:, :2] = box_centre(centres[:, :2], centres[:, 2], CENTRE_AHEAD_M)
+    check_finite(centres, *observations)
+    motions = [interpolate(poses[:, 0], centres, times)]
+    motions += [interpolate(table[:, 0], table[:, 1:4], times) for table in observations]
+    sizes = np.array([EGO_SIZE_M, *(np.median(table[:, 4:7], axis=0) for table in observations)])
+    state, valid = (np.stack(arrays) for arrays in zip(*motions, strict=True))
     return Tracks(
         xy=state[..., 0:2],
         z=np.zeros(valid.shape),
         heading=state[..., 2],
         velocity=state[..., 3:5],
-        size=np.where(valid[..., None], np.array(sizes)[:, None], 0.0),
+        size=np.where(valid[..., None], sizes[:, None], 0.0),
         valid=valid,
-        kind=np.array([AgentKind.VEHICLE, *scene.kinds], np.int8),
+        kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),
         track_id=np.arange(len(motions), dtype=np.int64),
     )
 
@@ -178,7 +187,7 @@ def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
 def interpolate(
     seen_s: Float64[Array, " row"], pose: Float64[Array, "row 3"], times: Float64[Array, " time"]
 ) -> tuple[Float64[Array, "time 5"], Bool[Array, " time"]]:
-    """Position, heading and velocity between observations.
+    """Interpolate position, heading and velocity between observations.
 
     Positions follow a cubic Hermite spline whose tangents are central differences (one-sided at the ends), velocities
     are its derivative, headings are linear after unwrapping. Steps before the first and after the last observation and
@@ -199,39 +208,17 @@ def interpolate(
     for run in (run for run in runs if len(run)):
         knots, xy = seen_s[run], pose[run, :2]
         # Half a step of tolerance: the ends of a run fall between steps.
-        inside = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
-        time = np.clip(times[inside], knots[0], knots[-1])
+        steps = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
+        time = np.clip(times[steps], knots[0], knots[-1])
         if len(run) == 1:
-            state[inside, :3] = pose[run[0]]
+            state[steps, :3] = pose[run[0]]
         else:
             spline = CubicHermiteSpline(knots, xy, np.gradient(xy, knots, axis=0))
-            state[inside, :2], state[inside, 3:] = spline(time), spline(time, 1)
-            state[inside, 2] = np.interp(time, knots, np.unwrap(pose[run, 2]))
-        valid |= inside
+            state[steps, :2], state[steps, 3:] = spline(time), spline(time, 1)
+            state[steps, 2] = np.interp(time, knots, np.unwrap(pose[run, 2]))
+        valid |= steps
     state[:, 2] = np.where(valid, wrap(state[:, 2]), 0.0)
     return state, valid
-
-
-@dataclass
-class Scene:
-    """One scene of the tables, cut from a log (``logfile``) in a city (``location``).
-
-    Attributes:
-        keyframes_s: Times of the keyframes, seconds since the epoch, increasing.
-        poses: Ego poses: time [s], x, y, heading; of the centre of the rear axle.
-        observations: Annotations of every instance: time [s], x, y, heading [rad], length, width, height [m].
-        kinds: Class of every instance.
-        unknown_fields: Number of tables and fields of unknown names.
-    """
-
-    name: str
-    location: str
-    logfile: str
-    keyframes_s: Float64[Array, " keyframe"]
-    poses: Float64[Array, "pose 4"]
-    observations: list[Float64[Array, "_ 7"]]
-    kinds: list[AgentKind]
-    unknown_fields: int
 
 
 @dataclass
@@ -290,46 +277,33 @@ class Tables:
         unknown = _unknown_fields(folder)
         return cls(scenes, logs, sample_scene, sample_time, poses, annotations, kinds, unknown)
 
-    def scene(self, row: int) -> Scene:
-        """Return the scene in a row of ``scenes``; refuse one without a log or two keyframes and poses."""
-        entry = self.scenes[row]
-        location, logfile = self.logs.get(entry["log_token"], ("", ""))
-        samples = np.flatnonzero(self.sample_scene == row)
-        poses = self.poses[self.poses[:, 0] == row, 1:]
-        if len(samples) < 2 or len(poses) < 2 or not location:
-            problem = f"{len(samples)} keyframes, {len(poses)} ego poses, log {location or 'unknown'}"
-            raise DataError(f"the scene cannot be used: {problem}", record=entry["name"], cure=_AGAIN)
+    def observations(
+        self, samples: Int64[Array, " sample"]
+    ) -> tuple[list[Float64[Array, "_ 7"]], list[AgentKind]]:
+        """Return time [s], x, y, heading, length, width and height of each instance at some samples, and its class."""
         annotations = self.annotations[np.isin(self.annotations[:, 0], samples)]
         times = self.sample_time[annotations[:, 0].astype(np.int64)]
         table = np.column_stack((times, annotations[:, 2:]))
         instances = np.unique(annotations[:, 1]).astype(np.int64).tolist()
-        return Scene(
-            name=entry["name"],
-            location=location,
-            logfile=logfile,
-            keyframes_s=np.unique(self.sample_time[samples]),
-            poses=_sort_by_time(poses),
-            observations=[_sort_by_time(table[annotations[:, 1] == instance]) for instance in instances],
-            kinds=[self.kinds[instance] for instance in instances],
-            unknown_fields=self.unknown_fields,
-        )
+        series = [_sort_by_time(table[annotations[:, 1] == instance]) for instance in instances]
+        return series, [self.kinds[instance] for instance in instances]
 
 
 def _unknown_fields(folder: Path) -> int:
-    """Number of tables, and of fields in the first rows of those that are read, with unknown names."""
+    """Count unknown tables, and unknown fields in the first rows of those that are read."""
     fields = {name for table in _TABLES for name in next(rows(folder / f"{table}.json"), {})}
     tables = {path.stem for path in folder.glob("*.json")}
     return len(fields - _FIELDS) + len(tables.difference(_TABLES, _OTHERS))
 
 
 def _sort_by_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
-    """Rows in the order of their first column, the first of several at one time."""
+    """Return rows in the order of their first column, the first of several at one time."""
     _, first = np.unique(table[:, 0], return_index=True)
     return table[first]
 
 
 def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64[Array, "pose 5"]:
-    """Ego poses of the lidar's frames: scene row, time, x, y, heading."""
+    """Read ego poses of the lidar's frames: scene row, time, x, y, heading."""
     scene_of_pose: dict[str, int] = {}
     for row in _table(folder, "sample_data"):
         sample = samples.get(row.text("sample_token"), -1)
@@ -348,7 +322,7 @@ def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64
 def _annotations(
     folder: Path, samples: Mapping[str, int], instances: Mapping[str, int]
 ) -> Float64[Array, "annotation 8"]:
-    """Annotations: sample row, instance row, x, y, heading, length, width, height."""
+    """Read annotations: sample row, instance row, x, y, heading, length, width, height."""
     table = array("d")
     for row in _table(folder, "sample_annotation"):
         sample = samples.get(row.text("sample_token"), -1)
@@ -363,7 +337,7 @@ def _annotations(
 
 
 def scene_rows(folder: Path) -> list[dict[str, str]]:
-    """The rows of ``scene.json``: token, name and log_token of each."""
+    """Read token, name and log_token of each row of ``scene.json``."""
     names = ("token", "name", "log_token")
     return [{name: row.text(name) for name in names} for row in _table(folder, "scene")]
 
@@ -377,12 +351,12 @@ def has_annotations(folder: Path) -> bool:
 
 
 def kind_of(category: str) -> AgentKind:
-    """The class of a nuScenes category (``vehicle.car``, ``human.pedestrian.adult``, ...)."""
+    """Return the class of a nuScenes category (``vehicle.car``, ``human.pedestrian.adult``, ...)."""
     return next((kind for start, kind in _KINDS if category.startswith(start)), AgentKind.OTHER)
 
 
 def yaw(w: float, x: float, y: float, z: float) -> float:
-    """Heading of a unit quaternion (w, x, y, z): the direction of its x axis in the plane, radians."""
+    """Return the heading of a unit quaternion (w, x, y, z): the direction of its x axis in the plane, radians."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
@@ -416,13 +390,13 @@ def _is_number(value: Any) -> bool:
 
 
 def _table(folder: Path, name: str) -> Iterator[_Row]:
-    """Rows of a table of a version, one by one."""
+    """Yield the rows of a table of a version."""
     file = folder / f"{name}.json"
     return (_Row(row, file) for row in rows(file))
 
 
 def rows(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects of a file that holds one array of objects; it is never held in memory as a whole."""
+    """Yield the objects of a file that holds one array of objects, which is never in memory as a whole."""
     check_regular(path, _AGAIN)
     decoder = json.JSONDecoder()
     number = 0
@@ -441,10 +415,10 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                 try:
                     row, end = decoder.raw_decode(text, position)
                 except ValueError:  # The row goes on in the next chunk, unless the file is damaged.
-                    more = file.read(_CHUNK)
-                    if not more or len(text) - position > _LONGEST:
+                    chunk = file.read(_CHUNK)
+                    if not chunk or len(text) - position > _LONGEST:
                         raise
-                    text, position = text[position:] + more, 0
+                    text, position = text[position:] + chunk, 0
                     continue
                 if not isinstance(row, dict):
                     raise DataError("is not an object", file=path, record=number, cure="download it again")

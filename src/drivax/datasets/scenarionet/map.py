@@ -73,7 +73,7 @@ _YAW_RAD = 0.05
 _FARTHEST_M, _LONGEST_M = 1e5, 2e6
 
 
-def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
+def orient_outlines(lines: Sequence[Array]) -> list[Array]:
     """Orient the outline of drivable space: exteriors anticlockwise, holes clockwise.
 
     Rings repeat their first point and do not cross, so one inside an even number of others is an exterior, else a hole.
@@ -86,26 +86,25 @@ def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
     depth = iter([_depth(points, [other for other in rings if other is not points]) for points in rings])
     result = []
     for points, is_ring in zip(lines, are_rings, strict=True):
-        anticlockwise = is_ring and _area(points) > 0
-        exterior = is_ring and next(depth) % 2 == 0
-        result.append(points if is_ring and anticlockwise == exterior else points[::-1].copy())
+        is_oriented = is_ring and (_area(points) > 0) == (next(depth) % 2 == 0)
+        result.append(points if is_oriented else points[::-1].copy())
     return result
 
 
 def _area(ring: Array) -> float:
-    """Twice the signed area, anticlockwise positive (shoelace formula around the first point)."""
+    """Return twice the signed area, anticlockwise positive (shoelace formula around the first point)."""
     x, y = (ring[:, :2] - ring[0, :2]).T
     return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]))
 
 
 def _depth(ring: Array, others: Sequence[Array]) -> int:
-    """Number of other rings that contain most of a few points along a ring."""
+    """Count the other rings that contain most of a few points along a ring."""
     first = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
     middle = (ring[first] + ring[first + 1]) / 2
-    return sum(int(2 * inside(middle, other).sum() > _PROBES) for other in others)
+    return sum(int(2 * in_ring(middle, other).sum() > _PROBES) for other in others)
 
 
-def inside(points: Array, ring: Array) -> Array:
+def in_ring(points: Array, ring: Array) -> Array:
     """Whether each point lies inside a closed ring (even-odd rule)."""
     a, b = ring[:-1], ring[1:]
     above = points[:, None, 1] >= a[None, :, 1]
@@ -116,7 +115,7 @@ def inside(points: Array, ring: Array) -> Array:
     return ((crosses & (x > points[:, None, 0])).sum(axis=1) % 2).astype(bool)
 
 
-def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
+def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
     """Orient road edges so that most of the lane points next to them are on their left; keep those without lanes."""
     centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
     if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
@@ -125,7 +124,7 @@ def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Arr
 
 
 def _votes_left(edge: Array, centres: Array) -> int:
-    """Number of lane points next to an edge on its left minus those on its right."""
+    """Return the number of lane points next to an edge on its left minus those on its right."""
     low, high = edge.min(axis=0) - NEIGHBOUR_M, edge.max(axis=0) + NEIGHBOUR_M
     near = centres[np.all((centres >= low) & (centres <= high), axis=1)]
     block = max(_BLOCK // len(edge), 1)
@@ -133,17 +132,17 @@ def _votes_left(edge: Array, centres: Array) -> int:
 
 
 def _votes(edge: Array, points: Array) -> int:
-    """The same for a block of points."""
+    """Return the same for a block of points."""
     a, b = edge[:-1], edge[1:]
-    distance, along = point_to_segment(points[:, None], a[None], b[None])
+    distance, fraction = point_to_segment(points[:, None], a[None], b[None])
     rows = np.arange(len(points))
     nearest = distance.argmin(axis=1)
-    position = nearest + along[rows, nearest]
+    position = nearest + fraction[rows, nearest]
     # A point that is nearest to an end lies before or behind the edge, not next to it.
-    adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (position > 0) & (position < len(a))
+    is_adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (position > 0) & (position < len(a))
     step, offset = (b - a)[nearest], points - a[nearest]
     side = np.sign(step[:, 0] * offset[:, 1] - step[:, 1] * offset[:, 0])
-    return int(side[adjacent].sum())
+    return int(side[is_adjacent].sum())
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     if total > _LONGEST_M:
         raise DataError(f"a map of {total / 1000:.0f} km of lines", cure=SKIP)
     lanes = [f.points for f in features if f.kind in LANE_KINDS and f.feature_id in reading.spatial]
-    flat = not reading.spatial or third_column_is_heading(lanes)
+    flat = not reading.spatial or has_headings(lanes)
     if flat:
         features = [replace(f, points=_on_plane(f.points)) for f in features]
     kind = RoadKind.LINE_SOLID_SINGLE_WHITE
@@ -252,7 +251,7 @@ def _on_plane(points: Array) -> Array:
 
 
 def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
-    """The speed limit in m/s; 0 in the file means unknown."""
+    """Return the speed limit in m/s; 0 in the file means unknown."""
     limits = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
     for value, unit in limits:
         limit = as_float(value)
@@ -265,7 +264,7 @@ def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
 
 
 def _width(body: Mapping[Any, Any]) -> float | None:
-    """Median width of a lane over its points; None for a missing or implausible one.
+    """Return the median width of a lane over its points; None for a missing or implausible one.
 
     The file pairs lane and boundary points by index, so distances reach 25 m; a missing side is a copy of the other.
     """
@@ -274,13 +273,13 @@ def _width(body: Mapping[Any, Any]) -> float | None:
     sides = floats(body["width"], "lane widths")
     if sides.ndim != 2 or sides.shape[1] != 2 or not len(sides):
         return None
-    both = sides[(sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])]
-    width = float(np.median(both.sum(axis=1))) if len(both) else 0.0
+    sides = sides[(sides > 0).all(axis=1) & (sides[:, 0] != sides[:, 1])]
+    width = float(np.median(sides.sum(axis=1))) if len(sides) else 0.0
     return width if WIDTHS_M[0] <= width <= WIDTHS_M[1] else None
 
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
-    """Numbers of linked features, which files name by number, text or a dictionary with ``feature_id``."""
+    """Return ids of linked features, which files name by number, text or a dictionary with ``feature_id``."""
     names = [item.get("feature_id") if isinstance(item, dict) else item for item in as_list(value)]
     links = tuple(link for name in names if (link := reading.names.get(name)) is not None)
     if len(links) < len(names):
@@ -288,14 +287,14 @@ def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
     return links
 
 
-def third_column_is_heading(lanes: Sequence[Array]) -> bool:
+def has_headings(lanes: Sequence[Array]) -> bool:
     """Whether the third column of lanes is their heading (nuScenes' arc lines are sampled as x, y, yaw)."""
     differences = []
     for points in lanes:
         step = np.diff(points[:, :2], axis=0)
-        moved = step.any(axis=1)
-        direction = np.arctan2(step[moved, 1], step[moved, 0])
-        differences.append(np.abs(wrap(points[:-1, 2][moved] - direction)))
+        has_length = step.any(axis=1)
+        direction = np.arctan2(step[has_length, 1], step[has_length, 0])
+        differences.append(np.abs(wrap(points[:-1, 2][has_length] - direction)))
     difference = np.concatenate(differences) if differences else np.zeros(0)
     return len(difference) > 0 and float(np.median(difference)) < _YAW_RAD
 
@@ -303,12 +302,12 @@ def third_column_is_heading(lanes: Sequence[Array]) -> bool:
 def _with_edges(features: list[MapFeature], outline: Array, dataset: str) -> list[MapFeature]:
     """Turn outlines of drivable space into road edges, and every edge's drivable side to its left."""
     rows = np.flatnonzero(outline).tolist()
-    for row, points in zip(rows, outlines_on_left([features[row].points for row in rows]), strict=True):
+    for row, points in zip(rows, orient_outlines([features[row].points for row in rows]), strict=True):
         features[row] = replace(features[row], kind=RoadKind.EDGE_BOUNDARY, points=points)
     if dataset in _DRIVABLE_LEFT:
         return features
     lanes = [f.points for f in features if f.kind in LANE_KINDS]
     rows = [i for i, f in enumerate(features) if f.kind in EDGE_KINDS and not outline[i]]
-    for row, points in zip(rows, drivable_on_left([features[i].points for i in rows], lanes), strict=True):
+    for row, points in zip(rows, orient_edges([features[i].points for i in rows], lanes), strict=True):
         features[row] = replace(features[row], points=points)
     return features

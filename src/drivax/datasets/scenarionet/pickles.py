@@ -141,10 +141,10 @@ class _Machine:
         module, name = self._take(2) if argument is None else argument.partition(" ")[::2]
         if not isinstance(module, str) or not isinstance(name, str):
             raise ValueError("a name that is not text")
-        full = f"{_MODULES.get(module, module)}.{name}"
-        if full not in _NAMES and full not in _FUNCTIONS:
-            raise DataError(f"names {full[:100]}, which is not data", cure=_DISTRUST)
-        self.stack.append(_Global(full))
+        path = f"{_MODULES.get(module, module)}.{name}"
+        if path not in _NAMES and path not in _FUNCTIONS:
+            raise DataError(f"names {path[:100]}, which is not data", cure=_DISTRUST)
+        self.stack.append(_Global(path))
 
     def _call(self, argument: Any) -> None:
         """REDUCE: call a constructor."""
@@ -207,7 +207,7 @@ _SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
 
 
 def _hashable(key: Any) -> Any:
-    """A key or a member of a set: a plain value or a short flat tuple of them.
+    """Return a key or a member of a set: a plain value or a short flat tuple of them.
 
     Hashing deep tuples ends the process. Keys of one hash take quadratic time: large integers, tuples of many parts
     or of floats.
@@ -222,43 +222,43 @@ def _hashable(key: Any) -> Any:
 
 
 def _members(items: Any = ()) -> list[Any]:
-    """Items of a container."""
+    """Return the items of a container."""
     if not isinstance(items, list | tuple | set | frozenset):
         raise ValueError("a container of an object without items")
     return list(items)
 
 
 def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
-    """A plain dictionary in place of an ordered or a default one, whose factory (the first argument) is dropped."""
+    """Return a plain dictionary for an ordered or a default one, whose factory (the first argument) is dropped."""
     pairs = [argument for argument in arguments if not isinstance(argument, _Global) and argument is not None]
     return {_hashable(key): value for items in pairs for key, value in _members(items)}
 
 
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
-    """Bytes, which protocols up to 2 store as a text in Latin-1."""
+    """Return bytes, which protocols up to 2 store as a text in Latin-1."""
     if not isinstance(text, str):
         raise ValueError("bytes of an object that is no text")
     return text.encode("latin1")
 
 
 def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
-    """An array type, with the arguments of ``numpy.dtype``; its byte order follows with its state."""
+    """Return an array type, with the arguments of ``numpy.dtype``; its byte order follows with its state."""
     if not isinstance(code, str) or not _TYPE_CODE.fullmatch(code):
         raise ValueError(f"arrays of type {code[:20]!r}" if isinstance(code, str) else "arrays of no type")
-    plain = np.dtype(code)
+    dtype = np.dtype(code)
 
     def finish(state: Any) -> np.dtype[Any]:
         """Apply the byte order of the state; refuse fields, shapes and metadata."""
-        plain_state = isinstance(state, tuple) and state[2:5] == (None, None, None)
-        if not plain_state or state[1] not in ("<", ">", "|", "="):
+        is_plain = isinstance(state, tuple) and state[2:5] == (None, None, None)
+        if not is_plain or state[1] not in ("<", ">", "|", "="):
             raise ValueError("an array type with fields")
-        return plain.newbyteorder(state[1])
+        return dtype.newbyteorder(state[1])
 
     return _Unbuilt(finish)
 
 
 def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
-    """An array whose shape, type and content follow with its state."""
+    """Return an array whose shape, type and content follow with its state."""
 
     def finish(state: Any) -> Any:
         """Build the array from its state: version, shape, type, order and content."""
@@ -271,7 +271,7 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
 
 
 def _array(content: Any, dtype: Any, shape: Any, order: Any = "C") -> Any:
-    """A list of objects, or an array over bytes of the file: no shape can ask for more memory than the file has."""
+    """Return a list of objects, or an array over bytes of the file: no shape can ask for more memory than it has."""
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or len(shape) > MOST_AXES:
         raise ValueError("an array of odd shape or type")
     if any(type(size) is not int or not 0 <= size <= MOST_BYTES for size in shape):
@@ -291,7 +291,7 @@ def _array(content: Any, dtype: Any, shape: Any, order: Any = "C") -> Any:
 
 
 def _scalar(dtype: Any, content: Any = b"") -> Any:
-    """A NumPy scalar as a Python value."""
+    """Return a NumPy scalar as a Python value."""
     array = _array(content, dtype, (1,))
     value = array[0] if isinstance(array, list) else array[0].item()
     return bool(value) if dtype.kind == "b" else value
@@ -319,7 +319,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def _content(content: Any) -> bytes:
-    """Bytes of a bytes-like value or a text in Latin-1; an integer, which would allocate that many, is refused."""
+    """Return bytes of a bytes-like value or a text in Latin-1; refuse an integer, which would allocate that many."""
     if isinstance(content, str):
         return _encode(content)
     if not isinstance(content, bytes | bytearray):

@@ -19,7 +19,7 @@ import numpy as np
 from drivax.datasets import parsing
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
 from drivax.datasets.parsing import flatten, lift
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
 from drivax.datasets.scenarionet.pickles import (
@@ -35,6 +35,7 @@ from drivax.datasets.scenarionet.pickles import (
 )
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
+from drivax.reading import read_bytes
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, is_even
 from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, AgentKind, Flag, LightState
 
@@ -90,7 +91,7 @@ _PARTS = (b"tracks", b"metadata", b"map_features", b"dynamic_map_states")
 
 @dataclass(frozen=True)
 class ScenarioNet:
-    """Reads ScenarioNet pickles without running them; one that names anything but data is refused."""
+    """Reader of ScenarioNet pickles without running them; one that names anything but data is refused."""
 
     name: str = _NAME
     patterns: tuple[str, ...] = ("sd_*.pkl", "[0-9]*.pkl")
@@ -98,12 +99,12 @@ class ScenarioNet:
 
     def recognise(self, path: Path) -> bool:
         """Whether it is a pickle that begins with the keys of a scenario."""
-        head = _head(path)
-        keys = all(sign in head for sign in _SIGNS) and any(part in head for part in _PARTS)
-        return head[:1] in (b"\x80", b"(", b"}") and keys
+        head = read_head(path, _HEAD_BYTES)
+        has_keys = all(key in head for key in _SIGNS) and any(key in head for key in _PARTS)
+        return head[:1] in (b"\x80", b"(", b"}") and has_keys
 
     def describe(self, path: Path) -> Description:
-        """Data set and version of the scenario, and what it lacks."""
+        """Describe data set and version of the scenario, and what it lacks."""
         tree = _load(path)
         recording = decode(tree)
         lanes = [f for f in recording.features if f.kind in LANE_KINDS]
@@ -123,48 +124,29 @@ class ScenarioNet:
 
     def count(self, path: Path) -> int:
         """Return the number of windows, by the length that the file names at its beginning."""
-        steps = _length_of(_head(path))
+        steps = _length_of(read_head(path, _HEAD_BYTES))
         return 0 if steps is None else parsing.windows_of(steps)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a file, or the bad record in its place."""
-        try:
-            yield decode(_load(path))
-        except DataError as error:
-            yield BadRecord.of(error, path)
-
-
-def _head(path: Path) -> bytes:
-    """The beginning of a file; empty if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
-    except OSError:
-        return b""
+        yield attempt(lambda: decode(_load(path)), file=path)
 
 
 def _load(path: Path) -> Any:
-    """Read a pickle of plausible size as data."""
-    try:
-        if path.stat().st_size > pickles.MOST_BYTES:
-            raise DataError(
-                f"larger than {pickles.MOST_BYTES >> 20} MB", file=path, cure="it is not a scenario"
-            )
-        return pickles.load(path.read_bytes())
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
+    """Return the content of a pickle."""
+    return pickles.load(read_bytes(path, "check the path, and that it is a scenario", pickles.MOST_BYTES))
 
 
 def _length_of(head: bytes) -> int | None:
-    """The value of the key ``length`` in the beginning of a pickle."""
-    last = None
+    """Return the value of the key ``length`` in the beginning of a pickle, None without a plausible one."""
+    key = None
     with contextlib.suppress(ValueError):  # the beginning is cut anywhere
         for operation, argument, _ in pickletools.genops(head):
             if operation.name in ("MEMOIZE", "BINPUT", "LONG_BINPUT", "PUT"):
                 continue
-            if last == "length":
+            if key == "length":
                 return argument if type(argument) is int and 0 < argument < 1_000_000 else None
-            last = argument
+            key = argument
     return None
 
 
@@ -210,7 +192,7 @@ def decode(tree: Any) -> Recording:
 
 
 def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
-    """Position (x, y, 0) of the file's origin in the original map frame; zeros where the file does not tell it.
+    """Return the position (x, y, 0) of the file's origin in the original map frame; zeros if the file does not tell it.
 
     ScenarioNet notes the centre that it takes from all positions, MetaDrive the old origin in its new frame. Older
     nuScenes files tell the centre by steps without an observation: their zeros were moved as well.
@@ -225,7 +207,7 @@ def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str)
 
 
 def _position(metadata: Mapping[Any, Any], name: str) -> Array:
-    """A position (x, y) in the metadata; zeros where there is none."""
+    """Return a position (x, y) in the metadata; zeros for a missing one."""
     value = metadata.get(name)
     position = np.zeros(2) if value is None else floats(value, name)
     if position.shape not in ((2,), (3,)) or not (np.abs(position) < _FARTHEST_M).all():
@@ -234,7 +216,7 @@ def _position(metadata: Mapping[Any, Any], name: str) -> Array:
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
-    """The id of the scenario, which forms of the files hold in three places."""
+    """Return the id of the scenario, which forms of the files hold in three places."""
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
         if identity := as_text(value):
             return identity
@@ -253,12 +235,12 @@ def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
 
 
 def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
-    """The row of the ego: of the track ``sdc_id``, or of the track ``ego`` if the file names none."""
+    """Return the row of the track ``sdc_id``, or of the track ``ego`` if the file names none."""
     name = as_text(metadata.get("sdc_id"))
     name = "ego" if name is None else name
-    if (row := rows.get(name)) is not None:
-        return row
-    raise DataError(f"the ego {name[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
+    if name not in rows:
+        raise DataError(f"the ego {name[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
+    return rows[name]
 
 
 def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Tracks, Counter[str]]:
@@ -310,7 +292,7 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
 
 
 def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array | None:
-    """One state of one track as ``[time, column]``; None for a missing one."""
+    """Return one state of one track as ``[time, column]``; None for a missing one."""
     series = state.get(name)
     if series is None:
         return None
@@ -323,26 +305,26 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
     return values
 
 
-def velocity_is_missing(tracks: Tracks) -> bool:
+def lacks_velocity(tracks: Tracks) -> bool:
     """Whether most tracks that move at their end have velocity 0 there: it is missing, or a difference (nuScenes)."""
     rows = np.arange(len(tracks.valid))
-    last = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
-    before = np.maximum(last - 1, 0)
-    moved = np.hypot(*(tracks.xy[rows, last] - tracks.xy[rows, before]).T) > _MOVED_M
-    moved &= tracks.valid[rows, last] & tracks.valid[rows, before] & (last > before)
-    still = ~tracks.velocity[rows, last].any(axis=1)
-    return bool((moved & still).sum() * 2 > moved.sum())
+    end = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
+    previous = np.maximum(end - 1, 0)
+    moves = np.hypot(*(tracks.xy[rows, end] - tracks.xy[rows, previous]).T) > _MOVED_M
+    moves &= tracks.valid[rows, end] & tracks.valid[rows, previous] & (end > previous)
+    has_zero = ~tracks.velocity[rows, end].any(axis=1)
+    return bool((moves & has_zero).sum() * 2 > moves.sum())
 
 
 def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:
-    """Tracks with box centres and their velocities, and flags for default sizes and differentiated velocities."""
+    """Return tracks with box centres and velocities, and flags for default sizes and differentiated velocities."""
     flags = Flag.DEFAULT_SIZES if dataset == "av2" else Flag.NONE
     if dataset == "nuscenes":  # poses of ego are of the rear axle
         xy = tracks.xy.copy()
         centres = parsing.box_centre(xy[ego], tracks.heading[ego], CENTRE_AHEAD_M)
         xy[ego] = np.where(tracks.valid[ego, :, None], centres, 0.0)
         tracks = replace(tracks, xy=xy)
-    if velocity_is_missing(tracks):
+    if lacks_velocity(tracks):
         times = _timestamps(metadata, tracks.valid.shape[1])
         tracks = replace(tracks, velocity=differentiate(tracks.xy, tracks.valid, times))
         flags |= Flag.DIFFERENTIATED_VELOCITY
@@ -350,16 +332,14 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
 
 
 def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeature, ...]]:
-    """Agents on the ground of the map where tracks or map have no heights."""
+    """Set agents on the ground of the map where tracks or map have no heights."""
     if roads.flat:
         return flatten(tracks, roads.features)
-    if not tracks.z.any():
-        return lift(tracks, roads.features), roads.features
-    return tracks, roads.features
+    return tracks if tracks.z.any() else lift(tracks, roads.features), roads.features
 
 
 def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
-    """Seconds of all steps; 10 Hz where the file has no timestamps."""
+    """Return seconds of all steps; 10 Hz where the file has no timestamps."""
     stamps = metadata.get("ts")
     if stamps is None:
         return np.arange(steps) * DT_S
@@ -372,7 +352,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
-    """The current step; files of long recordings name none, or the first."""
+    """Return the current step; files of long recordings name none, or the first."""
     step = as_int(metadata.get("current_time_index"))
     if step is None:
         return min(CURRENT_STEP, steps - 1)
@@ -382,7 +362,7 @@ def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
 
 
 def _track_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
-    """Rows of the tracks in a list of names or a dictionary by name, without unknown names."""
+    """Return rows of the tracks in a list of names or a dictionary by name, without unknown names."""
     names = list(value) if isinstance(value, dict) else as_list(value)
     numbers = (rows.get(name) for item in names if (name := as_text(item)) is not None)
     return tuple(row for row in numbers if row is not None)
@@ -391,7 +371,7 @@ def _track_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
 def _lights(
     table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
 ) -> tuple[Light, ...]:
-    """Lights by lane. None in the file is a step without an observation."""
+    """Return lights by lane. None in the file is a step without an observation."""
     if len(table) * steps > _MOST_LIGHT_STATES:
         raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
@@ -424,15 +404,15 @@ def _lights(
 
 
 def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
-    """Stop points (x, y and maybe z): one, or one per step in the light's ``state`` in the first form of the files."""
+    """Return stop points (x, y and maybe z): one, or in ``state`` of the first form of the files one per step."""
     stops = light.get("stop_point", light["state"].get("stop_point"))
     points = np.zeros((0, 3)) if stops is None else np.atleast_2d(floats(stops, f"{what}: stop_point"))
-    usable = len(points) in (1, steps) and points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()
-    return points if usable else np.zeros((0, 3))
+    is_plausible = points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()
+    return points if is_plausible and len(points) in (1, steps) else np.zeros((0, 3))
 
 
 def _state(state: Any) -> LightState | None:
-    """The state by its name or WOMD's number; None for any other."""
+    """Return the state by its name or WOMD's number; None for any other."""
     if isinstance(state, str):
         return _STATES.get(state)
     number = as_float(state)

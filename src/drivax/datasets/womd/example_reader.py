@@ -1,14 +1,18 @@
-"""Reader of WOMD tf.Examples in TFRecord files (motion dataset v1.0 to v1.3.1), and of their layout by other writers.
+"""Readers of tf.Examples in TFRecord files: of WOMD (motion dataset v1.0 to v1.3.1) and of ScenarioMax.
 
 They hold less than the protos: at most 128 tracks in flat lists, split into past, current and future; no lane graph,
 no speed limits, no lanes of stop signs; the map as one list of points that the writer cut off at 20,000 or 30,000; at
 most 16 lights per step.
+
+ScenarioMax, which V-Max reads, has the same layout with differences: ego is row 0, ids are renumbered from 0, padding
+looks like tracks, times, speeds and courses are missing, map points have limits in mph, lights keep their slot and are
+UNKNOWN where nothing was known, ten paths of ego are included, and the original data set is not named.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +25,37 @@ from drivax.datasets.womd.messages import SKIP, ExampleFeatures, features_of
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, Flag, RoadKind
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate
+from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, Flag, LightState, RoadKind
 
 #: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
 _EXACT = 2**24
 #: Larger median spacings of map points are those of v1.2 and later (1 m instead of 0.5 m), m.
 _COARSE_M = 0.75
+_FLAVOUR = "tf.Examples in TFRecord"
 Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
 class WomdExample(womd.TfRecordReader):
-    """Reader of tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
+    """Reader of WOMD's tf.Examples: tracks, map points grouped into features, lights by lane."""
 
     name: str = womd.EXAMPLE_FORMAT
     companions: tuple[str, ...] = ("export.json",)
 
     def decode(self, payload: bytes) -> Recording:
-        """The recording in a payload."""
-        return decode(payload)
+        """Return the recording in a serialised tf.Example; rows without an id are padding."""
+        table = features_of(payload)
+        rows = np.flatnonzero(table.numbers("state/id") != -1)
+        return _recording(table, payload, rows, womd.DATASET, self.name)
 
     def describe(self, path: Path) -> Description:
         """Describe the first record: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
-        no_graph = "no lane graph and no speed limits: lanes are chained by geometry"
-        notes = [*womd.notes_of(recording), no_graph]
+        notes = [
+            *womd.notes_of(recording),
+            "no lane graph and no speed limits: lanes are chained by geometry",
+        ]
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append(
                 "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
@@ -54,23 +63,54 @@ class WomdExample(womd.TfRecordReader):
         if "paths" in recording.lost:
             notes.append("path_samples are not used: routes are computed again")
         version = "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1"
-        return Description(
-            womd.FULL_NAME,
-            "tf.Examples in TFRecord",
-            version if recording.features else None,
-            count_records(path),
-            tuple(notes),
-        )
+        version = version if recording.features else None
+        return Description(womd.FULL_NAME, _FLAVOUR, version, count_records(path), tuple(notes))
 
 
-def decode(payload: bytes) -> Recording:
-    """The recording in a serialised tf.Example; rows without an id are padding."""
-    table = features_of(payload)
-    rows = np.flatnonzero(table.numbers("state/id") != -1)
-    return recording(table, payload, rows, womd.DATASET, womd.EXAMPLE_FORMAT)
+@dataclass(frozen=True)
+class ScenarioMax(womd.TfRecordReader):
+    """Reader of ScenarioMax's tf.Examples: tracks, map with limits, lights by lane."""
+
+    name: str = womd.SCENARIOMAX_FORMAT
+
+    def decode(self, payload: bytes) -> Recording:
+        """Return the recording in a serialised tf.Example of ScenarioMax.
+
+        Rows that are never valid are padding. Missing times are 10 Hz; missing velocities (-1 throughout) are
+        differentiated from positions. Lights that are UNKNOWN throughout are dropped: the writer fills with UNKNOWN
+        what it does not know, for some sources also yellow.
+        """
+        table = features_of(payload)
+        all_rows = np.arange(table.numbers("state/id").size)
+        rows = np.flatnonzero((table.over_time("valid", all_rows) == 1).any(axis=1))
+        recording = _recording(table, payload, rows, self.name, self.name)
+        tracks, flags = recording.tracks, recording.flags
+        if tracks.valid.any() and (tracks.velocity[tracks.valid] == -1.0).all():
+            velocity = differentiate(tracks.xy, tracks.valid, recording.timestamps_s)
+            tracks, flags = replace(tracks, velocity=velocity), flags | Flag.DIFFERENTIATED_VELOCITY
+        lights = tuple(light for light in recording.lights if (light.states > LightState.UNKNOWN).any())
+        lost = {**recording.lost, **parsing.nonzero(lights_without_state=len(recording.lights) - len(lights))}
+        return replace(recording, tracks=tracks, lights=lights, lost=lost, flags=flags)
+
+    def describe(self, path: Path) -> Description:
+        """Describe the first record: speed limits, truncated map, paths."""
+        recording = self.first(path)
+        limits = sum(feature.limit_mps is not None for feature in recording.features)
+        notes = [
+            *womd.notes_of(recording),
+            "the file does not say which data set its scenarios come from",
+            f"{limits} lanes have a speed limit; no lane graph: lanes are chained by geometry",
+        ]
+        if Flag.TRUNCATED_MAP in recording.flags:
+            notes.append("the list of map points is full, the map is cut off")
+        if "paths" in recording.lost:
+            notes.append(
+                "path_samples are not used (they were ranked by the log's future): routes are computed again"
+            )
+        return Description("ScenarioMax", _FLAVOUR, None, count_records(path), tuple(notes))
 
 
-def recording(
+def _recording(
     table: ExampleFeatures, payload: bytes, rows: Array, dataset: str, source_format: str
 ) -> Recording:
     """Return the recording in some rows.
@@ -80,10 +120,10 @@ def recording(
     future.
     """
     tracks = _tracks(table, rows)
-    features, truncated = _map_features(table)
+    features, is_full = _map_features(table)
     lights, lost_lights = _lights(table, features)
     scenario_id = table.scenario_id(payload)
-    result = Recording(
+    recording = Recording(
         scenario_id=scenario_id,
         dataset=dataset,
         segment=parsing.segment_of(scenario_id),
@@ -102,14 +142,14 @@ def recording(
             lights_without_place=lost_lights,
             unknown_fields=table.count_unknown(),
         ),
-        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
+        flags=Flag.TRUNCATED_MAP if is_full else Flag.NONE,
         split_gap_m=2.0 if _is_coarse(features) else 1.0,  # twice the nominal spacing of points
     )
-    return parsing.shift(result, table.origin())
+    return parsing.shift(recording, table.origin())
 
 
 def _track_ids(features: ExampleFeatures, rows: Array) -> Array:
-    """Ids of the rows, which are stored as floats; refuse those that may have been rounded."""
+    """Return ids of the rows, which are stored as floats; refuse those that may have been rounded."""
     ids = features.numbers("state/id")[rows]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
         raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
@@ -143,9 +183,13 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
 
 
 def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
-    """Seconds of every step; where no valid state has a time, 10 Hz from the nearest step that has one."""
+    """Return seconds of every step; where no valid state has a time, 10 Hz from the nearest step before, else after."""
     micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
-    return parsing.fill_times(np.where(micros >= 0, micros * 1e-6, np.nan))
+    steps, known = np.arange(len(micros)), np.flatnonzero((micros >= 0) & np.isfinite(micros))
+    if known.size == 0:
+        return steps * DT_S
+    nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
+    return micros[nearest] * 1e-6 + (steps - nearest) * DT_S
 
 
 def _ego_row(features: ExampleFeatures, rows: Array) -> int:
@@ -167,8 +211,8 @@ def _lights(features: ExampleFeatures, road_map: Sequence[MapFeature]) -> tuple[
             lanes = features.integers(base + "id", (steps, slots))
             states, valid = (features.numbers(base + name, (steps, slots)) for name in ("state", "valid"))
             points = np.stack([features.numbers(base + axis, (steps, slots)) for axis in "xyz"], axis=-1)
-            observed = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
-            for step, slot in np.argwhere(observed).tolist():
+            is_observed = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
+            for step, slot in np.argwhere(is_observed).tolist():
                 collector.observe(
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
@@ -177,7 +221,7 @@ def _lights(features: ExampleFeatures, road_map: Sequence[MapFeature]) -> tuple[
 
 
 def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bool]:
-    """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
+    """Return map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
         return (), False
@@ -198,14 +242,14 @@ def _map_features(features: ExampleFeatures) -> tuple[tuple[MapFeature, ...], bo
 
 
 def _groups(ids: Array, keep: Array) -> list[Array]:
-    """Point numbers of each feature, features in order of first appearance."""
+    """Return the point numbers of each feature, features in order of first appearance."""
     order = keep[np.argsort(ids[keep], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(ids[order])) + 1)
     return sorted(groups, key=lambda group: group[0]) if keep.size else []
 
 
 def _limits(features: ExampleFeatures, count: int) -> Array:
-    """Speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
+    """Return speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
     name = "roadgraph_samples/speed_limit"
     if not features.has(name):
         return np.zeros(count)
@@ -214,9 +258,9 @@ def _limits(features: ExampleFeatures, count: int) -> Array:
 
 
 def _open_ring(points: Array) -> Array:
-    """A ring without its repeated last point: map features are closed implicitly."""
-    closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
-    return points[:-1] if closed else points
+    """Drop the repeated last point of a ring: map features are closed implicitly."""
+    is_closed = len(points) > 1 and np.allclose(points[0], points[-1], rtol=0, atol=1e-3)
+    return points[:-1] if is_closed else points
 
 
 def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
@@ -225,7 +269,7 @@ def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
 
 
 def _paths(features: ExampleFeatures) -> int:
-    """Number of paths of the ego in the file."""
+    """Count paths of the ego in the file."""
     if not (features.has("path_samples/valid") and features.has("path_samples/on_route")):
         return 0
     valid = features.numbers("path_samples/valid") == 1

@@ -126,7 +126,7 @@ def _undeclared(message: Any) -> Iterator[tuple[str, int]]:
 
 @cache
 def message_class(name: str) -> Any:
-    """The class of a message: ``Scenario``, ``Example`` (its map of features as repeated entries), ..."""
+    """Return the class of a message: ``Scenario``, ``Example`` (its map of features as repeated entries), ..."""
     descriptor = _pool().FindMessageTypeByName(f"{_PACKAGE}.{name}")
     return import_extra("google.protobuf.message_factory").GetMessageClass(descriptor)
 
@@ -178,7 +178,7 @@ class Numbers:
 
 @cache
 def _layouts(numbers: Numbers) -> tuple[np.dtype[Any], ...]:
-    """Packed record types of every form in both orders: each field after its tag of one byte, ``#name``."""
+    """Return packed record types of every form in both orders: each field after its tag of one byte, ``#name``."""
     types = {name: _WIRE[kind][1] for name, _, kind in numbers.fields}
     orders = [order for form in numbers.forms for order in (form, form[::-1])]
     return tuple(
@@ -188,7 +188,7 @@ def _layouts(numbers: Numbers) -> tuple[np.dtype[Any], ...]:
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
-    """One row per message, one column per field, 0 for a field that a message lacks.
+    """Read one row per message, one column per field, 0 for a field that a message lacks.
 
     Messages of a usual layout are read together, by size and tags; protobuf reads the others.
     """
@@ -199,8 +199,9 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
         rows = np.flatnonzero(unread & (sizes == layout.itemsize))
         if not rows.size:
             continue
-        is_all = rows.size == len(blobs)
-        records = np.frombuffer(b"".join(blobs if is_all else [blobs[row] for row in rows.tolist()]), layout)
+        is_complete = rows.size == len(blobs)
+        content = blobs if is_complete else [blobs[row] for row in rows.tolist()]
+        records = np.frombuffer(b"".join(content), layout)
         fields = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
         fits = np.ones(len(rows), dtype=bool)
         for _, name, number, kind in fields:
@@ -217,7 +218,7 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
 
 
 def read_one(blob: bytes, numbers: Numbers) -> list[float]:
-    """One row as protobuf reads it."""
+    """Read one row with protobuf."""
     message = parse(numbers.name, blob)
     if message is None:
         raise DataError(f"a message {numbers.name} is damaged", cure=SKIP)
@@ -231,7 +232,7 @@ POINTS = Numbers("MapPoint", (("x", "y", "z"),))
 
 
 def features_of(payload: bytes) -> ExampleFeatures:
-    """The features in a serialised tf.Example."""
+    """Return the features in a serialised tf.Example."""
     message = parse("Example", payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
@@ -245,7 +246,7 @@ class ExampleFeatures:
         self._values: Mapping[str, Any] = {entry.key: entry.value for entry in message.features.feature}
 
     def _list(self, name: str) -> tuple[str | None, Sequence[Any]]:
-        """Kind of list of a feature, and its values."""
+        """Return the kind of list of a feature, and its values."""
         value = self._values.get(name)
         kind = None if value is None else value.WhichOneof("kind")
         return kind, () if kind is None else getattr(value, kind).value
@@ -255,7 +256,7 @@ class ExampleFeatures:
         return len(self._list(name)[1]) > 0
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
-        """A numeric feature in a shape that its size must match."""
+        """Return a numeric feature in a shape that its size must match."""
         kind, items = self._list(name)
         if kind not in ("float_list", "int64_list"):
             raise DataError(f"numeric feature {name} is missing", cure=SKIP)
@@ -270,31 +271,31 @@ class ExampleFeatures:
         return values.reshape(shape)
 
     def integers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:
-        """A feature that must be stored as integers: floats would round the ids of lanes."""
+        """Return a feature that must be stored as integers: floats would round the ids of lanes."""
         values = self.numbers(name, shape)
         if values.dtype != np.int64:
             raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
     def find_marks(self, name: str, rows: _Array) -> tuple[int, ...]:
-        """Indices in ``rows`` with the value 1; none if the file lacks the feature."""
+        """Return the indices in ``rows`` with the value 1; none if the file lacks the feature."""
         if not self.has(name):
             return ()
         values = self.numbers(name, (self.numbers("state/id").size,))[rows]
         return tuple(np.flatnonzero(values == 1).tolist())
 
     def scenario_id(self, payload: bytes) -> str:
-        """The scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""
+        """Return the scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""
         value = self._values.get("scenario/id")
         text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
         return text or hashlib.sha256(payload).hexdigest()[:16]
 
     def count_unknown(self) -> int:
-        """Number of features with names that neither the data set nor ScenarioMax uses."""
+        """Count features with names that neither the data set nor ScenarioMax uses."""
         return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
 
     def origin(self) -> Float64[np.ndarray, "3"]:
-        """The origin of the coordinates in the source's map frame; zeros unless drivax wrote the example."""
+        """Return the origin of the coordinates in the source's map frame; zeros unless drivax wrote the example."""
         if ORIGIN not in self._values:
             return np.zeros(3)
         try:
@@ -319,7 +320,7 @@ class ExampleFeatures:
         return steps
 
     def over_time(self, name: str, rows: _Array) -> _Array:
-        """``state/{past,current,future}/<name>`` of some rows over all steps, ``[track, time]``."""
+        """Return ``state/{past,current,future}/<name>`` of some rows over all steps, ``[track, time]``."""
         count = self.numbers("state/id").size
         spans = [(span, steps) for span, steps in self.spans.items() if steps]
         return np.concatenate(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivax.datasets import parsing
-from drivax.datasets.reader import BadRecord
+from drivax.datasets.reader import BadRecord, attempt
 from drivax.datasets.womd.messages import ExampleFeatures, parse
 from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
 from drivax.errors import DataError, DrivaxError, UsageError
@@ -58,13 +58,13 @@ def scenariomax_signs(features: ExampleFeatures) -> int:
 
 
 def _first(path: Path) -> bytes:
-    """Payload of the first readable record; without any, raise the error of the first record."""
-    damage = DataError("the file is empty", file=path, cure="download it again")
-    for number, record in read_records(path):
+    """Return the payload of the first readable record; without any, raise the error of the first record."""
+    damage = None
+    for _, record in read_records(path):
         if isinstance(record, bytes):
             return record
-        damage = record if number == 0 else damage
-    raise damage
+        damage = damage or record
+    raise damage or DataError("the file is empty", file=path, cure="download it again")
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class TfRecordReader:
     companions: tuple[str, ...] = ()
 
     def decode(self, payload: bytes) -> Recording:
-        """The recording in a payload."""
+        """Return the recording in a payload."""
         raise NotImplementedError
 
     def recognise(self, path: Path) -> bool:
@@ -90,48 +90,46 @@ class TfRecordReader:
             return False
 
     def first(self, path: Path) -> Recording:
-        """The recording of the first readable record."""
-        payload = _first(path)
-        try:
-            return self.decode(payload)
-        except DataError as error:
-            cause = self._explain(error, payload)
-            raise DataError(cause.problem, file=path, cure=cause.cure) from error
+        """Return the recording of the first readable record."""
+        recording = attempt(self._decode, _first(path), file=path)
+        if isinstance(recording, BadRecord):
+            raise recording.error()
+        return recording
 
     def count(self, path: Path) -> int:
-        """The number of records times the windows of the first."""
+        """Return the number of records times the windows of the first."""
         try:
             return count_records(path) * parsing.windows_of(len(self.decode(_first(path)).timestamps_s))
         except DrivaxError:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings, and a bad record in place of each that cannot be decoded."""
-        for number, record in read_records(path):
-            if isinstance(record, DataError):
-                yield BadRecord.of(record, path, number)
-                continue
-            try:
-                yield self.decode(record)
-            except DataError as error:
-                yield BadRecord.of(self._explain(error, record), path, number)
+        """Yield the recordings, and a bad record in place of each that cannot be decoded."""
+        for number, payload in read_records(path):
+            if isinstance(payload, DataError):
+                yield BadRecord.of(payload, path, number)
+            else:
+                yield attempt(self._decode, payload, file=path, record=number)
 
-    def _explain(self, error: DataError, payload: bytes) -> DrivaxError:
-        """The error, or one that names the format if the payload is of another one."""
-        other = flavour(payload)
-        if other in (None, self.name):
-            return error
-        problem = f"contains {_CONTENTS[other]}, not {_CONTENTS[self.name]}"
-        return DataError(problem, cure=f"use --format {other}")
+    def _decode(self, payload: bytes) -> Recording:
+        """Return the recording in a payload; the error for a payload of another format names the format."""
+        try:
+            return self.decode(payload)
+        except DataError as error:
+            content = flavour(payload)
+            if content in (None, self.name):
+                raise
+            problem = f"contains {_CONTENTS[content]}, not {_CONTENTS[self.name]}"
+            raise DataError(problem, cure=f"use --format {content}") from error
 
 
 def agent_kind(code: int) -> AgentKind:
-    """The class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
+    """Return the class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
     return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """Notes for users about recordings like this one: length, future, lights."""
+    """Return notes for users about recordings like this one: length, future, lights."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

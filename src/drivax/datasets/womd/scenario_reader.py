@@ -33,62 +33,58 @@ class WomdScenario(womd.TfRecordReader):
     name: str = womd.SCENARIO_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
-        """The recording in a payload."""
-        return decode(payload)
+        """Return the recording in a serialised ``Scenario``.
+
+        Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad),
+        invalid states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links
+        are kept.
+        """
+        message = parse("Scenario", payload)
+        if message is None or not message.scenario_id:
+            raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
+        steps = len(message.timestamps_seconds)
+        _check(message, steps)
+        features, lost = _features(message.map_features)
+        lights, lost_lights = _lights(message.dynamic_map_states, steps, features)
+        rows = {track.id: row for row, track in enumerate(message.tracks)}
+        return Recording(
+            scenario_id=message.scenario_id,
+            dataset=womd.DATASET,
+            segment=message.scenario_id,
+            timestamps_s=np.array(message.timestamps_seconds, np.float64),
+            current_step=message.current_time_index,
+            ego=message.sdc_track_index,
+            tracks=_tracks(message.tracks, steps),
+            features=features,
+            lights=lights,
+            to_predict=parsing.rows_within(
+                [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
+            ),
+            # These are track ids, tracks_to_predict are rows.
+            of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
+            tags={"source_format": self.name},
+            lost=parsing.nonzero(
+                lost, lights_without_place=lost_lights, unknown_fields=_unknown_fields(message, payload)
+            ),
+            split_gap_m=_SPLIT_GAP_M,
+        )
 
     def describe(self, path: Path) -> Description:
         """Describe the first record: version by kinds of features, lane graph, lights."""
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
-        linked = any(lane.successors or lane.predecessors for lane in lanes)
+        has_links = any(lane.successors or lane.predecessors for lane in lanes)
         notes = list(womd.notes_of(recording))
-        if not linked:
+        if not has_links:
             notes.append("no lane graph in the first record: lanes are chained by geometry")
-        driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
-        version = "1.2 or later" if driveways else "1.1 or later" if linked else None
+        has_driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
+        version = "1.2 or later" if has_driveways else "1.1 or later" if has_links else None
         flavour = "Scenario protos in TFRecord"
         return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
 
 
-def decode(payload: bytes) -> Recording:
-    """The recording in a serialised ``Scenario``.
-
-    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad), invalid
-    states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links are kept.
-    """
-    message = parse("Scenario", payload)
-    if message is None or not message.scenario_id:
-        raise DataError("the payload is not a WOMD Scenario proto", cure=SKIP)
-    steps = len(message.timestamps_seconds)
-    _check(message, steps)
-    features, lost = _features(message.map_features)
-    lights, lost_lights = _lights(message.dynamic_map_states, steps, features)
-    rows = {track.id: row for row, track in enumerate(message.tracks)}
-    return Recording(
-        scenario_id=message.scenario_id,
-        dataset=womd.DATASET,
-        segment=message.scenario_id,
-        timestamps_s=np.array(message.timestamps_seconds, np.float64),
-        current_step=message.current_time_index,
-        ego=message.sdc_track_index,
-        tracks=_tracks(message.tracks, steps),
-        features=features,
-        lights=lights,
-        to_predict=parsing.rows_within(
-            [track.track_index for track in message.tracks_to_predict], len(rows), "tracks_to_predict"
-        ),
-        # These are track ids, tracks_to_predict are rows.
-        of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
-        tags={"source_format": womd.SCENARIO_FORMAT},
-        lost=parsing.nonzero(
-            lost, lights_without_place=lost_lights, unknown_fields=_unknown_fields(message, payload)
-        ),
-        split_gap_m=_SPLIT_GAP_M,
-    )
-
-
 def _unknown_fields(message: Any, payload: bytes) -> int:
-    """Number of fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
+    """Count fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
     states = {len(state): state for track in message.tracks for state in track.states}
     pairs = ((parse(STATES.name, blob), blob) for blob in states.values())
     in_states = (unknown_fields(state, blob) for state, blob in pairs if state is not None)
@@ -106,13 +102,13 @@ def _check(message: Any, steps: int) -> None:
     parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
         raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=SKIP)
-    seen = set()
+    ids = set()
     for track in message.tracks:
         if len(track.states) != steps:
             raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=SKIP)
-        if track.id in seen:
+        if track.id in ids:
             raise DataError(f"two tracks have the id {track.id}", cure=SKIP)
-        seen.add(track.id)
+        ids.add(track.id)
 
 
 def _tracks(tracks: Any, steps: int) -> Tracks:
@@ -176,7 +172,7 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
 
 
 def _blobs(kind: str, body: Any) -> Sequence[bytes]:
-    """The serialised points of a feature."""
+    """Return the serialised points of a feature."""
     if kind == "stop_sign":
         return [body.position] if body.HasField("position") else []
     return body.polygon if kind in _POLYGONS else body.polyline

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
 
 _Array = np.ndarray[Any, Any]
@@ -31,7 +32,7 @@ _FETCH = "copy or download the file again"
 
 
 def example(features: Mapping[str, bytes | _Array]) -> bytes:
-    """A serialised tf.Example, its features in order of their names.
+    """Serialise a tf.Example, its features in order of their names.
 
     Values are bytes (a list of one), integer arrays (int64 lists) or floating-point arrays (float32 lists); arrays are
     flattened row by row.
@@ -44,7 +45,7 @@ def example(features: Mapping[str, bytes | _Array]) -> bytes:
 
 
 def _feature(value: bytes | _Array) -> bytes:
-    """A serialised ``Feature``: the list of its kind, whose only field has number 1."""
+    """Serialise a ``Feature``: the list of its kind, whose only field has number 1."""
     if isinstance(value, bytes):
         return _field(_BYTES, _field(1, value))
     if np.issubdtype(value.dtype, np.floating):
@@ -53,12 +54,12 @@ def _feature(value: bytes | _Array) -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """A field with a length: tag, length, content."""
+    """Serialise a field with a length: tag, length, content."""
     return bytes((number << 3 | _LENGTH,)) + varints(np.array([len(content)])) + content
 
 
 def varints(values: _Array) -> bytes:
-    """Integers as variable-length ones: seven bits a byte, the least first; negative ones take ten bytes."""
+    """Serialise integers as variable-length ones: seven bits a byte, the least first, ten bytes for negative ones."""
     bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
     groups = bits >> (np.uint64(7) * _GROUPS)
     continues = groups >= 128
@@ -69,7 +70,7 @@ def varints(values: _Array) -> bytes:
 
 
 def shard_name(name: str, number: int, shards: int) -> str:
-    """The usual file name of a shard."""
+    """Return the usual file name of a shard."""
     return f"{name}.tfrecord-{number:05d}-of-{shards:05d}"
 
 
@@ -83,7 +84,7 @@ def write_record(file: BinaryIO, payload: bytes) -> None:
 
 
 def mask_crc(crc: int) -> int:
-    """TFRecord's mask of a CRC-32C: rotate right by 15 bits, add a constant, modulo 2**32."""
+    """Mask a CRC-32C as TFRecord does: rotate right by 15 bits, add a constant, modulo 2**32."""
     return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
 
 
@@ -153,7 +154,7 @@ def _read_record(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> b
 
 
 def count_records(path: str | Path) -> int:
-    """Number of complete records by their lengths, without checks; 0 if the file cannot be opened. Needs no package."""
+    """Count complete records by their lengths, without checks; 0 if the file cannot be opened. Needs no package."""
     try:
         with Path(path).open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -167,19 +168,15 @@ def count_records(path: str | Path) -> int:
         return 0
 
 
-def looks_framed(path: str | Path) -> bool:
+def looks_framed(path: Path) -> bool:
     """Whether the file begins with a length and its checksum. Needs no package, never raises."""
-    try:
-        with Path(path).open("rb") as file:
-            header = file.read(_HEADER_BYTES)
-    except (OSError, ValueError):
-        return False
-    whole = len(header) == _HEADER_BYTES
-    return whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
+    header = read_head(path, _HEADER_BYTES)
+    is_whole = len(header) == _HEADER_BYTES
+    return is_whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
 
 
 def _crc32c_slowly(data: bytes) -> int:
-    """CRC-32C bit by bit (Castagnoli's polynomial, reflected): enough for the eight bytes of a length."""
+    """Compute a CRC-32C bit by bit (Castagnoli's polynomial, reflected): enough for the eight bytes of a length."""
     crc = 0xFFFFFFFF
     for byte in data:
         crc ^= byte
@@ -189,7 +186,7 @@ def _crc32c_slowly(data: bytes) -> int:
 
 
 def _bad_length(header: bytes, start: int) -> _FramingError:
-    """The error for a length whose checksum differs; ``start`` is where the record begins."""
+    """Return the error for a length whose checksum differs; ``start`` is the first byte of the record."""
     if start > 0:
         return _FramingError(
             "the length is damaged (checksum mismatch), so the rest of the file cannot be read"
