@@ -28,7 +28,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from drivax.errors import DataError, UsageError
+from drivax.errors import MAKE_ROOM, DataError, UsageError
 
 #: Flags of renameat2 (Linux): relative to the current folder, exchange both names.
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -74,9 +74,8 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
     if path.is_dir() != folder:
         raise UsageError(f"output is a {other}", file=path, cure=f"name a {kind} to write")
     if not overwrite:
-        raise UsageError(
-            f"output {kind} already exists", file=path, cure="choose another or pass --overwrite"
-        )
+        cure = "choose another or pass --overwrite"
+        raise UsageError(f"output {kind} already exists", file=path, cure=cure)
 
 
 def free_bytes(path: Path) -> int:
@@ -95,7 +94,7 @@ def format_bytes(size: float) -> str:
     return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
 
 
-def check_space(path: Path, needed: int, cure: str = "make room, or choose another disk") -> None:
+def check_space(path: Path, needed: int, cure: str = MAKE_ROOM) -> None:
     """Check, before any work, that the disk has space for an output of about ``needed`` bytes.
 
     Raises:
@@ -118,26 +117,22 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
         yield
     except Exception as error:
         if not _is_full_disk(error):
-            if (
-                isinstance(error, OSError)
-                and error.errno is not None
-                and ".partial" in str(error.filename or ".partial")
-            ):
+            if isinstance(error, OSError) and error.errno and ".partial" in str(error.filename or ".partial"):
                 error.filename = str(path)
             raise
         needed = needed or getattr(error, "needed", 0)
         need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
         problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free, {need})"
-        full = FullDiskError(problem, file=path, cure="make room, or choose another disk")
+        full = FullDiskError(problem, file=path, cure=MAKE_ROOM)
         full.needed = needed
         raise full from error
 
 
 def _is_full_disk(error: Exception) -> bool:
-    """Whether the disk is full: a system error, or one of a library (TensorStore) that quotes it."""
+    """Return whether the disk is full, by a system error or one of a library (TensorStore) that quotes it."""
     codes = (errno.ENOSPC, errno.EDQUOT)
-    quoted = any(os.strerror(code) in str(error) for code in codes)
-    return isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes or quoted
+    has_code = isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes
+    return has_code or any(os.strerror(code) in str(error) for code in codes)
 
 
 @contextlib.contextmanager
@@ -299,12 +294,10 @@ class PartialFolder:
         identity = _read_json(self.root / "identity.json")
         if isinstance(identity, dict) and identity != self.identity and not restart and can_resume(self.path):
             own = self.identity or {}
-            different = ", ".join(name for name in own if identity.get(name) != own[name])
-            raise UsageError(
-                f"an unfinished output was started with other data or other options ({different or 'command'})",
-                file=self.path,
-                cure="finish it with the same options, or pass --overwrite to start again",
-            )
+            names = ", ".join(name for name in own if identity.get(name) != own[name]) or "command"
+            problem = f"an unfinished output was started with other data or other options ({names})"
+            cure = "finish it with the same options, or pass --overwrite to start again"
+            raise UsageError(problem, file=self.path, cure=cure)
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
@@ -333,11 +326,8 @@ class PartialFolder:
         try:
             self._lock = _open_locked(self.root / "lock")
         except BlockingIOError as error:
-            raise UsageError(
-                "another process is writing it",
-                file=self.path,
-                cure="wait for it, or choose another name",
-            ) from error
+            cure = "wait for it, or choose another name"
+            raise UsageError("another process is writing it", file=self.path, cure=cure) from error
 
     def _release(self) -> None:
         if self._lock is not None:
