@@ -112,29 +112,27 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     Raises:
         DataError: Settings or combination differ.
     """
-    method, stored = METHODS[table.method], dict(table.config)
+    method, config_of_table = METHODS[table.method], json.loads(json.dumps(dict(table.config)))
     config = method.config if config is None else config
-    current: dict[str, Any] = {} if method.config is None else plain(config)
+    present: dict[str, Any] = {} if method.config is None else plain(config)
     if method.config is not None:
         try:
-            stored |= _with_present_names(stored, config, current)
+            config_of_table |= _with_present_names(config_of_table, config, present)
         except UsageError as error:
             raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
     if table.components:
-        current["combination"] = asdict(method.combination(config))
-    # Convert tuples to lists, as in tables from files.
-    stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
-    for name, value in current.items():
-        if stored.get(name) != value:
-            problem = f"scores of {table.method!r} have {name} {stored.get(name)}, not {value}"
+        present["combination"] = asdict(method.combination(config))
+    for name, value in present.items():
+        if config_of_table.get(name) != value:
+            problem = f"scores of {table.method!r} have {name} {config_of_table.get(name)}, not {value}"
             raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
-def _with_present_names(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
-    """Return stored settings ``names`` with the present names of their fields."""
-    values = {name: stored[name] for name in names if name in stored}
-    present = plain(settings.load(type(config), json.loads(json.dumps(values)), trust=()))
-    return {name: value for name, value in present.items() if name in stored}
+def _with_present_names(former: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
+    """Return the settings ``names`` among ``former`` ones with the present names of their fields."""
+    values = {name: former[name] for name in names if name in former}
+    present = plain(settings.load(type(config), values, trust=()))
+    return {name: value for name, value in present.items() if name in former}
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
@@ -158,9 +156,8 @@ def make_table(
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
-    empty = np.zeros(valid.shape)
-    settings = {**({} if config is None else plain(config)), **details}
-    table = ScoreTable(name, settings, data.hash, ids, valid, empty, empty[:, 0], components)
+    empty, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
+    table = ScoreTable(name, values, data.hash, ids, valid, empty, empty[:, 0], components)
     return table.recombine(METHODS[name].combination(config))
 
 
