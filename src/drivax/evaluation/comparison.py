@@ -202,9 +202,8 @@ def _compare_metric(
 ) -> MetricComparison:
     """Compare the planners in one metric; the winner is added later."""
     x, y = (side.values(metric) for side in sides)
-    undefined_a, undefined_b = (
-        int((np.isnan(values) & side.arm).sum()) for values, side in zip((x, y), sides, strict=True)
-    )
+    pairs = zip((x, y), sides, strict=True)
+    undefined = [int((np.isnan(values) & side.arm).sum()) for values, side in pairs]
     included = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
     x, y = np.where(included, x, np.nan), np.where(included, y, np.nan)
     a, b = (side.interval(plan, metric, included) for side in sides)
@@ -222,8 +221,8 @@ def _compare_metric(
         p_adjusted=None,
         winner=None,
         seeds=max(len(side.tables) for side in sides),
-        undefined_a=undefined_a,
-        undefined_b=undefined_b,
+        undefined_a=undefined[0],
+        undefined_b=undefined[1],
     )
 
 
@@ -234,13 +233,10 @@ def _test_difference(
     clusters = sides[0].pairs.clusters
     resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
     if split is not None:
-        values = np.where(split.first, x, y)
-        return (
-            split_bootstrap(values, split.first, clusters, strata=split.strata, **resampling),
-            significance.split_permutation(
-                values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
-            ),
-        )
+        values, first = np.where(split.first, x, y), split.first
+        difference = split_bootstrap(values, first, clusters, strata=split.strata, **resampling)
+        test = significance.split_permutation
+        return difference, test(values, first, clusters, split.strata, plan.resamples, seed=plan.seed)
     if max(len(side.tables) for side in sides) == 1:
         difference = paired_bootstrap(x, y, clusters, **resampling)
         return difference, _paired_test(plan, metric, x, y, clusters)

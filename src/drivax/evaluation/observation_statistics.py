@@ -316,20 +316,16 @@ def importances(
     def change(permuted_groups: dict[str, Values]) -> float:
         if not varies.any():
             return math.nan
-        shift = (np.asarray(act(dict(observation) | permuted_groups), np.float64) - actions)[:, varies] / std[
-            varies
-        ]
-        return float(np.sqrt(np.mean(shift**2)))
+        shift = np.asarray(act(dict(observation) | permuted_groups), np.float64) - actions
+        return float(np.sqrt(np.mean((shift[:, varies] / std[varies]) ** 2)))
 
     columns, groups = {}, {}
     for group, values in observation.items():
         mask_name = f"{group}_mask"
         if group.removesuffix("_mask") in observation and group.endswith("_mask"):
             continue
-        order = rng.permutation(len(values))
-        groups[group] = change(
-            {name: observation[name][order] for name in (group, mask_name) if name in observation}
-        )
+        order, names = rng.permutation(len(values)), (group, mask_name)
+        groups[group] = change({name: observation[name][order] for name in names if name in observation})
         valid = observation.get(mask_name, np.ones(values.shape[:-1], bool))
         for column in range(values.shape[-1]):
             permuted = np.array(values)

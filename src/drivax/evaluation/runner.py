@@ -184,10 +184,8 @@ def format_crashes(table: EpisodeTable) -> str:
         return ""
     count = len(table.crashes)
     lines = [f"{table.planner} crashed in {count} of {len(table)} episodes, which count as failed:"]
-    lines += [
-        escape_controls(f"  {crash.scenario_id}, step {crash.step}: {crash.error}")
-        for crash in table.crashes[:_MAX_LISTED]
-    ]
+    for crash in table.crashes[:_MAX_LISTED]:
+        lines.append(escape_controls(f"  {crash.scenario_id}, step {crash.step}: {crash.error}"))
     if count > _MAX_LISTED:
         lines.append(f"  and {count - _MAX_LISTED} more, in crashes.json")
     return "\n".join(lines)
@@ -363,8 +361,11 @@ class _Evaluation:
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
         info: dict[str, Any] = {"planner": planner, "traffic": traffic}
-        if own_metrics := self._own_metrics():
-            info["own_metrics"] = own_metrics
+        if user_metrics := {name: metric for name, metric in self.metrics.items() if name not in METRICS}:
+            info["own_metrics"] = {
+                name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
+                for name, metric in user_metrics.items()
+            }
         return EpisodeTable(
             folder=None,
             name=planner,
@@ -381,20 +382,10 @@ class _Evaluation:
             ),
         )
 
-    def _own_metrics(self) -> dict[str, dict[str, str]]:
-        user_metrics = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
-        return {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
-            for name, metric in user_metrics.items()
-        }
-
 
 def _crashes(
-    crash_step: Int[np.ndarray, " episode"],
-    names: Names,
-    identity: Any,
-    errors: Mapping[tuple[int, int], str],
-) -> tuple[Crash, ...]:
+    crash_step: Int[np.ndarray, " episode"], names: Names, identity: Any, errors: Mapping[tuple[int, int], str]
+) -> tuple[Crash, ...]:  # fmt: skip
     crashes = []
     for row in np.flatnonzero(crash_step >= 0).tolist():
         step = int(crash_step[row])
