@@ -100,11 +100,7 @@ class RunFolder:
         if not (path / RUN_FILE).is_file():
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
         present_kind = _kind(path)
-        if (
-            kind is not None
-            and present_kind is not None
-            and (present_kind in _TRAINING_KINDS) != (kind in _TRAINING_KINDS)
-        ):
+        if len({name in _TRAINING_KINDS for name in (kind, present_kind) if name is not None}) > 1:
             problem = f"output folder contains a run of kind {present_kind}, not {kind}"
             raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)
@@ -238,9 +234,8 @@ def seed_folders(path: str | Path) -> list[Path]:
     if _kind(path) != "seeds":
         return [path]
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
-    seeds = {folder: re.fullmatch(r"seed-(-?\d+)", folder.name) for folder in folders}
-    numbers = {folder: int(match[1]) for folder, match in seeds.items() if match}
-    return sorted(numbers, key=numbers.__getitem__)
+    seeds = {f: int(match[1]) for f in folders if (match := re.fullmatch(r"seed-(-?\d+)", f.name))}
+    return sorted(seeds, key=seeds.__getitem__)
 
 
 def _kind(path: Path) -> str | None:
@@ -258,9 +253,8 @@ def run_and_step(name: str) -> tuple[str, int | None]:
     """
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
-        raise UsageError(
-            f"{step!r} is not a checkpoint step", cure="write RUN@STEP, for example runs/a@100000"
-        )
+        cure = "write RUN@STEP, for example runs/a@100000"
+        raise UsageError(f"{step!r} is not a checkpoint step", cure=cure)
     return run, int(step) if at else None
 
 
