@@ -41,9 +41,9 @@ _OTHER_FILES = 128
 
 
 class FullDiskError(DataError):
-    """The disk is full; ``needed`` is the size of the output in bytes, 0 if unknown."""
+    """The disk is full; ``size`` is that of the output in bytes, 0 if unknown."""
 
-    needed = 0
+    size = 0
 
 
 def sync_and_close(file: IO[bytes]) -> None:
@@ -94,23 +94,23 @@ def format_bytes(size: float) -> str:
     return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
 
 
-def check_space(path: Path, needed: int, cure: str = MAKE_ROOM) -> None:
-    """Check, before any work, that the disk has space for an output of about ``needed`` bytes.
+def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
+    """Check, before any work, that the disk has space for an output of about ``size`` bytes.
 
     Raises:
         DataError: The disk has less space left.
     """
-    if needed > (free := free_bytes(path)):
-        problem = f"no space: needs about {format_bytes(needed)}, the disk has {format_bytes(free)} left"
+    if size > (free := free_bytes(path)):
+        problem = f"no space: needs about {format_bytes(size)}, the disk has {format_bytes(free)} left"
         raise DataError(problem, file=path, cure=cure)
 
 
 @contextlib.contextmanager
-def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
-    """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
+def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
+    """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
-    the outermost one that knows them the bytes. Other errors of the system get the name if they have none, or a hidden
+    the outermost one that knows it the size. Other errors of the system get the name if they have none, or a hidden
     one.
     """
     try:
@@ -120,11 +120,11 @@ def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
             if isinstance(error, OSError) and error.errno and ".partial" in str(error.filename or ".partial"):
                 error.filename = str(path)
             raise
-        needed = needed or getattr(error, "needed", 0)
-        need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
+        size = size or getattr(error, "size", 0)
+        need = f"of about {format_bytes(size)} needed" if size else "more needed"
         problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free, {need})"
         full = FullDiskError(problem, file=path, cure=MAKE_ROOM)
-        full.needed = needed
+        full.size = size
         raise full from error
 
 
@@ -136,15 +136,15 @@ def _is_full_disk(error: Exception) -> bool:
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path, needed: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
 
-    A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``. With
+    A full disk is reported with the space that is free without the part that did fit, and the ``size`` in bytes. With
     ``follow``, a symbolic link stays, and the file that it leads to is written.
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)
-    with explain_full_disk(path, needed), _open_locked(partial, wait=True) as file:
+    with explain_full_disk(path, size), _open_locked(partial, wait=True) as file:
         try:
             file.truncate()  # a killed process may have left it
             yield file
@@ -187,13 +187,13 @@ def file_digest(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def replace_folder(path: Path, needed: int = 0) -> Iterator[Path]:
+def replace_folder(path: Path, size: int = 0) -> Iterator[Path]:
     """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged.
 
     A full disk is reported as by :func:`atomic_write`.
     """
     partial = PartialFolder(path)
-    with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
+    with explain_full_disk(path, size), contextlib.ExitStack() as cleanup:
         partial.open(restart=True)
         cleanup.callback(partial.close)
         yield partial.content
@@ -352,13 +352,13 @@ def allow_open_files(path: Path, number: int) -> None:
         UsageError: The system allows fewer.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed, infinity = number + _OTHER_FILES, resource.RLIM_INFINITY
-    if soft == infinity or needed <= soft:
+    total, infinity = number + _OTHER_FILES, resource.RLIM_INFINITY
+    if soft == infinity or total <= soft:
         return
-    if hard != infinity and needed > hard:
-        problem = f"needs {needed} open files, the limit is {hard}"
-        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {needed}, or a larger shard size")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    if hard != infinity and total > hard:
+        problem = f"needs {total} open files, the limit is {hard}"
+        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {total}, or a larger shard size")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (total, hard))
 
 
 def _follow(path: Path) -> Path:

@@ -133,8 +133,8 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
-    if trained := learned_from(config.planner):
-        info["trained_on"] = trained
+    if training_sets := learned_from(config.planner):
+        info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
