@@ -23,13 +23,13 @@ from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
-from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, existing
+from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, require_file
 
 #: Key columns of ``episodes.csv``, before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
-#: Columns that an evaluation adds to the metrics.
 _CRASHED = "the planner raised an error, or its action was not finite: a failed episode"
 _ACTION_JERK = "standard deviation of the change of the action from step to step; 0.82 for random actions"
+#: Columns that an evaluation adds to the metrics.
 ADDED = {
     "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
 }  # fmt: skip
@@ -298,7 +298,7 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    text = read_text(existing(path, _RERUN), _RERUN)
+    text = read_text(require_file(path, _RERUN), _RERUN)
     with explain_damage(path, _RERUN, "cannot be read"):
         rows = csv_rows(text)
     header = rows[0] if rows else []

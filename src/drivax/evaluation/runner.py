@@ -45,7 +45,7 @@ from drivax.simulator.types import Traffic
 from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
-from drivax.tracking.run_folder import RunFolder, learned_from
+from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
 #: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
@@ -133,7 +133,7 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
-    if training_sets := learned_from(config.planner):
+    if training_sets := policy_training_sets(config.planner):
         info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)

@@ -140,7 +140,7 @@ class RunFolder:
             DataError: ``config.yaml`` is missing or edited.
             UsageError: It does not match ``cls``, or names code that is not trusted.
         """
-        file = existing(self.path / CONFIG_FILE, _RERUN)
+        file = require_file(self.path / CONFIG_FILE, _RERUN)
         return settings.load(cls, file, overrides, trust=trust)
 
     @property
@@ -179,10 +179,10 @@ class RunFolder:
         Raises:
             DataError: The file is missing, or a row is damaged.
         """
-        return list(read_rows(existing(self.metrics, "train again")))
+        return list(read_rows(require_file(self.metrics, "train again")))
 
 
-def existing(path: Path, cure: str) -> Path:
+def require_file(path: Path, cure: str) -> Path:
     """Return the path of a file.
 
     Raises:
@@ -281,18 +281,17 @@ def is_policy(name: str | Path) -> bool:
     return str(name).startswith(ZOO) or Path(name).is_dir()
 
 
-def learned_from(planner: str) -> list[dict[str, Any]]:
+def policy_training_sets(planner: str) -> list[dict[str, Any]]:
     """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining.
 
     Other planners have none.
     """
-    folder = planner.partition("@")[0]
-    path = policy_folder(folder) if is_policy(folder) else Path(folder)
+    path = policy_folder(planner.partition("@")[0])
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
-    return trained_on(info) if info.get("kind") in ("training", "policy") else []
+    return training_sets(info) if info.get("kind") in ("training", "policy") else []
 
 
-def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+def training_sets(info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the data sets in the ``run.json`` of a training run without duplicates, its own sets first."""
     by_hash: dict[str, dict[str, Any]] = {}
     networks_from = info.get("networks_from") or {}
