@@ -105,12 +105,12 @@ def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]
 def _required_braking(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
         counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
-        return _braking_for(bank, log.index, frame, counts, along_m, speed)
+        return _braking_at_step(bank, log.index, frame, counts, along_m, speed)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
-def _braking_for(
+def _braking_at_step(
     bank: ScenarioBank, index: Any, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
     speed_mps: Float[Array, ""],
 ) -> Float[Array, ""]:  # fmt: skip
