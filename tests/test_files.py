@@ -189,7 +189,7 @@ def test_a_full_disk_is_reported_with_path_need_and_cure(tmp_path: Path, error: 
         pytest.raises(
             DataError, match=r"set: no space left on device \(.+ free, of about 3\.0 MB needed\); make"
         ),
-        explain_full_disk(tmp_path / "set", needed=3_000_000),
+        explain_full_disk(tmp_path / "set", size=3_000_000),
     ):
         raise error
 

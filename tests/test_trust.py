@@ -25,7 +25,6 @@ from drivax.learning.policies import export_policy, find_traffic, load_policy, p
 from drivax.planners.catalogue import make_planner
 from drivax.plugins import find_named, makes, result_class
 from drivax.scenario.store import ScenarioSet
-from drivax.settings.trust import check_names, modules_of
 from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.studies.definition import StudyConfig
@@ -253,15 +252,16 @@ def test_trusted_modules_are_resolved(folder):
     config = run.config(TrainConfig, trust=["own_terms", "toy_learner"])
     assert config == settings.load(TrainConfig, OWN) and config.algorithm == ToyConfig()
     assert config.task.rewards.own[0].term == own_terms.Crowded(7.0)
-    assert modules_of(config) == ["own_terms", "toy_learner"] and modules_of(TrainConfig()) == []
+    modules = settings.modules_of(config), settings.modules_of(TrainConfig())
+    assert modules == (["own_terms", "toy_learner"], [])
     # A package covers its modules, but not those whose names only begin alike.
-    check_names(["good_policy.extra:thing"], ["good_policy"])
+    settings.check_names(["good_policy.extra:thing"], ["good_policy"])
     with pytest.raises(UsageError, match="names code"):
-        check_names(["good_policy_2:thing"], ["good_policy"])
+        settings.check_names(["good_policy_2:thing"], ["good_policy"])
     # What a trusted module has imported from others is not its own.
     for name in ("own_terms:jax.jit", "own_terms:Any", "own_terms:dataclass"):
         with pytest.raises(UsageError, match="is not a component of 'own_terms'"):
-            check_names({"a": [name]}, ["own_terms"])
+            settings.check_names({"a": [name]}, ["own_terms"])
 
 
 @pytest.mark.parametrize("environment", [DrivingEnv, VectorDrivingEnv])

@@ -31,7 +31,7 @@ import numpy as np
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable, interval_of
-from drivax.evaluation.result_tables import paired_differences
+from drivax.evaluation.result_tables import paired_difference
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.evaluation.runner import evaluate
 from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
@@ -74,7 +74,7 @@ def evaluate_as_ego(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
     }
     differences = {
         other: {
-            metric: paired_differences(episodes["aggressive"], episodes[other], metric).as_dict()
+            metric: paired_difference(episodes["aggressive"], episodes[other], metric).as_dict()
             for metric in metrics_shown
         }
         for other in ("clone", "log")

@@ -98,10 +98,9 @@ def _processor() -> str:
     """Return eight hexadecimal digits of the processor's kind: XLA compiles for the instructions that it has."""
     kind = f"{platform.machine()} {platform.processor()}"
     with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-        kind += " ".join(
-            sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-        )
+        lines = set(Path("/proc/cpuinfo").read_text(errors="replace").splitlines())
+        prefixes = ("model name", "flags", "Features")
+        kind += " ".join(sorted(line for line in lines if line.startswith(prefixes)))
     return hashlib.sha256(kind.encode()).hexdigest()[:8]
 
 
@@ -113,8 +112,8 @@ def _prune(top: Path, max_bytes: int, keep: Path) -> None:
             status = path.stat()
             files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     total = sum(size for _, size, _ in files)
-    for used_s, size, path in sorted(files):
-        if total <= max_bytes or used_s > time.time() - _SETTLED_S:
+    for last_use_s, size, path in sorted(files):
+        if total <= max_bytes or last_use_s > time.time() - _SETTLED_S:
             break
         path.unlink(missing_ok=True)
         total -= size

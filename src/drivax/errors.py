@@ -20,32 +20,21 @@ _EXTRAS = {
 }  # fmt: skip
 #: Characters of the longest problem that is kept in full; of others, which quote a value, only the ends.
 _LONGEST = 1000
-
-
-_UNREACHABLE = "mount the disk again or check it, then repeat the command"
+#: Cure of a full disk.
+MAKE_ROOM = "make room, or choose another disk"
 _NO_PERMISSION = "change the permissions of the file or of its folder, or choose another"
+_UNREACHABLE = (
+    errno.ESTALE, errno.EIO, errno.ENXIO, errno.ENOTCONN, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.ENODEV
+)  # fmt: skip
 #: Cures of failures of files and disks.
 _DISK_CURES = {
     errno.ENOENT: "check the path, and that its disk is mounted",
-    errno.EACCES: _NO_PERMISSION,
-    errno.EPERM: _NO_PERMISSION,
     errno.EROFS: "choose a folder on a disk that can be written",
-    **dict.fromkeys(
-        (
-            errno.ESTALE,
-            errno.EIO,
-            errno.ENXIO,
-            errno.ENOTCONN,
-            errno.ETIMEDOUT,
-            errno.EHOSTDOWN,
-            errno.ENODEV,
-        ),
-        _UNREACHABLE,
-    ),
-    errno.ENOSPC: "make room, or choose another disk",
-    errno.EDQUOT: "make room, or choose another disk",
     errno.EFBIG: "raise the limit of file sizes: ulimit -f unlimited",
     errno.ENAMETOOLONG: "choose a shorter name",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _NO_PERMISSION),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), MAKE_ROOM),
+    **dict.fromkeys(_UNREACHABLE, "mount the disk again or check it, then repeat the command"),
 }
 _LESS_MEMORY = "use fewer --workers or a smaller --batch, or raise the limit: ulimit -v unlimited"
 #: Limits of a process (name, resource) and their cures.
@@ -124,10 +113,9 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
     if number in _LIMITS:
         name, kind, cure = _LIMITS[number]
         limit = resource.getrlimit(kind)[0]
-        shown = (
-            "none" if limit == resource.RLIM_INFINITY else limit // 1024 if number == errno.ENOMEM else limit
-        )
-        return UsageError(f"{problem} (limit of {name}: {shown})", file=file, cure=cure)
+        size = limit // 1024 if number == errno.ENOMEM else limit
+        text = "none" if limit == resource.RLIM_INFINITY else size
+        return UsageError(f"{problem} (limit of {name}: {text})", file=file, cure=cure)
     return DataError(problem, file=file, cure=_DISK_CURES[number]) if number in _DISK_CURES else None
 
 
@@ -159,12 +147,10 @@ def import_extra(package: str) -> Any:
         raise missing_package(error) or error from error
 
 
-def did_you_mean(
-    name: str, names: Iterable[str], *, otherwise: str | None = None, cutoff: float = 0.6
-) -> str:
+def did_you_mean(name: str, names: Iterable[str], *, otherwise: str | None = None) -> str:
     """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names."""
     candidates = list(names)
-    if matches := difflib.get_close_matches(name, candidates, n=1, cutoff=cutoff):
+    if matches := difflib.get_close_matches(name, candidates, n=1):
         return f"did you mean {matches[0]!r}?"
     if otherwise is not None:
         return otherwise

@@ -28,7 +28,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from drivax.errors import DataError, UsageError
+from drivax.errors import MAKE_ROOM, DataError, UsageError
 
 #: Flags of renameat2 (Linux): relative to the current folder, exchange both names.
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -41,9 +41,9 @@ _OTHER_FILES = 128
 
 
 class FullDiskError(DataError):
-    """The disk is full; ``needed`` is the size of the output in bytes, 0 if unknown."""
+    """The disk is full; ``size`` is that of the output in bytes, 0 if unknown."""
 
-    needed = 0
+    size = 0
 
 
 def sync_and_close(file: IO[bytes]) -> None:
@@ -74,9 +74,8 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
     if path.is_dir() != folder:
         raise UsageError(f"output is a {other}", file=path, cure=f"name a {kind} to write")
     if not overwrite:
-        raise UsageError(
-            f"output {kind} already exists", file=path, cure="choose another or pass --overwrite"
-        )
+        cure = "choose another or pass --overwrite"
+        raise UsageError(f"output {kind} already exists", file=path, cure=cure)
 
 
 def free_bytes(path: Path) -> int:
@@ -95,61 +94,57 @@ def format_bytes(size: float) -> str:
     return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
 
 
-def check_space(path: Path, needed: int, cure: str = "make room, or choose another disk") -> None:
-    """Check, before any work, that the disk has space for an output of about ``needed`` bytes.
+def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
+    """Check, before any work, that the disk has space for an output of about ``size`` bytes.
 
     Raises:
         DataError: The disk has less space left.
     """
-    if needed > (free := free_bytes(path)):
-        problem = f"no space: needs about {format_bytes(needed)}, the disk has {format_bytes(free)} left"
+    if size > (free := free_bytes(path)):
+        problem = f"no space: needs about {format_bytes(size)}, the disk has {format_bytes(free)} left"
         raise DataError(problem, file=path, cure=cure)
 
 
 @contextlib.contextmanager
-def explain_full_disk(path: Path, needed: int = 0) -> Iterator[None]:
-    """Raise a FullDiskError that names ``path``, and ``needed`` bytes if known, when the block fills the disk.
+def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
+    """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
-    the outermost one that knows them the bytes. Other errors of the system get the name if they have none, or a hidden
+    the outermost one that knows it the size. Other errors of the system get the name if they have none, or a hidden
     one.
     """
     try:
         yield
     except Exception as error:
         if not _is_full_disk(error):
-            if (
-                isinstance(error, OSError)
-                and error.errno is not None
-                and ".partial" in str(error.filename or ".partial")
-            ):
+            if isinstance(error, OSError) and error.errno and ".partial" in str(error.filename or ".partial"):
                 error.filename = str(path)
             raise
-        needed = needed or getattr(error, "needed", 0)
-        need = f"of about {format_bytes(needed)} needed" if needed else "more needed"
+        size = size or getattr(error, "size", 0)
+        need = f"of about {format_bytes(size)} needed" if size else "more needed"
         problem = f"no space left on device ({format_bytes(free_bytes(path.parent))} free, {need})"
-        full = FullDiskError(problem, file=path, cure="make room, or choose another disk")
-        full.needed = needed
+        full = FullDiskError(problem, file=path, cure=MAKE_ROOM)
+        full.size = size
         raise full from error
 
 
 def _is_full_disk(error: Exception) -> bool:
-    """Whether the disk is full: a system error, or one of a library (TensorStore) that quotes it."""
+    """Return whether the disk is full, by a system error or one of a library (TensorStore) that quotes it."""
     codes = (errno.ENOSPC, errno.EDQUOT)
-    quoted = any(os.strerror(code) in str(error) for code in codes)
-    return isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes or quoted
+    has_code = isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes
+    return has_code or any(os.strerror(code) in str(error) for code in codes)
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path, needed: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
 
-    A full disk is reported with the space that is free without the part that did fit, and the bytes ``needed``. With
+    A full disk is reported with the space that is free without the part that did fit, and the ``size`` in bytes. With
     ``follow``, a symbolic link stays, and the file that it leads to is written.
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)
-    with explain_full_disk(path, needed), _open_locked(partial, wait=True) as file:
+    with explain_full_disk(path, size), _open_locked(partial, wait=True) as file:
         try:
             file.truncate()  # a killed process may have left it
             yield file
@@ -192,13 +187,13 @@ def file_digest(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def replace_folder(path: Path, needed: int = 0) -> Iterator[Path]:
+def replace_folder(path: Path, size: int = 0) -> Iterator[Path]:
     """Yield a new folder that replaces ``path`` when the block ends; an error leaves ``path`` unchanged.
 
     A full disk is reported as by :func:`atomic_write`.
     """
     partial = PartialFolder(path)
-    with explain_full_disk(path, needed), contextlib.ExitStack() as cleanup:
+    with explain_full_disk(path, size), contextlib.ExitStack() as cleanup:
         partial.open(restart=True)
         cleanup.callback(partial.close)
         yield partial.content
@@ -299,12 +294,10 @@ class PartialFolder:
         identity = _read_json(self.root / "identity.json")
         if isinstance(identity, dict) and identity != self.identity and not restart and can_resume(self.path):
             own = self.identity or {}
-            different = ", ".join(name for name in own if identity.get(name) != own[name])
-            raise UsageError(
-                f"an unfinished output was started with other data or other options ({different or 'command'})",
-                file=self.path,
-                cure="finish it with the same options, or pass --overwrite to start again",
-            )
+            names = ", ".join(name for name in own if identity.get(name) != own[name]) or "command"
+            problem = f"an unfinished output was started with other data or other options ({names})"
+            cure = "finish it with the same options, or pass --overwrite to start again"
+            raise UsageError(problem, file=self.path, cure=cure)
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
@@ -333,11 +326,8 @@ class PartialFolder:
         try:
             self._lock = _open_locked(self.root / "lock")
         except BlockingIOError as error:
-            raise UsageError(
-                "another process is writing it",
-                file=self.path,
-                cure="wait for it, or choose another name",
-            ) from error
+            cure = "wait for it, or choose another name"
+            raise UsageError("another process is writing it", file=self.path, cure=cure) from error
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -362,13 +352,13 @@ def allow_open_files(path: Path, number: int) -> None:
         UsageError: The system allows fewer.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed, infinity = number + _OTHER_FILES, resource.RLIM_INFINITY
-    if soft == infinity or needed <= soft:
+    total, infinity = number + _OTHER_FILES, resource.RLIM_INFINITY
+    if soft == infinity or total <= soft:
         return
-    if hard != infinity and needed > hard:
-        problem = f"needs {needed} open files, the limit is {hard}"
-        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {needed}, or a larger shard size")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    if hard != infinity and total > hard:
+        problem = f"needs {total} open files, the limit is {hard}"
+        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {total}, or a larger shard size")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (total, hard))
 
 
 def _follow(path: Path) -> Path:

@@ -83,18 +83,14 @@ def _may_be_named(thing: Any, name: str) -> bool:
     A component is a dataclass, an instance of one, or a reward term or feature of ``drivax.tasks``, which is pure; its
     name has no underscore in front.
     """
-    if not _is_part_of_drivax(thing):
-        return _package_of(thing) == name.partition(":")[0].partition(".")[0]
-    is_private = any(part.startswith("_") for part in re.split("[.:]", name))
+    if (package := _package_of(thing)) != "drivax":
+        return package == name.partition(":")[0].partition(".")[0]
+    is_private = re.search(r"(^|[.:])_", name) is not None
     return not is_private and (is_dataclass(thing) or _is_term(thing))
 
 
 def _package_of(thing: Any) -> str:
     return str(getattr(thing, "__module__", None)).partition(".")[0]
-
-
-def _is_part_of_drivax(thing: Any) -> bool:
-    return _package_of(thing) == "drivax"
 
 
 def _is_term(thing: Any) -> bool:
@@ -114,15 +110,11 @@ def _import(module_name: str, name: str) -> Any:
             return importlib.import_module(module_name)
     except Exception as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None and (module_name == missing or module_name.startswith(f"{missing}.")):
-            raise UsageError(
-                f"{name!r}: module {missing!r} not found",
-                cure="install it, add its folder to PYTHONPATH, or run from its folder",
-            ) from error
-        raise UsageError(
-            f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}",
-            cure="fix the module",
-        ) from error
+        if missing is not None and f"{module_name}.".startswith(f"{missing}."):
+            cure = "install it, add its folder to PYTHONPATH, or run from its folder"
+            raise UsageError(f"{name!r}: module {missing!r} not found", cure=cure) from error
+        problem = f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}"
+        raise UsageError(problem, cure="fix the module") from error
 
 
 @contextlib.contextmanager
@@ -147,16 +139,11 @@ def dotted_name(thing: Any) -> str:
         UsageError: The object is a lambda, or defined inside a function.
     """
     name = f"{getattr(thing, '__module__', None)}:{getattr(thing, '__qualname__', None)}"
-    try:
-        target = find_named(name)
-    except UsageError:
-        target = None
-    if target is not thing:
-        label = getattr(thing, "__qualname__", repr(thing))
-        raise UsageError(
-            f"{label} cannot be saved in a configuration", cure="define it at the top level of a module"
-        )
-    return name
+    with contextlib.suppress(UsageError):
+        if find_named(name) is thing:
+            return name
+    label, cure = getattr(thing, "__qualname__", repr(thing)), "define it at the top level of a module"
+    raise UsageError(f"{label} cannot be saved in a configuration", cure=cure)
 
 
 def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
@@ -229,7 +216,7 @@ def _check_method(thing: Any, name: str, member: str, expected: Any) -> None:
     arguments = tuple(inspect.signature(expected).parameters)[not isinstance(thing, type) :]
     signature = _signature(method)
     has_names = signature is not None and tuple(signature.parameters)[: len(arguments)] == arguments
-    if not _accepts(method, arguments) or (_is_part_of_drivax(thing) and not has_names):
+    if not _accepts(method, arguments) or (_package_of(thing) == "drivax" and not has_names):
         raise ValueError(f"{name!r}: {member} takes {signature}, not ({', '.join(arguments)})")
 
 

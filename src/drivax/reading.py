@@ -87,24 +87,24 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
         return file.read_bytes()
 
 
-def read_text(file: Path, cure: str, most: int = MOST_TEXT) -> str:
+def read_text(file: Path, cure: str) -> str:
     """Return the content of a UTF-8 file.
 
     Raises:
-        DataError: It is missing, larger than ``most`` bytes, or not text.
+        DataError: It is missing, larger than :data:`MOST_TEXT`, or not text.
     """
-    data = read_bytes(file, cure, most)
+    data = read_bytes(file, cure)
     with explain_damage(file, cure, "is not text"):
         return data.decode()
 
 
-def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
+def read_json(file: Path, cure: str) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        DataError: It is missing, larger than ``most`` bytes, nested too deeply, or not JSON.
+        DataError: It is missing, larger than :data:`MOST_TEXT`, nested too deeply, or not JSON.
     """
-    data = read_bytes(file, cure, most)
+    data = read_bytes(file, cure)
     with explain_damage(file, cure, "is not valid JSON"):
         return json.loads(data)
 

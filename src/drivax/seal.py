@@ -30,7 +30,7 @@ _MOST_BYTES, _MOST_SEALED_BYTES = 1 << 20, 4 << 30
 class _Block:
     """Whether edited files are used, and those that were read, in order."""
 
-    allowed: bool
+    is_allowed: bool
     files: dict[str, None] = field(default_factory=dict)
 
 
@@ -39,8 +39,8 @@ _block: ContextVar[_Block | None] = ContextVar("block", default=None)
 
 def seal(folder: Path, *names: str) -> None:
     """Seal files of a folder in their present state: their content, or that they do not exist."""
-    edited = edited_files(folder)  # An edited file stays one: its entry does not change.
-    digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
+    former = edited_files(folder)  # An edited file stays one: its entry does not change.
+    digests = {name: _digest(folder / name) for name in names if str(folder / name) not in former}
     write_json(folder / SEAL, {**_read(folder / SEAL), **digests}, follow=False)
 
 
@@ -71,12 +71,12 @@ def refuse_edited(file: Path, problem: str) -> None:
 
 
 @contextlib.contextmanager
-def allow_edited(allowed: bool = True) -> Iterator[None]:
+def allow_edited(is_allowed: bool = True) -> Iterator[None]:
     """Use edited files in the block instead of refusing them; all tables, pages and runs of the block say so.
 
-    Without ``allowed``, edited files are refused, and only the edited files behind earlier runs are noted.
+    Without ``is_allowed``, edited files are refused, and only the edited files behind earlier runs are noted.
     """
-    token = _block.set(_Block(allowed))
+    token = _block.set(_Block(is_allowed))
     try:
         yield
     finally:
@@ -85,7 +85,7 @@ def allow_edited(allowed: bool = True) -> Iterator[None]:
 
 def is_edited_allowed() -> bool:
     """Return whether edited files are used (:func:`allow_edited`)."""
-    return (block := _block.get()) is not None and block.allowed
+    return (block := _block.get()) is not None and block.is_allowed
 
 
 def note_edited(*files: str) -> None:
@@ -101,9 +101,9 @@ def edited_files(folder: Path | None = None) -> list[str]:
     return [file for file in files if folder is None or Path(file).parent == folder]
 
 
-def mark_edited(name: str, edited: object) -> str:
-    """Return a name for tables, with :data:`MARK` if ``edited`` is true."""
-    return f"{name}{MARK}" if edited and not name.endswith(MARK) else name
+def mark_edited(name: str, is_edited: object) -> str:
+    """Return a name for tables, with :data:`MARK` if ``is_edited`` is true."""
+    return f"{name}{MARK}" if is_edited and not name.endswith(MARK) else name
 
 
 def _digest(file: Path) -> str | None:

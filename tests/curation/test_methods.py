@@ -68,7 +68,7 @@ def test_methods_return_their_declared_components(tables):
         method = METHODS[table.method]
         if table.components:
             weighed = method.combination(method.config).weights
-            assert set(table.components) == {*weighed, *method.unweighted(method.config)}
+            assert set(table.components) == {*weighed, *method.extra_components(method.config)}
 
 
 def test_commands_offer_every_method_and_arm():

@@ -79,7 +79,11 @@ def test_states_are_sampled_before_and_after_the_collision(bank):
     samples = sample_states(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
     assert samples.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
-    assert samples.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
+    assert samples.has_collided.tolist() == [
+        [step > 38 for step in range(10, 81, 10)],
+        [False] * 8,
+        [False] * 8,
+    ]
     assert samples.collides.tolist() == [True, False, False]
 
 

@@ -111,6 +111,17 @@ def test_strata_in_the_order_of_their_words():
     assert [numbers(table, row)[0].interval.n for row in table.rows] == [8, 8, 3, 3, 1, 1]
 
 
+def test_strata_of_runs_with_the_same_name():
+    tags = {("d", f"s{i}"): {"difficulty": "easy" if i else "hard"} for i in range(N)}
+    whole = run("a", {"success": [0] + [1] * (N - 1)})
+    keys = {name: values[1:] for name, values in whole.keys.items()}
+    rest = replace(whole, keys=keys, metrics={"success": whole.metrics["success"][1:]})
+    table = strata_table([whole, rest], tags, "difficulty", ["success"])
+    assert labels(table) == [("easy", "a"), ("easy", "a"), ("hard", "a")]
+    assert means(table) == [[1.0], [1.0], [0.0]]
+    assert [numbers(table, row)[0].interval.n for row in table.rows] == [N - 1, N - 1, 1]
+
+
 def test_scenarios_of_several_types_count_in_each():
     types = ["stopping_with_lead|near_multiple_vehicles", "stopping_with_lead"] + ["changing_lane"] * (N - 3)
     tags = {("d", f"s{i}"): {"scenario_types": words} for i, words in enumerate(types)}

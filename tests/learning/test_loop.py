@@ -24,7 +24,7 @@ from drivax.scenario.select import splits
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.run_folder import learned_from, seed_folders
+from drivax.tracking.run_folder import policy_training_sets, seed_folders
 from drivax.tracking.sinks import read_rows
 from toy_learner import VALUES, Toy, ToyConfig, ToyState
 
@@ -99,7 +99,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
         lacks = parameters - numbers(last_state(fresh))[0]
         np.testing.assert_allclose(lacks, began.parameters, rtol=1e-5)
         assert iteration == 1 and (key == numbers(last_state(fresh))[1]).all()
-        assert learned_from(str(path)) == learned_from(str(former)), "each set once"
+        assert policy_training_sets(str(path)) == policy_training_sets(str(former)), "each set once"
     # Without a step it is the best; whoever resumes from the very beginning finds the same.
     run = train(replace(onward, begin_from=str(former)), data, tmp_path / "best", validation=data)
     assert (

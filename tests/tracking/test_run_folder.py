@@ -162,7 +162,7 @@ def test_entries_of_trainings_are_read(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config(), kind="training")
     for values in entries:
         info = RunFolder.open(run.note(**values).path).info
-        assert info.items() >= values.items() and runs.trained_on(info) == []
+        assert info.items() >= values.items() and runs.training_sets(info) == []
 
 
 def test_tables_of_other_programs_need_no_hash(tmp_path: Path):
@@ -211,13 +211,13 @@ def test_training_sets_of_a_planner(tmp_path):
     for name, kind in (("policy", "training"), ("judged", "evaluation")):
         RunFolder.create(tmp_path / name, Config(), kind=kind).note(data=data)
     trained = str(tmp_path / "policy")
-    assert runs.learned_from(trained) == runs.learned_from(f"{trained}@1000") == data
-    assert runs.learned_from(str(tmp_path / "judged")) == runs.learned_from("idm") == []
-    assert [entry["scenarios"] for entry in runs.learned_from("zoo:aggressive")] == [4096]
+    assert runs.policy_training_sets(trained) == runs.policy_training_sets(f"{trained}@1000") == data
+    assert runs.policy_training_sets(str(tmp_path / "judged")) == runs.policy_training_sets("idm") == []
+    assert [entry["scenarios"] for entry in runs.policy_training_sets("zoo:aggressive")] == [4096]
     # What the run learned from whose networks it began with counts too, each set once.
     former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
     RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})
-    assert runs.learned_from(trained) == [*data, former[1]]
+    assert runs.policy_training_sets(trained) == [*data, former[1]]
 
 
 def test_steps_of_runs():

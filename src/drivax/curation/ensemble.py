@@ -206,13 +206,13 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
 
 def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
     """Return the sorted scenarios of random whole recordings, at least ``count`` in total; None: all scenarios."""
-    names, recording = np.unique(clusters, return_inverse=True)
     if count is None:
-        return np.arange(len(recording))
-    rank = np.random.default_rng(seed).permutation(len(names))
-    sizes = np.bincount(rank[recording])
+        return np.arange(len(clusters))
+    names, recording = np.unique(clusters, return_inverse=True)
+    rank = np.random.default_rng(seed).permutation(len(names))[recording]
+    sizes = np.bincount(rank)
     # Add recordings until there are enough scenarios.
-    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[recording]])
+    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank])
 
 
 def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | None = None) -> Ensemble:
@@ -241,14 +241,11 @@ def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: i
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
     if 2 * size * count > free:
-        max_scenarios = free // (4 * size)
-        problem = (
-            f"{count:,} scenarios take about {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free"
-        )
+        max_scenarios, need_gb = free // (4 * size), 2e-9 * size * count
+        problem = f"{count:,} scenarios take about {need_gb:,.0f} GB, and {free / 1e9:,.0f} GB are free"
         cure = f"pass --learn_from {max_scenarios} to train on fewer scenarios; all are scored"
-        raise UsageError(
-            problem, file=data.path, cure=cure if max_scenarios >= config.folds else "free memory"
-        )
+        cure = cure if max_scenarios >= config.folds else "free memory"
+        raise UsageError(problem, file=data.path, cure=cure)
 
 
 def experience_of(
@@ -291,9 +288,8 @@ def fit(
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                return cloning.imitation_loss(
-                    learner.distribution(parameters, batch), action[order], is_other_fold[order]
-                )
+                distribution = learner.distribution(parameters, batch)
+                return cloning.imitation_loss(distribution, action[order], is_other_fold[order])
 
             return imitation_update(member_state, learner.optimiser, loss)[0]
 

@@ -66,17 +66,16 @@ class KinematicConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.urgent_s < TTC_HORIZON_S:
-            raise UsageError(
-                f"urgent_s is {self.urgent_s}", cure=f"use more than 0 and less than {TTC_HORIZON_S}"
-            )
+            cure = f"use more than 0 and less than {TTC_HORIZON_S}"
+            raise UsageError(f"urgent_s is {self.urgent_s}", cure=cure)
         names = ("full_braking_mps2", "full_jerk_mps3", "full_yaw_rps2", "edge_m", "lane_m", "crowd")
         check_positive({name: getattr(self, name) for name in names})
 
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
         return {
-            "urgency": _urgencies(self, log),
-            "braking": jnp.clip(_required_braking_of_log(bank, log) / self.full_braking_mps2, 0.0, 1.0),
+            "urgency": _urgency(self, log),
+            "braking": jnp.clip(_required_braking(bank, log) / self.full_braking_mps2, 0.0, 1.0),
             "volatility": _volatility(self, log, bank.last_step[log.context.row[0]]),
             "off_road": _edge_nearness(self, bank, log),
             "lane_deviation": _deviation(self, bank, log),
@@ -91,16 +90,27 @@ def check_positive(values: dict[str, float]) -> None:
             raise UsageError(f"{name} is {value}", cure="use a positive number")
 
 
-def urgency(
-    ttc_s: Float[Array, ""], speed_mps: Float[Array, ""], config: KinematicConfig
-) -> Float[Array, ""]:
+def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
     """Return the scaled inverse time to collision: 0 above 5 s or at standstill, 1 up to ``urgent_s``."""
-    low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
-    share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
-    return jnp.where(speed_mps >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
+
+    def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
+        low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
+        ttc_s = time_to_collision(frame, jnp.int32(0), ignored)
+        share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
+        return jnp.where(motion[3] >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
+
+    return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
 
 
-def required_braking(
+def _required_braking(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
+    def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
+        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
+        return _braking_at_step(bank, log.index, frame, counts, along_m, speed)
+
+    return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
+
+
+def _braking_at_step(
     bank: ScenarioBank, index: Any, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
     speed_mps: Float[Array, ""],
 ) -> Float[Array, ""]:  # fmt: skip
@@ -122,9 +132,7 @@ def required_braking(
     near, far = map(project_at, _WINDOWS_M)
     use_near = near.distance_m <= far.distance_m
     projections = jax.tree.map(
-        lambda a, b: jnp.where(use_near.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-        near,
-        far,
+        lambda a, b: jnp.where(use_near.reshape(-1, *(1,) * (a.ndim - 1)), a, b), near, far
     )
     cos = jnp.sum(frame.box[:, 2:4] * projections.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
@@ -142,21 +150,6 @@ def required_braking(
 def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
     """Return the number of valid agents, ego included, relative to ``crowd``, at most 1."""
     return jnp.minimum(log.frame.valid.sum(axis=1) / crowd, 1.0)
-
-
-def _urgencies(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
-        return urgency(time_to_collision(frame, jnp.int32(0), ignored), motion[3], config)
-
-    return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
-
-
-def _required_braking_of_log(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
-    def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
-        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
-        return required_braking(bank, log.index, frame, counts, along_m, speed)
-
-    return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
 def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, ""]) -> Float[Array, " T"]:
@@ -196,8 +189,8 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScena
     def at_step(box: Array, ground: Array) -> Array:
         # A logged car without a road edge nearby is on a driveway or outside the map, and counts as on the road.
         on_road = jnp.ones(4, bool)
-        beyond = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
-        return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
+        outside_m = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
+        return jnp.max(jnp.clip(1.0 + outside_m / config.edge_m, 0.0, 1.0))
 
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
 
@@ -241,10 +234,8 @@ class PublishedConfig:
 
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
-        xy = log.motion[:, :2]
-        edge_m, lane_m = jax.vmap(
-            lambda point: queries.vertex_distances(bank, log.index, point, self.spacing_m)
-        )(xy)
+        distances = jax.vmap(lambda xy: queries.vertex_distances(bank, log.index, xy, self.spacing_m))
+        edge_m, lane_m = distances(log.motion[:, :2])
         return {
             "volatility": _published_volatility(self, log),
             "interaction": _interaction(self, log),

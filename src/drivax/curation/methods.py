@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -70,15 +69,15 @@ class Request:
 class Method:
     """A registered method; ``config`` are its default settings, None for a method without settings.
 
-    From settings, ``combination`` returns the combination of components, and ``unweighted`` the names of further
-    components.
+    ``score`` takes the name of the method and a request. From settings, ``combination`` returns the combination of
+    components, and ``extra_components`` the names of those without a weight.
     """
 
     name: str
-    score: Callable[[Request], ScoreTable]
+    score: Callable[[str, Request], ScoreTable]
     config: Any = None
     combination: Callable[[Any], Combination] = lambda _: _ALL
-    unweighted: Callable[[Any], tuple[str, ...]] = lambda _: ()
+    extra_components: Callable[[Any], tuple[str, ...]] = lambda _: ()
 
 
 def curate(name: str, request: Request) -> ScoreTable:
@@ -98,7 +97,7 @@ def curate(name: str, request: Request) -> ScoreTable:
     if type(config) is not type(default):
         cure = "remove them" if default is None else f"use {type(default).__name__}"
         raise UsageError(f"{name} has no settings of type {type(config).__name__}", cure=cure)
-    table = METHODS[name].score(replace(request, config=config))
+    table = METHODS[name].score(name, replace(request, config=config))
     if request.progress is not None:
         request.progress(len(request.data), len(request.data))
     return table
@@ -112,29 +111,27 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     Raises:
         DataError: Settings or combination differ.
     """
-    method, stored = METHODS[table.method], dict(table.config)
+    method, config_of_table = METHODS[table.method], json.loads(json.dumps(dict(table.config)))
     config = method.config if config is None else config
-    current: dict[str, Any] = {} if method.config is None else plain(config)
+    present: dict[str, Any] = {} if method.config is None else plain(config)
     if method.config is not None:
         try:
-            stored |= _with_present_names(stored, config, current)
+            config_of_table |= _with_present_names(config_of_table, config, present)
         except UsageError as error:
             raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
     if table.components:
-        current["combination"] = asdict(method.combination(config))
-    # Convert tuples to lists, as in tables from files.
-    stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
-    for name, value in current.items():
-        if stored.get(name) != value:
-            problem = f"scores of {table.method!r} have {name} {stored.get(name)}, not {value}"
+        present["combination"] = asdict(method.combination(config))
+    for name, value in present.items():
+        if config_of_table.get(name) != value:
+            problem = f"scores of {table.method!r} have {name} {config_of_table.get(name)}, not {value}"
             raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
-def _with_present_names(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
-    """Return stored settings ``names`` with the present names of their fields."""
-    values = {name: stored[name] for name in names if name in stored}
-    present = plain(settings.load(type(config), json.loads(json.dumps(values)), trust=()))
-    return {name: value for name, value in present.items() if name in stored}
+def _with_present_names(former: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
+    """Return the settings ``names`` among ``former`` ones with the present names of their fields."""
+    values = {name: former[name] for name in names if name in former}
+    present = plain(settings.load(type(config), values, trust=()))
+    return {name: value for name, value in present.items() if name in former}
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
@@ -143,8 +140,8 @@ def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> Non
     Raises:
         UsageError: A component is unknown, or a weight or aggregator is invalid.
     """
-    default = METHODS[name].combination(config)
-    replace(default, **changes).check_components({*default.weights, *METHODS[name].unweighted(config)})
+    default, extra = METHODS[name].combination(config), METHODS[name].extra_components(config)
+    replace(default, **changes).check_components({*default.weights, *extra})
 
 
 def make_table(
@@ -158,9 +155,8 @@ def make_table(
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
-    empty = np.zeros(valid.shape)
-    settings = {**({} if config is None else plain(config)), **details}
-    table = ScoreTable(name, settings, data.hash, ids, valid, empty, empty[:, 0], components)
+    empty, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
+    table = ScoreTable(name, values, data.hash, ids, valid, empty, empty[:, 0], components)
     return table.recombine(METHODS[name].combination(config))
 
 
@@ -219,13 +215,13 @@ def _disagreement_components(
 
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
     """Score a scenario by the second with the largest disagreement."""
-    by_likelihood = config.cloning.loss == "likelihood"
-    return Combination({"information" if by_likelihood else "disagreement": 1.0}, "top10")
+    name = "information" if config.cloning.loss == "likelihood" else "disagreement"
+    return Combination({name: 1.0}, "top10")
 
 
 def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
-    by_likelihood = config.cloning.loss == "likelihood"
-    return () if by_likelihood else tuple(f"action_{index}" for index in range(Actions().size))
+    size = 0 if config.cloning.loss == "likelihood" else Actions().size
+    return tuple(f"action_{index}" for index in range(size))
 
 
 def _heuristic(name: str, request: Request) -> ScoreTable:
@@ -239,18 +235,18 @@ def _rarity(name: str, request: Request) -> ScoreTable:
     return make_table(name, request.config, request.data, components)
 
 
-def _ensemble(request: Request) -> ScoreTable:
+def _ensemble(_: str, request: Request) -> ScoreTable:
     ensemble = train_ensemble(request.config, request.data, request.training)
     return ensemble_table(ensemble, request.data, request.progress)
 
 
-def _uniform(request: Request) -> ScoreTable:
+def _uniform(name: str, request: Request) -> ScoreTable:
     steps = np.ones((len(request.data), request.data.capacity.steps))
-    return make_table("uniform", None, request.data, {"all": steps})
+    return make_table(name, None, request.data, {"all": steps})
 
 
-def _oracle(request: Request) -> ScoreTable:
-    return make_table("oracle", None, request.data, {"all": event_steps(request.data).astype(np.float64)})
+def _oracle(name: str, request: Request) -> ScoreTable:
+    return make_table(name, None, request.data, {"all": event_steps(request.data).astype(np.float64)})
 
 
 def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:
@@ -277,19 +273,17 @@ def event_kinds(data: ScenarioSet) -> Int[np.ndarray, " N"]:
     return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])
 
 
-def _permute_like(request: Request) -> ScoreTable:
+def _permute_like(_: str, request: Request) -> ScoreTable:
     assert request.like is not None
     return permute_scores(read_scores(request.like, request.data), request.seed)
 
 
-_KINEMATIC, _PUBLISHED = partial(_heuristic, "kinematic"), partial(_heuristic, "published")
-_RARITY, _RARITY_PUBLISHED = partial(_rarity, "action_rarity"), partial(_rarity, "action_rarity_published")
 _METHODS = (
-    Method("kinematic", _KINEMATIC, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
-    Method("published", _PUBLISHED, PublishedConfig(), lambda _: PUBLISHED),
+    Method("kinematic", _heuristic, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
+    Method("published", _heuristic, PublishedConfig(), lambda _: PUBLISHED),
     Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
-    Method("action_rarity", _RARITY, KernelRarity(), lambda _: RARITY),
-    Method("action_rarity_published", _RARITY_PUBLISHED, PublishedRarity(), lambda _: RARITY),
+    Method("action_rarity", _rarity, KernelRarity(), lambda _: RARITY),
+    Method("action_rarity_published", _rarity, PublishedRarity(), lambda _: RARITY),
     Method("uniform", _uniform),
     Method("random_matched", _permute_like),
     Method("oracle", _oracle),

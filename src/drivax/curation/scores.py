@@ -25,8 +25,6 @@ Steps = Float[np.ndarray[Any, Any], "N T"]
 Valid = Bool[np.ndarray[Any, Any], "N T"]
 Scenarios = Float[np.ndarray[Any, Any], " N"]
 
-_NUMBERED = re.compile(r"(p|top)(\d+)")
-
 
 @dataclass(frozen=True)
 class Combination:
@@ -50,12 +48,10 @@ class Combination:
             raise UsageError("all weights are 0", cure="give a component a weight above 0")
         aggregators = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario
         for name in aggregators.values():
-            check_aggregator(name)
-        if not isinstance(self.scenario, str):
-            missing = sorted(set(self.weights) - set(self.scenario))
-            if missing:
-                problem = f"missing aggregator for {missing[0]!r}"
-                raise UsageError(problem, cure="name an aggregator for each component")
+            _parse_aggregator(name)
+        if not isinstance(self.scenario, str) and (missing := set(self.weights) - set(self.scenario)):
+            problem = f"missing aggregator for {min(missing)!r}"
+            raise UsageError(problem, cure="name an aggregator for each component")
 
     def check_components(self, available: Collection[str]) -> None:
         """Check that all components with a weight or an aggregator are available."""
@@ -79,25 +75,21 @@ class Combination:
         steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
             return steps, aggregate(steps, valid, self.scenario)
-        scenario_components = {
-            name: aggregate(components[name], valid, self.scenario[name]) for name in shares
-        }
-        scenarios = sum(
-            (share * scenario_components[name] for name, share in shares.items()), np.zeros(len(steps))
-        )
+        scenarios = np.zeros(len(steps))
+        for name, share in shares.items():
+            scenarios += share * aggregate(components[name], valid, self.scenario[name])
         return steps, np.minimum(scenarios, 1.0)
 
 
-def check_aggregator(name: str) -> None:
-    """Check the name of an aggregator."""
-    match = _NUMBERED.fullmatch(name)
-    if match is None:
-        known = name in ("max", "mean", "std")
-    else:
-        known = int(match[2]) <= 100 if match[1] == "p" else int(match[2]) >= 1
-    if not known:
+def _parse_aggregator(name: str) -> tuple[str, int]:
+    """Return kind (``mean``, ``std``, ``p`` or ``top``) and number of an aggregator; ``max`` is ``p100``."""
+    match = re.fullmatch(r"(p|top)(\d+)", "p100" if name == "max" else name)
+    kind, number = (match[1], int(match[2])) if match else (name, 0)
+    is_valid = (number <= 100 if kind == "p" else number >= 1) if match else kind in ("mean", "std")
+    if not is_valid:
         cure = "use max, mean, std, p0 to p100, or top1, top2, ..."
         raise UsageError(f"unknown aggregator {name!r}", cure=cure)
+    return kind, number
 
 
 def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
@@ -105,23 +97,21 @@ def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
 
     Percentiles interpolate linearly (NumPy's default); ``std`` is the population standard deviation.
     """
-    check_aggregator(name)
+    kind, number = _parse_aggregator(name)
     count = valid.sum(axis=1)
     divisor = np.maximum(count, 1)
-    valid_scores = np.where(valid, steps, 0.0)
-    mean = valid_scores.sum(axis=1) / divisor
-    if name == "mean":
+    mean = np.where(valid, steps, 0.0).sum(axis=1) / divisor
+    if kind == "mean":
         return mean
-    if name == "std":
+    if kind == "std":
         return np.sqrt(np.where(valid, (steps - mean[:, None]) ** 2, 0.0).sum(axis=1) / divisor)
     sorted_scores = np.sort(np.where(valid, steps, np.inf), axis=1)
     sorted_scores = np.where(np.isinf(sorted_scores), 0.0, sorted_scores)
-    match = _NUMBERED.fullmatch(name)
-    if match is not None and match[1] == "top":
+    if kind == "top":
         rank = np.arange(steps.shape[1])
-        largest = (rank < count[:, None]) & (rank >= count[:, None] - int(match[2]))
+        largest = (rank < count[:, None]) & (rank >= count[:, None] - number)
         return np.where(largest, sorted_scores, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
-    position = (divisor - 1) * (1.0 if match is None else int(match[2]) / 100.0)
+    position = (divisor - 1) * (number / 100.0)
     low = np.floor(position).astype(int)
     high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
     fraction = position - low
@@ -153,13 +143,13 @@ class ScoreTable:
     config: Mapping[str, Any]
     set_hash: str
     scenario_ids: tuple[str, ...]
-    valid: Bool[np.ndarray[Any, Any], "N T"]
-    steps: Float[np.ndarray[Any, Any], "N T"]
-    scenarios: Float[np.ndarray[Any, Any], " N"]
-    components: Mapping[str, Float[np.ndarray[Any, Any], "N T"]] = field(default_factory=dict)
+    valid: Valid
+    steps: Steps
+    scenarios: Scenarios
+    components: Mapping[str, Steps] = field(default_factory=dict)
 
     @property
-    def drawable(self) -> Bool[np.ndarray[Any, Any], "N T"]:
+    def drawable(self) -> Valid:
         """Steps that can be drawn, at which ego's action is known: it is observed at this and the next step."""
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
 
@@ -245,8 +235,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
 
 def _digest(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
     """Return the SHA-256 (hex) of a table; tables of earlier versions lack it."""
-    described = {name: value for name, value in header.items() if name != "sha256"}
-    digest = hashlib.sha256(json.dumps(described).encode())
+    content = {name: value for name, value in header.items() if name != "sha256"}
+    digest = hashlib.sha256(json.dumps(content).encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         digest.update(np.ascontiguousarray(arrays[name]).tobytes())
@@ -257,10 +247,8 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
     if version != SCORES_VERSION:
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_RERUN)
     if set_hash != data.hash:
-        subset_scores = data.path / OWN_SCORES
-        problem = (
-            f"scores belong to another set (hash {str(set_hash)[:12]}, {data.path} has {data.hash[:12]})"
-        )
+        subset_scores, short_hash = data.path / OWN_SCORES, str(set_hash)[:12]
+        problem = f"scores belong to another set (hash {short_hash}, {data.path} has {data.hash[:12]})"
         cure = f"use {subset_scores}" if subset_scores.is_file() and subset_scores != file else _RERUN
         raise DataError(problem, file=file, cure=cure)
 

@@ -78,9 +78,8 @@ def sampling_weights(
         weights[drawable] = _score_weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
         has_steps = drawable.any(axis=1)
-        weight = _score_weights(
-            table.scenarios[has_steps], drawable[has_steps].sum(axis=1).astype(np.float64), config
-        )
+        mass = drawable[has_steps].sum(axis=1).astype(np.float64)
+        weight = _score_weights(table.scenarios[has_steps], mass, config)
         weights[has_steps] = np.where(drawable[has_steps], weight[:, None], 0.0)
     if not weights.any():
         raise UsageError("every score is 0, so all weights are 0", cure="set floor, or normalise: quantile")
@@ -165,12 +164,11 @@ def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | No
     drawable = table.drawable if usable is None else usable
     steps, scenarios = table.steps.copy(), table.scenarios.copy()
     indices = np.flatnonzero(drawable.any(axis=1))
-    for index, other in zip(indices, rng.permutation(indices), strict=True):
-        scores = table.steps[other, drawable[other]]
+    for index, source in zip(indices, rng.permutation(indices), strict=True):
+        scores = table.steps[source, drawable[source]]
         scores = np.roll(scores, rng.integers(len(scores)))
         steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
-        scenarios[index] = table.scenarios[other]
+        scenarios[index] = table.scenarios[source]
     config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
-    return replace(
-        table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
-    )
+    table = replace(table, method="random_matched", config=config, components={})
+    return replace(table, steps=steps, scenarios=scenarios)

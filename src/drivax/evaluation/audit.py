@@ -203,19 +203,15 @@ def _reverse_and_forward_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
     step = np.diff(scenario.agent_xy[future].astype(np.float64), axis=0)
     along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
     drives = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
-    return np.stack(
-        [
-            np.where(drives & (sign * along > CREEP_MPS * DT_S), sign * along, 0.0).sum(axis=0)
-            for sign in (-1, 1)
-        ]
-    )
+    motions = (np.where(drives, sign * along, 0.0) for sign in (-1, 1))
+    return np.stack([np.where(motion > CREEP_MPS * DT_S, motion, 0.0).sum(axis=0) for motion in motions])
 
 
-def _clipped_share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
+def _clipped_share(is_clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
     """Return the share of clipped actions among those from an evaluated or the current step."""
     counts = evaluated.copy()
     counts[2:] &= evaluated[1:-1]
-    return _round(clipped[counts].mean(), 4) if counts.any() else None
+    return _round(is_clipped[counts].mean(), 4) if counts.any() else None
 
 
 def _first_step(condition: np.ndarray[Any, Any]) -> int | None:

@@ -125,10 +125,128 @@ class _Side:
         values = np.where(self.arm, self.by_seed(plan.primary), np.nan)
         defined = [seed_values[~np.isnan(seed_values)] for seed_values in values]
         means = tuple(float(seed_values.mean()) if seed_values.size else None for seed_values in defined)
-        interquartile = interquartile_bootstrap(
-            values, self.pairs.clusters, plan.confidence, plan.resamples, seed=plan.seed
-        )
+        draws = {"resamples": plan.resamples, "seed": plan.seed}
+        interquartile = interquartile_bootstrap(values, self.pairs.clusters, plan.confidence, **draws)
         return SeedSpread(means, interquartile)
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    """Two planners, and the split of the scenarios between them; None for pairs."""
+
+    plan: ComparisonPlan
+    a: _Side
+    b: _Side
+    split: Split | None
+
+    @property
+    def seeds(self) -> int:
+        return max(len(self.a.tables), len(self.b.tables))
+
+    @property
+    def clusters(self) -> tuple[str, ...]:
+        return self.a.pairs.clusters
+
+    def compare(self, metric: str) -> MetricComparison:
+        """Compare the planners in one metric; the winner is added later."""
+        a, b = self.a.values(metric), self.b.values(metric)
+        included = ~np.isnan(a) & ~np.isnan(b) if self.split is None else np.ones(a.size, bool)
+        x, y = np.where(included, a, np.nan), np.where(included, b, np.nan)
+        difference, evidence = self._test(metric, x, y)
+        column = self.a.tables[0].metric(metric)
+        return MetricComparison(
+            metric=metric,
+            unit="" if column is None else column.unit,
+            better="-" if column is None else column.better,
+            a=self.a.interval(self.plan, metric, included),
+            b=self.b.interval(self.plan, metric, included),
+            difference=difference,
+            effects={"d": effects.cohens_d(x, y)} if self.split else asdict(effects.cohens_d_paired(x, y)),
+            evidence=evidence,
+            p_adjusted=None,
+            winner=None,
+            seeds=self.seeds,
+            undefined_a=int((np.isnan(a) & self.a.arm).sum()),
+            undefined_b=int((np.isnan(b) & self.b.arm).sum()),
+        )
+
+    def _test(self, metric: str, x: Values, y: Values) -> tuple[Interval, SignificanceResult]:
+        """Return the difference of the means, and its significance test."""
+        plan, split, clusters = self.plan, self.split, self.clusters
+        resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
+        if split is not None:
+            values, first = np.where(split.first, x, y), split.first
+            difference = split_bootstrap(values, first, clusters, strata=split.strata, **resampling)
+            test = significance.split_permutation
+            return difference, test(values, first, clusters, split.strata, plan.resamples, seed=plan.seed)
+        if self.seeds == 1:
+            return paired_bootstrap(x, y, clusters, **resampling), self._paired_test(metric, x, y)
+        difference, effect = self._seed_difference(metric)
+        p, units = (None, 0) if effect is None else (effect.p, effect.clusters)
+        return difference, SignificanceResult("t", p, units, exact=False)
+
+    def _seed_difference(self, metric: str) -> tuple[Interval, CrossedEffect | None]:
+        """Return the difference with an interval over seeds and recordings, and its crossed effect."""
+        x, y = self.a.by_seed(metric), self.b.by_seed(metric)
+        return difference_interval(x, y, self.clusters, self.plan.confidence)
+
+    def _paired_test(self, metric: str, x: Values, y: Values) -> SignificanceResult:
+        """Apply McNemar's test to rates in independent pairs, otherwise the plan's test of means by recording."""
+        _, labels = drop_undefined(x, self.clusters)
+        independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
+        values = np.concatenate((x, y))
+        if metric in RATES and independent and np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
+            return significance.mcnemar_test(x, y)
+        permutation = self.plan.test == "permutation"
+        test = significance.paired_permutation if permutation else significance.paired_bootstrap_test
+        return test(x, y, self.clusters, self.plan.resamples, seed=self.plan.seed)
+
+    def sensitivity(self) -> Sensitivity | None:
+        """Return the sensitivity in the primary metric; None if the metric does not vary."""
+        plan, split = self.plan, self.split
+        x, y = self.a.values(plan.primary), self.b.values(plan.primary)
+        if split is None:
+            deviations, labels = drop_undefined(x - y, self.clusters)
+            share, deviation = None, float(deviations.std(ddof=1)) if deviations.size > 1 else 0.0
+        else:
+            residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
+            deviations, labels = drop_undefined(residuals, self.clusters)
+            defined_a, defined_b = x[~np.isnan(x)], y[~np.isnan(y)]
+            share = defined_a.size / deviations.size
+            deviation = effects.pooled_deviation(defined_a, defined_b) if deviations.size > 2 else 0.0
+        if deviations.size < 2:
+            return None
+        inflation = design_effect(deviations, labels)
+        smallest = plan.smallest_difference or _SMALL_EFFECT * deviation
+        if self.seeds > 1:
+            return self._seed_sensitivity(deviations.size, deviation, inflation, smallest)
+        if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
+            return None
+        effect, effective_n = smallest / deviation, deviations.size / inflation
+        detectable_d = effects.detectable_effect(effective_n, plan.power, plan.confidence, share)
+        needed = inflation * effects.scenarios_needed(effect, plan.power, plan.confidence, share)
+        return Sensitivity(
+            deviation=deviation,
+            design_effect=inflation,
+            smallest=smallest,
+            power=effects.power(effect, effective_n, plan.confidence, share),
+            detectable=None if detectable_d is None else detectable_d * deviation,
+            needed=math.ceil(needed),
+        )
+
+    def _seed_sensitivity(
+        self, n: int, deviation: float, inflation: float, smallest: float
+    ) -> Sensitivity | None:
+        """Return the sensitivity over seeds; more scenarios do not reduce the variance of seeds."""
+        plan, effect = self.plan, self._seed_difference(self.plan.primary)[1]
+        if effect is None or effect.error == 0.0:
+            return None
+        power, needed = effect.power(smallest, plan.confidence), n
+        if power < plan.power:
+            clusters = replace(effect, difference=smallest).clusters_needed(plan.power, plan.confidence)
+            needed = None if clusters is None else math.ceil(clusters * n / effect.clusters)
+        detectable = effect.detectable(plan.power, plan.confidence)
+        return Sensitivity(deviation, inflation, smallest, power, detectable, needed)
 
 
 def compare(
@@ -154,14 +272,15 @@ def compare(
     all_scenarios = np.ones(len(pairs.keys), bool)
     arms = (all_scenarios, all_scenarios) if split is None else (split.first, ~split.first)
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
-    primary = _compare_metric(plan, plan.primary, sides, split)
+    contrast = _Contrast(plan, *sides, split)
+    primary = contrast.compare(plan.primary)
     if min(primary.a.n, primary.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b))
     primary = primary.with_winner(plan, primary.evidence.p)
-    others = [_compare_metric(plan, metric, sides, split) for metric in plan.secondary]
-    adjusted_p = significance.holm_adjust([other.evidence.p for other in others])
-    secondary = tuple(other.with_winner(plan, p) for other, p in zip(others, adjusted_p, strict=True))
-    sensitivity = _sensitivity(plan, sides, split)
+    metrics = [contrast.compare(metric) for metric in plan.secondary]
+    adjusted_p = significance.holm_adjust([metric.evidence.p for metric in metrics])
+    secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(metrics, adjusted_p, strict=True))
+    sensitivity = contrast.sensitivity()
     return Comparison(
         plan=plan,
         names=_names(*sides),
@@ -195,125 +314,3 @@ def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, An
             raise UsageError(f"stratum of scenario {missing[1]} is unknown", cure=cure)
         strata = pairing.strata_of([entry_by_key[key] for key in pairs.keys], plan.strata)
     return pairing.assign(pairs.clusters, strata, plan.ratio, plan.seed)
-
-
-def _compare_metric(
-    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
-) -> MetricComparison:
-    """Compare the planners in one metric; the winner is added later."""
-    x, y = (side.values(metric) for side in sides)
-    undefined_a, undefined_b = (
-        int((np.isnan(values) & side.arm).sum()) for values, side in zip((x, y), sides, strict=True)
-    )
-    included = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
-    x, y = np.where(included, x, np.nan), np.where(included, y, np.nan)
-    a, b = (side.interval(plan, metric, included) for side in sides)
-    difference, evidence = _test_difference(plan, metric, sides, split, x, y)
-    column = sides[0].tables[0].metric(metric)
-    return MetricComparison(
-        metric=metric,
-        unit="" if column is None else column.unit,
-        better="-" if column is None else column.better,
-        a=a,
-        b=b,
-        difference=difference,
-        effects={"d": effects.cohens_d(x, y)} if split else asdict(effects.cohens_d_paired(x, y)),
-        evidence=evidence,
-        p_adjusted=None,
-        winner=None,
-        seeds=max(len(side.tables) for side in sides),
-        undefined_a=undefined_a,
-        undefined_b=undefined_b,
-    )
-
-
-def _test_difference(
-    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None, x: Values, y: Values
-) -> tuple[Interval, SignificanceResult]:
-    """Return the difference of the means, and its significance test."""
-    clusters = sides[0].pairs.clusters
-    resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
-    if split is not None:
-        values = np.where(split.first, x, y)
-        return (
-            split_bootstrap(values, split.first, clusters, strata=split.strata, **resampling),
-            significance.split_permutation(
-                values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
-            ),
-        )
-    if max(len(side.tables) for side in sides) == 1:
-        difference = paired_bootstrap(x, y, clusters, **resampling)
-        return difference, _paired_test(plan, metric, x, y, clusters)
-    difference, effect = _seed_difference(plan, metric, sides)
-    p, units = (None, 0) if effect is None else (effect.p, effect.clusters)
-    return difference, SignificanceResult("t", p, units, exact=False)
-
-
-def _seed_difference(
-    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
-) -> tuple[Interval, CrossedEffect | None]:
-    """Return the difference with an interval over seeds and recordings, and its crossed effect."""
-    x, y = (side.by_seed(metric) for side in sides)
-    return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
-
-
-def _paired_test(
-    plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
-) -> SignificanceResult:
-    """Apply McNemar's test to rates in independent pairs, otherwise the plan's test of means by recording."""
-    _, labels = drop_undefined(x, clusters)
-    independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
-    values = np.concatenate((x, y))
-    if metric in RATES and independent and np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
-        return significance.mcnemar_test(x, y)
-    permutation = plan.test == "permutation"
-    test = significance.paired_permutation if permutation else significance.paired_bootstrap_test
-    return test(x, y, clusters, plan.resamples, seed=plan.seed)
-
-
-def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split | None) -> Sensitivity | None:
-    """Return the sensitivity of the comparison in the primary metric; None if the metric does not vary."""
-    x, y = (side.values(plan.primary) for side in sides)
-    if split is None:
-        deviations, labels = drop_undefined(x - y, sides[0].pairs.clusters)
-        share, deviation = None, float(deviations.std(ddof=1)) if deviations.size > 1 else 0.0
-    else:
-        residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
-        deviations, labels = drop_undefined(residuals, sides[0].pairs.clusters)
-        defined_a, defined_b = x[~np.isnan(x)], y[~np.isnan(y)]
-        share = defined_a.size / deviations.size
-        deviation = effects.pooled_deviation(defined_a, defined_b) if deviations.size > 2 else 0.0
-    if deviations.size < 2:
-        return None
-    inflation = design_effect(deviations, labels)
-    smallest = plan.smallest_difference or _SMALL_EFFECT * deviation
-    if max(len(side.tables) for side in sides) > 1:
-        crossed_effect = _seed_difference(plan, plan.primary, sides)[1]
-        return _seed_sensitivity(plan, crossed_effect, deviations.size, deviation, inflation, smallest)
-    if deviation <= effects.ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
-        return None
-    effect, effective_n = smallest / deviation, deviations.size / inflation
-    detectable_d = effects.detectable_effect(effective_n, plan.power, plan.confidence, share)
-    return Sensitivity(
-        deviation=deviation,
-        design_effect=inflation,
-        smallest=smallest,
-        power=effects.power(effect, effective_n, plan.confidence, share),
-        detectable=None if detectable_d is None else detectable_d * deviation,
-        needed=math.ceil(inflation * effects.scenarios_needed(effect, plan.power, plan.confidence, share)),
-    )
-
-
-def _seed_sensitivity(
-    plan: ComparisonPlan, effect: CrossedEffect | None, n: int, deviation: float, inflation: float,
-    smallest: float,
-) -> Sensitivity | None:  # fmt: skip
-    """Return the sensitivity of a comparison over seeds; more scenarios do not reduce the variance of seeds."""
-    if effect is None or effect.error == 0.0:
-        return None
-    power, needed = effect.power(smallest, plan.confidence), n
-    if power < plan.power:
-        clusters = replace(effect, difference=smallest).clusters_needed(plan.power, plan.confidence)
-        needed = None if clusters is None else math.ceil(clusters * n / effect.clusters)
-    detectable = effect.detectable(plan.power, plan.confidence)
-    return Sensitivity(deviation, inflation, smallest, power, detectable, needed)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -371,15 +371,15 @@ def _common_or_connected(road: Road, lanes_by_corner: Sequence[set[int]]) -> boo
     if set.intersection(*lanes_by_corner):
         return True
     front_left, rear_left, rear_right, front_right = lanes_by_corner
-    before_left, before_right = (
-        lanes.union(*(road.objects[index].predecessors for index in lanes))
-        for lanes in (front_left, front_right)
-    )
-    after_left, after_right = (
-        lanes.union(*(road.objects[index].successors for index in lanes)) for lanes in (rear_left, rear_right)
-    )
+    before_left, before_right = (_extend(road, lanes, "predecessors") for lanes in (front_left, front_right))
+    after_left, after_right = (_extend(road, lanes, "successors") for lanes in (rear_left, rear_right))
     rears = rear_left & after_right or rear_right & after_left
     return bool(rears and before_left & after_right & before_right & after_left)
+
+
+def _extend(road: Road, lanes: set[int], links: Literal["successors", "predecessors"]) -> set[int]:
+    """Return lanes and those that they are linked to."""
+    return lanes.union(*(getattr(road.objects[index], links) for index in lanes))
 
 
 def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"]) -> tuple[Collision, ...]:
@@ -477,18 +477,12 @@ def _route(road: Road, points: Points) -> list[list[int]]:
         if not current:
             current = sorted(_current_objects(road, inside))
             on_connector = bool(current) and road.objects[current[0]].connector
+            may_stay = on_connector or (not current and in_intersection[sample])
             last = route[-1] if sample > 1 else []
-            if (
-                last
-                and road.objects[last[0]].connector
-                and (on_connector or (not current and in_intersection[sample]))
-            ):
+            if last and road.objects[last[0]].connector and may_stay:
                 point = shapely.points(points[sample])
-                nearby = [
-                    index
-                    for index in last
-                    if shapely.distance(road.objects[index].polygon, point) < _MAX_EXIT_M
-                ]
+                distances = [shapely.distance(road.objects[index].polygon, point) for index in last]
+                nearby = [i for i, distance in zip(last, distances, strict=True) if distance < _MAX_EXIT_M]
                 current = nearby or current
         route.append(current)
     return _drop_extra_connectors(road, route)
@@ -552,12 +546,8 @@ def _block_progress(road: Road, blocks: Sequence[tuple[int, Any]], points: Point
         while candidate < len(blocks) and not shapely.contains_xy(road.blocks[blocks[candidate][0]], x, y):
             candidate += 1
             if current + 1 < candidate < len(blocks):
-                previous, skipped_line, next_line = (
-                    line for _, line in blocks[candidate - 2 : candidate + 1]
-                )
-                skipped_m += _locate(skipped_line, _end(next_line, 0)) - _locate(
-                    skipped_line, _end(previous, -1)
-                )
+                (_, previous), (_, line), (_, following) = blocks[candidate - 2 : candidate + 1]
+                skipped_m += _locate(line, _end(following, 0)) - _locate(line, _end(previous, -1))
         if candidate == len(blocks):
             continue
         line, last_line = blocks[candidate][1], blocks[current][1]
@@ -591,10 +581,9 @@ def _speed_compliance(road: Road, route: Sequence[Sequence[int]], speed: Float64
     for sample, objects in enumerate(route):
         lanes = [road.objects[index] for index in objects]
         if lanes and lanes[0].connector:
-            lanes = [
-                road.objects[index] for lane in lanes for index in (*lane.successors, *lane.predecessors)
-            ]
-        limits = [lane.limit_mps for lane in lanes]
+            indices = (index for lane in lanes for index in (*lane.successors, *lane.predecessors))
+            lanes = [road.objects[index] for index in indices]
+        limits = [lane.limit_mps or 0.0 for lane in lanes]
         if limits and all(limits):
-            speeding[sample] = max(0.0, speed[sample] - max(limit for limit in limits if limit))
+            speeding[sample] = max(0.0, speed[sample] - max(limits))
     return max(0.0, 1.0 - speeding.sum() / (_OVERSPEED_MPS * max(len(speed) - 1, 1)))

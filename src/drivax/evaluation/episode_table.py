@@ -23,25 +23,26 @@ from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
-from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, existing
+from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, require_file
 
 #: Key columns of ``episodes.csv``, before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
-#: Columns that an evaluation adds to the metrics.
 _CRASHED = "the planner raised an error, or its action was not finite: a failed episode"
 _ACTION_JERK = "standard deviation of the change of the action from step to step; 0.82 for random actions"
+#: Columns that an evaluation adds to the metrics.
 ADDED = {
     "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
 }  # fmt: skip
-_COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
+#: All columns of an evaluation but user-defined metrics.
+COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
 #: Columns of zeros and ones, which have Wilson intervals.
-RATES = names_of(_COLUMNS, "rate")
+RATES = names_of(COLUMNS, "rate")
 #: Columns with values between 0 and 1.
-SHARES = names_of(_COLUMNS, "rate", "score")
+SHARES = names_of(COLUMNS, "rate", "score")
 #: Columns without a mean.
-NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
+NOT_SUMMARISED = tuple(name for name, column in COLUMNS.items() if not column.summarised)
 #: Columns that are 0 if the planner crashed.
-FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
+FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
 #: Largest trajectories: bytes of all, and more per episode than any capacity takes.
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
@@ -116,10 +117,8 @@ class EpisodeTable:
         """
         run = RunFolder.open(path)
         if run.kind != "evaluation":
-            cure = "give a folder written by drivax evaluate"
-            raise DataError(
-                f"run is of kind {run.kind!r}, not evaluation", file=run.path / "run.json", cure=cure
-            )
+            problem, file = f"run is of kind {run.kind!r}, not evaluation", run.path / "run.json"
+            raise DataError(problem, file=file, cure="give a folder written by drivax evaluate")
         keys, metrics = _read_columns(run.path / "episodes.csv")
         crashes = _read_crashes(run.path / "crashes.json")
         for file in (CONFIG_FILE, "summary.json"):
@@ -160,9 +159,7 @@ class EpisodeTable:
     def data(self) -> Mapping[str, Any]:
         """Path, hash and name of the scenario set, if known."""
         data = self.info.get("data") or {}
-        if isinstance(data, list):
-            return data[0] if data else {}
-        return data if isinstance(data, dict) else {}
+        return data[0] if isinstance(data, list) else data
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:
@@ -200,7 +197,7 @@ class EpisodeTable:
 
     def metric(self, name: str) -> Column | None:
         """Return the description of a metric, or None if it is unknown."""
-        return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
+        return COLUMNS.get(name) or self.own_metrics.get(name)
 
     def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
         """Return the mean of a metric over the defined episodes of each scenario; NaN if there are none."""
@@ -301,7 +298,7 @@ def _cell(value: Any) -> str:
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    text = read_text(existing(path, _RERUN), _RERUN)
+    text = read_text(require_file(path, _RERUN), _RERUN)
     with explain_damage(path, _RERUN, "cannot be read"):
         rows = csv_rows(text)
     header = rows[0] if rows else []
@@ -343,9 +340,8 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
         return ()
     rows = read_json(path, _RERUN)
     with explain_damage(path, _RERUN, "cannot be read"):
-        return tuple(
-            Crash(row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows
-        )
+        crashes = ((row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows)
+        return tuple(Crash(*crash) for crash in crashes)
 
 
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
@@ -369,9 +365,8 @@ def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: boo
     if rows == list(range(len(ids))):
         return Trajectories(ego, action, start, events, others)
     events = {name: steps[rows] for name, steps in events.items()}
-    return Trajectories(
-        ego[rows], action[rows], start[rows], events, None if others is None else others[rows]
-    )
+    others = None if others is None else others[rows]
+    return Trajectories(ego[rows], action[rows], start[rows], events, others)
 
 
 def _has_consistent_shapes(

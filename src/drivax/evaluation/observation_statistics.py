@@ -39,15 +39,15 @@ Values = np.ndarray[Any, Any]
 class SampledStates:
     """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
-    ``hit`` marks states after ego's first collision, ``collides`` episodes with a collision, ``[episode]``. The last
-    state of a short log is repeated after its end.
+    ``has_collided`` marks states after ego's first collision, ``collides`` episodes with a collision, ``[episode]``.
+    The last state of a short log is repeated after its end.
     """
 
     state: SimState
     carry: Any
     key: Array
     observation: dict[str, Array]
-    hit: Bool[Array, "*batch sample"]
+    has_collided: Bool[Array, "*batch sample"]
     collides: Bool[Array, "*batch"]
 
 
@@ -138,7 +138,7 @@ def observation_statistics(
     simulator, bank = Simulator(evaluation_task(task), traffic), prepare_bank(traffic, bank)
     samples = sample_states(simulator, planner, bank, every, seed)
     observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
-    hit, collides = np.asarray(samples.hit), np.asarray(samples.collides)
+    has_collided, collides = np.asarray(samples.has_collided), np.asarray(samples.collides)
     context = samples.state.context
     in_log = np.asarray(context.step < bank.last_step[context.row])
     columns, groups, permuted = {}, {}, 0
@@ -149,7 +149,7 @@ def observation_statistics(
         columns, groups = _planner_importances(simulator, planner, bank, samples, indices, seed)
         permuted = len(indices)
     observations = _mask_after_log(observations, in_log)
-    features = column_statistics(task.observation.features, observations, hit, collides, columns)
+    features = column_statistics(task.observation.features, observations, has_collided, collides, columns)
     return ObservationStatistics(
         planner.name, len(collides), int(collides.sum()), int(in_log.sum()), permuted, features, groups
     )
@@ -161,7 +161,7 @@ def _planner_importances(
     """Return the :func:`importances` for a planner in the sampled states with the given flat indices."""
 
     def select(leaf: Array) -> Array:
-        return leaf.reshape(samples.hit.size, *leaf.shape[2:])[indices]
+        return leaf.reshape(samples.has_collided.size, *leaf.shape[2:])[indices]
 
     states = (samples.state, samples.carry, samples.key, samples.observation)
     *planner_inputs, observation = jax.tree.map(select, states)
@@ -181,13 +181,13 @@ def _mask_after_log(observation: Mapping[str, Values], in_log: Values) -> dict[s
 
 
 def column_statistics(
-    features: Features, observation: Mapping[str, Values], hit: Values, collides: Values,
+    features: Features, observation: Mapping[str, Values], has_collided: Values, collides: Values,
     importance: Mapping[tuple[str, int], float],
 ) -> tuple[FeatureStatistics, ...]:  # fmt: skip
     """Return the statistics of every column of observations ``[episode, sample, ...]``, ordered by group.
 
-    ``hit`` and ``collides`` are those of :class:`SampledStates`; ``importance`` maps group and column number to the
-    permutation importance.
+    ``has_collided`` and ``collides`` are those of :class:`SampledStates`; ``importance`` maps group and column number
+    to the permutation importance.
     """
     names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
     statistics = []
@@ -195,7 +195,8 @@ def column_statistics(
         for column, name in enumerate(columns):
             values = observation[group][..., column]
             valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
-            before_collision = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
+            dimensions = (*has_collided.shape, *(1,) * (valid.ndim - has_collided.ndim))
+            before_collision = valid & ~has_collided.reshape(dimensions)
             correlation = collision_correlation(values, before_collision, collides)
             change = importance.get((group, column), math.nan)
             statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, change))
@@ -234,22 +235,22 @@ def _episode(
     keys = jax.random.split(key, steps)
 
     def step(loop_state: Any, key: Array) -> tuple[Any, None]:
-        state, carry, hit = loop_state
+        state, carry, has_collided = loop_state
         is_over = state.context.step >= bank.last_step[state.context.row]
         next_state, carry, _ = advance(simulator, planner, bank, state, carry, key)
         state = jax.tree.map(partial(jnp.where, is_over), state, next_state)
-        return (state, carry, hit | state.facts.collision), None
+        return (state, carry, has_collided | state.facts.collision), None
 
     def sample(loop_state: Any, keys: Array) -> tuple[Any, Any]:
-        state, carry, hit = loop_state
-        samples = state, carry, keys[0], dict(simulator.observe(bank, state.context)), hit
+        state, carry, has_collided = loop_state
+        samples = state, carry, keys[0], dict(simulator.observe(bank, state.context)), has_collided
         return jax.lax.scan(step, loop_state, keys)[0], samples
 
     sampled_steps = steps - steps % every
     initial = (state, carry, state.facts.collision)
     loop_state, samples = jax.lax.scan(sample, initial, keys[:sampled_steps].reshape(-1, every))
-    (_, _, hit), _ = jax.lax.scan(step, loop_state, keys[sampled_steps:])
-    return SampledStates(*samples, collides=hit)
+    (_, _, collides), _ = jax.lax.scan(step, loop_state, keys[sampled_steps:])
+    return SampledStates(*samples, collides=collides)
 
 
 @partial(jax.jit, static_argnames=("simulator",))
@@ -316,20 +317,16 @@ def importances(
     def change(permuted_groups: dict[str, Values]) -> float:
         if not varies.any():
             return math.nan
-        shift = (np.asarray(act(dict(observation) | permuted_groups), np.float64) - actions)[:, varies] / std[
-            varies
-        ]
-        return float(np.sqrt(np.mean(shift**2)))
+        shift = np.asarray(act(dict(observation) | permuted_groups), np.float64) - actions
+        return float(np.sqrt(np.mean((shift[:, varies] / std[varies]) ** 2)))
 
     columns, groups = {}, {}
     for group, values in observation.items():
         mask_name = f"{group}_mask"
         if group.removesuffix("_mask") in observation and group.endswith("_mask"):
             continue
-        order = rng.permutation(len(values))
-        groups[group] = change(
-            {name: observation[name][order] for name in (group, mask_name) if name in observation}
-        )
+        order, names = rng.permutation(len(values)), (group, mask_name)
+        groups[group] = change({name: observation[name][order] for name in names if name in observation})
         valid = observation.get(mask_name, np.ones(values.shape[:-1], bool))
         for column in range(values.shape[-1]):
             permuted = np.array(values)

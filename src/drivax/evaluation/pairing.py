@@ -83,8 +83,7 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         if len(planners) > 1:
             problem = f"contains evaluations of several planners ({', '.join(sorted(planners.values()))})"
             folder = side[0].folder
-            file = None if folder is None else folder.parent
-            raise UsageError(problem, file=file, cure=f"name one of them, as {folder}")
+            raise UsageError(problem, file=folder and folder.parent, cure=f"name one of them, as {folder}")
     for table in tables[1:]:
         if problem := mismatch(tables[0], table):
             names = [run.folder or run.name for run in (tables[0], table)]
@@ -146,10 +145,10 @@ def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list
     Raises:
         UsageError: A tag does not occur in any scenario.
     """
-    known = dict.fromkeys(name for entry in entries for name in entry["tags"])
+    names = dict.fromkeys(name for entry in entries for name in entry["tags"])
     for tag in tags:
-        if tag not in known:
-            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, list(known)))
+        if tag not in names:
+            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, names))
     return [" ".join(str(entry["tags"].get(tag, "unknown")) for tag in tags) for entry in entries]
 
 

@@ -59,9 +59,8 @@ class ComparisonPlan:
             if not 0 < value < 1:
                 raise UsageError(f"{name} is {value}", cure="use a number between 0 and 1")
         if self.minimum_scenarios < 2 or self.resamples < 100:
-            raise UsageError(
-                "too few scenarios or resamples", cure="use 2 scenarios and 100 resamples or more"
-            )
+            cure = "use 2 scenarios and 100 resamples or more"
+            raise UsageError("too few scenarios or resamples", cure=cure)
         if self.smallest_difference is not None and not self.smallest_difference > 0:
             raise UsageError("the smallest difference that matters is above 0", cure="give its size, or null")
         if len(set(self.secondary)) < len(self.secondary):

@@ -67,11 +67,8 @@ class ProfileRow:
     @property
     def differing(self) -> tuple[str, ...]:
         """Terms that differ, except the score."""
-        return tuple(
-            name
-            for name in TERMS
-            if name != "score" and abs(self.ours[name] - self.devkit[name]) > _TOLERANCE
-        )
+        names = [name for name in TERMS if name != "score"]
+        return tuple(name for name in names if abs(self.ours[name] - self.devkit[name]) > _TOLERANCE)
 
 
 def devkit_rows(
@@ -91,11 +88,9 @@ def devkit_rows(
     Raises:
         DataError: The table lacks a metric that the devkit's terms are compared with.
     """
-    missing = [metric for metric in TERMS.values() if metric not in table.metrics]
-    if missing:
-        raise DataError(
-            f"lacks the metric {missing[0]!r}", file=table.folder, cure="run drivax evaluate again"
-        )
+    if missing := [metric for metric in TERMS.values() if metric not in table.metrics]:
+        cure = "run drivax evaluate again"
+        raise DataError(f"lacks the metric {missing[0]!r}", file=table.folder, cure=cure)
     indices = {(entry["dataset"], entry["scenario_id"]): index for index, entry in enumerate(data.entries)}
     sizes, crashes, result = Sizes.used(data), table.crash_by_scenario, []
     for number, key in enumerate(table.scenarios):
@@ -119,14 +114,11 @@ def devkit_episode(scenario: Scenario, trajectories: Trajectories, row: int, siz
         row: Row of the episode.
         sizes: Sizes of the set's banks.
     """
-    start = int(trajectories.start[row])
-    steps = slice(start, int(scenario.steps))
-    ego = _ego(scenario, trajectories.ego[row, : steps.stop - start].astype(np.float64), start)
-    valid = scenario.agent_valid[steps, 0]
-    expert = scenario.agent_xy[steps, 0][valid].astype(np.float64)
-    others = (
-        None if trajectories.others is None else unpack_poses(trajectories.others[row, : steps.stop - start])
-    )
+    start, last = int(trajectories.start[row]), int(scenario.steps)
+    steps, count = slice(start, last), last - start
+    ego = _ego(scenario, trajectories.ego[row, :count].astype(np.float64), start)
+    expert = scenario.agent_xy[steps, 0][scenario.agent_valid[steps, 0]].astype(np.float64)
+    others = None if trajectories.others is None else unpack_poses(trajectories.others[row, :count])
     return devkit_verdict(ego, _tracks(scenario, steps, others), _road(scenario, steps, sizes), expert)
 
 
@@ -285,15 +277,10 @@ def _objects(scenario: Scenario) -> list[RoadObject]:
         line: Any = shapely.linestrings(points) if len(points) else shapely.LineString()
         width, limit = float(scenario.lane_width[index]), float(scenario.lane_limit[index])
         half_width = (width if width > 0 else DEFAULT_LANE_WIDTH_M) / 2
-        links = (scenario.lane_successor[index], scenario.lane_predecessor[index])
-        successors, predecessors = (
-            tuple(lane for lane in lanes.tolist() if 0 <= lane < len(lines)) for lanes in links
-        )
-        objects.append(
-            RoadObject(
-                polygon=line.buffer(half_width, cap_style="flat"), line=line, block=blocks[index],
-                limit_mps=limit if limit > 0 else None, connector=bool(scenario.lane_interpolating[index]),
-                successors=successors, predecessors=predecessors,
-            )
-        )  # fmt: skip
+        links = (table[index].tolist() for table in (scenario.lane_successor, scenario.lane_predecessor))
+        successors, predecessors = (tuple(i for i in lanes if 0 <= i < len(lines)) for lanes in links)
+        polygon, limit_mps = line.buffer(half_width, cap_style="flat"), limit if limit > 0 else None
+        connector = bool(scenario.lane_interpolating[index])
+        lane = RoadObject(polygon, line, blocks[index], limit_mps, connector, successors, predecessors)
+        objects.append(lane)
     return objects

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import UsageError
-from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
+from drivax.evaluation.episode_table import COLUMNS, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
 from drivax.evaluation.pairing import Pairs, mismatch
 from drivax.metrics.catalogue import METRICS, headline
 from drivax.scenario.select.tags import TAGS
@@ -70,7 +69,7 @@ class MetricLabel:
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
     """Return the label of a metric; ``runs`` contain the descriptions of user-defined metrics."""
     own_columns = (run.own_metrics[name] for run in runs if name in run.own_metrics)
-    metric = METRICS.get(name) or ADDED.get(name) or next(own_columns, None)
+    metric = COLUMNS.get(name) or next(own_columns, None)
     if metric is None:
         return MetricLabel(name.replace("_", " "), "-", "", "")
     text = metric.label or name.replace("_", " ")
@@ -93,7 +92,7 @@ def headline_names(names: Sequence[str]) -> list[str]:
 
 def sort_metrics(names: Sequence[str]) -> list[str]:
     """Sort metrics in the order of their definition, with unknown ones last, and drop codes."""
-    rank = {name: index for index, name in enumerate((*METRICS, *ADDED))}
+    rank = {name: index for index, name in enumerate(COLUMNS)}
     return sorted((name for name in names if name not in CODES), key=lambda name: rank.get(name, len(rank)))
 
 
@@ -112,17 +111,6 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     pairs = Pairs.of(run, other)
     values, others = pairs.values(run, metric), pairs.values(other, metric)
     return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
-
-
-def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """Return :func:`paired_difference` of two evaluations of one set.
-
-    Raises:
-        UsageError: The evaluations have different scenarios.
-    """
-    if set(results.scenarios) != set(other.scenarios):
-        raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
-    return paired_difference(results, other, metric)
 
 
 def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> tuple[Interval, str]:
@@ -148,20 +136,14 @@ def _verdict(interval: Interval, better: str) -> str:
 
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with planners in rows and metrics in columns; the best mean of each column is marked."""
-    means = [[summarise(run, name) for run in runs] for name in metrics]
-    best_means = [
-        _best_mean(column, metric_label(name, runs)) for name, column in zip(metrics, means, strict=True)
-    ]
-    rows = []
-    for index, run in enumerate(runs):
-        label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
-        cells = [
-            _cell(runs, name, column[index], {"run": run.name, "metric": name}, best_mean)
-            for name, column, best_mean in zip(metrics, means, best_means, strict=True)
-        ]
-        rows.append((label, *cells))
+    cells = [[Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic") for run in runs]]
+    for name in metrics:
+        means = [summarise(run, name) for run in runs]
+        best_mean = _best_mean(means, metric_label(name, runs))
+        links = ({"run": run.name, "metric": name} for run in runs)
+        cells.append([_cell(runs, name, *pair, best_mean) for pair in zip(means, links, strict=True)])
     columns = (Column("planner", label=True), *_metric_columns(metrics, runs))
-    return Table("planners", columns, tuple(rows))
+    return Table("planners", columns, tuple(zip(*cells, strict=True)))
 
 
 def _best_mean(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
@@ -256,15 +238,13 @@ def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Se
     Scenarios without the tag have the value ``unknown``. A tag with several words (``scenario_types``) counts in the
     row of each word.
     """
-    words = {
-        run.name: [tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs
-    }
+    words = [[tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs]
     rank = {value: index for index, value in enumerate(TAGS.get(tag, ()))}
-    values = {value for episodes in words.values() for episode in episodes for value in episode}
+    values = {value for words_of_run in words for episode in words_of_run for value in episode}
     rows = []
     for value in sorted(values, key=lambda value: (rank.get(value, len(rank)), value)):
-        for run in runs:
-            episodes = np.flatnonzero([value in episode for episode in words[run.name]])
+        for run, words_of_run in zip(runs, words, strict=True):
+            episodes = np.flatnonzero([value in episode for episode in words_of_run])
             if episodes.size:
                 link = {"run": run.name, "tags": {tag: value}}
                 means = ((name, summarise(run, name, episodes)) for name in metrics)
@@ -331,8 +311,8 @@ def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
         cells.setdefault(labels, {})[set_name] = _cell(runs, metric, summarise(run, metric), link)
     sets = tuple(dict.fromkeys(evaluation_sets))
     rows = tuple(
-        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in sets))
-        for labels, row in cells.items()
+        (*map(Cell, labels), *(cell_of_set.get(name, Cell(style="undefined")) for name in sets))
+        for labels, cell_of_set in cells.items()
     )
     headings = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
     columns = (*headings, *(Column(name, name) for name in sets))

@@ -139,10 +139,9 @@ def _step(
     after, carry, is_finite = advance(simulator, planner, bank, state, loop.carry, key)
     state = jax.tree.map(partial(jnp.where, is_over), state, after)
     all_finite = loop.all_finite & (is_finite | is_over)
-    metric_state = loop.metric_state
-    metric_state = (
-        state if planner.replays else jax.tree.map(partial(jnp.where, all_finite), state, metric_state)
-    )
+    metric_state = state
+    if not planner.replays:
+        metric_state = jax.tree.map(partial(jnp.where, all_finite), state, loop.metric_state)
     context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
     others = _others(simulator.traffic, bank, state)
     output = _StepOutput(context.history[-1], context.action, offroad, all_finite, others)

@@ -45,7 +45,7 @@ from drivax.simulator.types import Traffic
 from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
-from drivax.tracking.run_folder import RunFolder, learned_from
+from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
 #: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
@@ -133,8 +133,8 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
-    if trained := learned_from(config.planner):
-        info["trained_on"] = trained
+    if training_sets := policy_training_sets(config.planner):
+        info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
@@ -184,10 +184,8 @@ def format_crashes(table: EpisodeTable) -> str:
         return ""
     count = len(table.crashes)
     lines = [f"{table.planner} crashed in {count} of {len(table)} episodes, which count as failed:"]
-    lines += [
-        escape_controls(f"  {crash.scenario_id}, step {crash.step}: {crash.error}")
-        for crash in table.crashes[:_MAX_LISTED]
-    ]
+    for crash in table.crashes[:_MAX_LISTED]:
+        lines.append(escape_controls(f"  {crash.scenario_id}, step {crash.step}: {crash.error}"))
     if count > _MAX_LISTED:
         lines.append(f"  and {count - _MAX_LISTED} more, in crashes.json")
     return "\n".join(lines)
@@ -363,8 +361,11 @@ class _Evaluation:
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
         info: dict[str, Any] = {"planner": planner, "traffic": traffic}
-        if own_metrics := self._own_metrics():
-            info["own_metrics"] = own_metrics
+        if user_metrics := {name: metric for name, metric in self.metrics.items() if name not in METRICS}:
+            info["own_metrics"] = {
+                name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
+                for name, metric in user_metrics.items()
+            }
         return EpisodeTable(
             folder=None,
             name=planner,
@@ -381,20 +382,10 @@ class _Evaluation:
             ),
         )
 
-    def _own_metrics(self) -> dict[str, dict[str, str]]:
-        user_metrics = {name: metric for name, metric in self.metrics.items() if name not in METRICS}
-        return {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
-            for name, metric in user_metrics.items()
-        }
-
 
 def _crashes(
-    crash_step: Int[np.ndarray, " episode"],
-    names: Names,
-    identity: Any,
-    errors: Mapping[tuple[int, int], str],
-) -> tuple[Crash, ...]:
+    crash_step: Int[np.ndarray, " episode"], names: Names, identity: Any, errors: Mapping[tuple[int, int], str]
+) -> tuple[Crash, ...]:  # fmt: skip
     crashes = []
     for row in np.flatnonzero(crash_step >= 0).tolist():
         step = int(crash_step[row])

@@ -32,7 +32,7 @@ from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, trained_on
+from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, training_sets
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
@@ -496,7 +496,7 @@ class PretrainedRun:
             step = Checkpoints(folder.checkpoints).best_or_newest()
         if step is None:
             raise DataError("has no checkpoint", file=run, cure="name a run that wrote one")
-        return cls(Path(run), step, trained_on(folder.info))
+        return cls(Path(run), step, training_sets(folder.info))
 
     def __str__(self) -> str:
         return f"{self.run}@{self.step}"

@@ -22,7 +22,7 @@ from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
-from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, trained_on
+from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, training_sets
 
 #: What an exported policy has instead of checkpoints.
 POLICY_FILE = "policy.npz"
@@ -105,7 +105,7 @@ def export_policy(
     step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step, trust=trust)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
-    data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
+    data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in training_sets(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drivax.errors import DataError, UsageError, did_you_mean
+from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
 from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
-from drivax.settings.trust import check_names, modules_of
 
-__all__ = ["dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
+__all__ = ["check_names", "dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
 
 Record = TypeVar("Record")
 
@@ -103,7 +103,10 @@ def _read_settings(file: Path, extensions: tuple[Path, ...] = (), extends: bool 
 
     ``extensions`` are the files that extend this one, from the first one that was read.
     """
-    values = parse_yaml(_read(file), file)
+    try:
+        values = parse_yaml(read_text(file, "name a YAML file"), file)
+    except DataError as error:
+        raise UsageError(error.problem, file=file, cure=error.cure) from error
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
@@ -118,13 +121,13 @@ def _read_settings(file: Path, extensions: tuple[Path, ...] = (), extends: bool 
 
 def _find_base(file: Path, name: Any) -> Path:
     """Return the preset, or the file relative to ``file``, that ``file`` extends."""
-    name = str(name)
+    name, names = str(name), presets()
     is_file = Path(name).suffix in (".yaml", ".yml")
     if is_file and (file.parent / name).is_file():
         return file.parent / name
-    if not is_file and name in presets():
+    if not is_file and name in names:
         return preset(name)
-    cure = "name a file relative to this one" if is_file else did_you_mean(name, presets())
+    cure = "name a file relative to this one" if is_file else did_you_mean(name, names)
     raise UsageError(f"extends {name!r}, which is not found", file=file, cure=cure)
 
 
@@ -135,13 +138,6 @@ def _merge(base: Any, values: Any) -> Any:
     if any(name in values and values[name] != base.get(name) for name in ("kind", "preset")):
         return values
     return base | {name: _merge(base.get(name), value) for name, value in values.items()}
-
-
-def _read(file: Path) -> str:
-    try:
-        return read_text(file, "name a YAML file")
-    except DataError as error:
-        raise UsageError(error.problem, file=file, cure=error.cure) from error
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -162,8 +158,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
 
 def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
     """Return the path of keys and the text of each flag, ``true`` for a flag without a value."""
-    pairs = []
-    arguments = list(overrides)
+    pairs, arguments = [], list(overrides)
     while arguments:
         flag = arguments.pop(0)
         if not flag.startswith("--") or flag == "--":
@@ -178,3 +173,37 @@ def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
 def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
     """Copy nested mappings, so that overrides leave those of the caller alone."""
     return {key: _copy(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+
+
+def check_names(values: Any, trust: Collection[str], file: Path | None = None) -> None:
+    """Check the names in plain values of a file before one of them is used; those of flags are the user's.
+
+    Raises:
+        UsageError: A name leads to a module that is not trusted, or to something that is no component.
+    """
+    names = sorted(_names(values))
+    if foreign := [name for name in names if not is_trusted(name, trust)]:
+        raise UsageError(f"names code, {', '.join(foreign)}", file=file, cure=trust_cure(foreign))
+    for name in names:
+        try:
+            find_named(name, trust)
+        except UsageError as error:
+            raise UsageError(error.problem, file=file, cure=error.cure) from error
+
+
+def modules_of(record: Any) -> list[str]:
+    """Return the modules outside drivax whose code a configuration names."""
+    return sorted({name.partition(":")[0] for name in _names(plain(record)) if not is_trusted(name, ())})
+
+
+def _names(values: Any) -> set[str]:
+    """Return the dotted names in nested values, keys included, except those of flags."""
+    stack, names, visited = [values], set[str](), set[int]()
+    while stack:
+        value = stack.pop()
+        if is_dotted(value) and not isinstance(value, Flag):
+            names.add(value)
+        elif isinstance(value, Mapping | list | tuple) and id(value) not in visited:
+            visited.add(id(value))  # YAML may repeat a list by aliases.
+            stack += (*value, *value.values()) if isinstance(value, Mapping) else value
+    return names

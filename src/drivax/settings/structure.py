@@ -96,8 +96,8 @@ def _to_scalar(value: Any, cls: Any) -> Any:
     result = _parse_flag(value)
     if cls is int and isinstance(result, float) and result.is_integer():
         result = int(result)  # steps: 25e6
-    types, name = _SCALARS[cls]
-    if isinstance(result, bool) != (cls is bool) or not isinstance(result, types):
+    accepts, name = _SCALARS[cls]
+    if isinstance(result, bool) != (cls is bool) or not isinstance(result, accepts):
         raise _refusal(value, name)
     return float(result) if cls is float else result
 
@@ -191,12 +191,11 @@ def _to_user_object(value: Any, cls: Any) -> Any:
     value = _parse_flag(value)
     name = _kind(value)
     if not isinstance(name, str):
-        expected = "a dotted name (package.module:name) nor a section with such a kind"
-        raise ValueError(f"{value!r} is neither {expected}")
+        forms = "a dotted name (package.module:name) nor a section with such a kind"
+        raise ValueError(f"{value!r} is neither {forms}")
     user_object = find_named(name)
-    options = (
-        {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
-    )
+    items = value.items() if isinstance(value, Mapping) else ()
+    options = {key: item for key, item in items if key != "kind"}
     if options and not _is_record(user_object):
         raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
@@ -307,13 +306,9 @@ def _is_protocol(cls: Any) -> bool:
     return isinstance(cls, type) and bool(getattr(cls, "_is_protocol", False))
 
 
-def _is_callable(cls: Any) -> bool:
-    return cls is Callable or get_origin(cls) is Callable
-
-
 def _accepts_user_objects(cls: Any) -> bool:
     """Return whether a type accepts user-defined objects."""
-    return _is_protocol(cls) or _is_callable(cls)
+    return _is_protocol(cls) or cls is Callable or get_origin(cls) is Callable
 
 
 @functools.cache
@@ -334,8 +329,8 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
     """Return the first problem inside a cattrs error and its dotted path."""
     if isinstance(error, ForbiddenExtraKeysError):
         names = [field.name for field in dataclasses.fields(error.cl)]
-        unknown = sorted(error.extra_fields)[0]
-        return f"unknown setting; {did_you_mean(unknown, names)}", _join(path, unknown)
+        name = min(error.extra_fields)
+        return f"unknown setting; {did_you_mean(name, names)}", _join(path, name)
     if isinstance(error, ClassValidationError | IterableValidationError):
         inner_errors, own_errors = error.group_exceptions()
         if inner_errors:
@@ -388,10 +383,9 @@ def _item_type(annotation: Any, number: int) -> Any:
     """Return the type of an item of a tuple or list."""
     for candidate in (annotation, *_members(annotation)):
         if get_origin(candidate) in (tuple, list):
-            types_of_items = get_args(candidate)
-            if types_of_items[-1] is Ellipsis or len(types_of_items) <= number:
-                return types_of_items[0]
-            return types_of_items[number]
+            item_types = get_args(candidate)
+            all_same = item_types[-1] is Ellipsis or len(item_types) <= number
+            return item_types[0 if all_same else number]
     return Any
 
 

@@ -23,8 +23,8 @@ Strata = Int64[np.ndarray, " cluster"]
 
 def recordings(datasets: Iterable[str], segments: Iterable[str], scenarios: Iterable[str]) -> list[str]:
     """Return the cluster of each scenario: its recording (``segment``), or the scenario itself if that is unknown."""
-    rows = zip(datasets, segments, scenarios, strict=True)
-    return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
+    names = zip(datasets, segments, scenarios, strict=True)
+    return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in names]
 
 
 def recordings_of(entries: Sequence[Mapping[str, Any]]) -> list[str]:

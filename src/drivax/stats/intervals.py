@@ -130,15 +130,14 @@ def bootstrap_mean(
     x, labels = drop_undefined(values, clusters)
     if x.size == 0:
         return UNDEFINED
-    strata_of_clusters = None
     if strata is not None:
         keep = ~np.isnan(as_values(values))
-        strata_of_clusters = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels)
+        strata = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels)
     mean = float(x.mean())
     if labels.max() == 0:
         return Interval(mean, None, None, x.size)
-    means = _resample_means(x, labels, strata_of_clusters, resamples, np.random.default_rng(seed))
-    return Interval(mean, *_percentiles(means, confidence), x.size)
+    means = _resample_means(x, labels, strata, resamples, np.random.default_rng(seed))
+    return Interval(mean, *percentiles(means, confidence), x.size)
 
 
 def split_bootstrap(
@@ -166,11 +165,8 @@ def split_bootstrap(
     n = sum(arm_values.size for arm_values, _, _ in arms)
     if min(labels.max() for _, labels, _ in arms) == 0:
         return Interval(difference, None, None, n)
-    means = [
-        _resample_means(arm_values, labels, arm_strata, resamples, rng)
-        for arm_values, labels, arm_strata in arms
-    ]
-    return Interval(difference, *_percentiles(means[0] - means[1], confidence), n)
+    first_means, second_means = (_resample_means(x, labels, h, resamples, rng) for x, labels, h in arms)
+    return Interval(difference, *percentiles(first_means - second_means, confidence), n)
 
 
 def paired_bootstrap(
@@ -209,7 +205,7 @@ def interquartile_bootstrap(
     for resample in range(resamples):
         cluster_draws, seed_draws = _draw_counts(cluster_count, rng), _draw_counts(seeds, rng)
         means[resample] = _interquartile(seed_draws, sums @ cluster_draws, counts @ cluster_draws)
-    return Interval(mean, *_percentiles(means, confidence), n)
+    return Interval(mean, *percentiles(means, confidence), n)
 
 
 def _seed_totals(
@@ -217,8 +213,8 @@ def _seed_totals(
 ) -> tuple[Float64[np.ndarray, "seed cluster"], Float64[np.ndarray, "seed cluster"]]:
     """Return sum and number of the defined values of each cluster, by seed."""
     count, valid = int(labels.max()) + 1, ~np.isnan(x)
-    sums = [np.bincount(labels, row, count) for row in np.where(valid, x, 0.0)]
-    return np.stack(sums), np.stack([np.bincount(labels, row, count) for row in valid])
+    sums = [np.bincount(labels, seed_values, count) for seed_values in np.where(valid, x, 0.0)]
+    return np.stack(sums), np.stack([np.bincount(labels, mask, count) for mask in valid])
 
 
 def _draw_counts(count: int, rng: np.random.Generator) -> Labels:
@@ -266,8 +262,8 @@ def normal_quantile(confidence: float) -> float:
     return float(special.ndtri((1 + confidence) / 2))
 
 
-def _percentiles(values: Float64[np.ndarray, " resample"], confidence: float) -> tuple[float, float]:
-    """Return the bounds of the central part of the resamples."""
+def percentiles(values: Float64[np.ndarray, " resample"], confidence: float) -> tuple[float, float]:
+    """Return the bounds of the central part of the resamples, without those that are NaN."""
     low, high = np.nanquantile(values, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 

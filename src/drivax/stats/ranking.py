@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm, rankdata
 
 from drivax.errors import UsageError
+from drivax.stats.intervals import percentiles
 
 Numbers = Float[np.ndarray[Any, Any], " n"]
 Labels = Bool[np.ndarray[Any, Any], " n"]
@@ -67,13 +68,8 @@ def bootstrap_intervals(
         draw_counts = np.bincount(draws, minlength=len(names))[cluster]
         by_rank = _weights_by_rank(rank, labels, weights * draw_counts)
         samples.append((_auc(*by_rank), _precision(*by_rank)))
-    low, high = _percentiles(samples, confidence)
-    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
-
-
-def _percentiles(samples: Any, confidence: float) -> np.ndarray[Any, Any]:
-    tail = (1.0 - confidence) / 2
-    return np.quantile(samples, (tail, 1.0 - tail), axis=0)
+    auc, precision = np.array(samples).T
+    return percentiles(auc, confidence), percentiles(precision, confidence)
 
 
 def _ranks(scores: Numbers, labels: Labels) -> Int[np.ndarray[Any, Any], " n"]:
@@ -128,5 +124,4 @@ def correlation_interval(
         samples.append(rank_correlation(first[indices], second[indices]))
     if len(members) < 2 or np.isnan(samples).any():
         return -1.0, 1.0
-    low, high = _percentiles(samples, confidence)
-    return float(low), float(high)
+    return percentiles(np.array(samples), confidence)

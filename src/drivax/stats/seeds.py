@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64
 from scipy import special
 
 from drivax.errors import UsageError
-from drivax.stats.clusters import dense_labels
+from drivax.stats.clusters import Labels, dense_labels
 from drivax.stats.effects import ROUNDING
 from drivax.stats.intervals import Interval, effective_size, wilson
 
@@ -45,8 +45,7 @@ class CrossedEffect:
       totals; Cochran, Sampling Techniques, 1977, section 6.3);
     - for each policy, the interaction of seeds and scenarios, which both variances contain,
       ``e = C / (C - 1) sum(R_kc^2) / (K (K - 1) W^2)`` with totals ``R_kc`` of the residuals of a two-way layout
-          (Owen,
-      Ann. Appl. Stat. 1, 2007).
+      (Owen, Ann. Appl. Stat. 1, 2007).
 
     Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
 
@@ -123,16 +122,14 @@ class CrossedEffect:
         interaction = e_a * share_a, e_b * share_b
         scenarios = max(self.scenarios - sum(self.interaction), 0.0) + sum(interaction)
         seeds, counts = (a * share_a, b * share_b), (number, number)
-        return CrossedEffect(self.difference, seeds, scenarios, counts, self.clusters, interaction)
+        return replace(self, seeds=seeds, scenarios=scenarios, seed_counts=counts, interaction=interaction)
 
     def _with_clusters(self, number: int) -> CrossedEffect:
         """Extrapolate to ``number`` clusters with the same variance."""
         (a, b), (e_a, e_b), share = self.seeds, self.interaction, self.clusters / number
         seeds = max(a - e_a, 0.0) + e_a * share, max(b - e_b, 0.0) + e_b * share
-        interaction = e_a * share, e_b * share
-        return CrossedEffect(
-            self.difference, seeds, self.scenarios * share, self.seed_counts, number, interaction
-        )
+        scenarios, interaction = self.scenarios * share, (e_a * share, e_b * share)
+        return replace(self, seeds=seeds, scenarios=scenarios, clusters=number, interaction=interaction)
 
     def _smallest_number(
         self, extrapolate: Callable[[int], CrossedEffect], present: int, power: float, confidence: float
@@ -221,24 +218,22 @@ def crossed_difference(
     rounding = ROUNDING * max(float(np.abs(policy).max()) for policy in policies)
     difference = np.where(np.abs(difference) <= rounding, 0.0, difference)
     mean = float(difference @ share)
-    scenarios = correction * float(
-        np.square(np.bincount(labels, share * (difference - mean), cluster_count)).sum()
+    totals = np.bincount(labels, share * (difference - mean), cluster_count)
+    scenarios = correction * float(np.square(totals).sum())
+    (seeds_a, e_a), (seeds_b, e_b) = (
+        _seed_variances(policy, share, labels, correction) for policy in policies
     )
-    seeds, interaction = [], []
-    for policy in policies:
-        seed_means, seed_count = policy @ share, len(policy)
-        seeds.append(float(seed_means.var(ddof=1)) / seed_count)
-        residuals = (policy - seed_means[:, None] - policy.mean(axis=0) + seed_means.mean()) * share
-        totals = np.stack([np.bincount(labels, row, cluster_count) for row in residuals])
-        interaction.append(correction * float(np.square(totals).sum()) / (seed_count * (seed_count - 1)))
-    return CrossedEffect(
-        mean,
-        (seeds[0], seeds[1]),
-        scenarios,
-        (len(a), len(b)),
-        cluster_count,
-        (interaction[0], interaction[1]),
-    )
+    counts = len(a), len(b)
+    return CrossedEffect(mean, (seeds_a, seeds_b), scenarios, counts, cluster_count, (e_a, e_b))
+
+
+def _seed_variances(policy: Values, share: Weights, labels: Labels, correction: float) -> tuple[float, float]:
+    """Return the variances from the choice of seeds and of the interaction of one policy."""
+    seed_means, seed_count = policy @ share, len(policy)
+    residuals = (policy - seed_means[:, None] - policy.mean(axis=0) + seed_means.mean()) * share
+    totals = np.stack([np.bincount(labels, residual) for residual in residuals])
+    interaction = correction * float(np.square(totals).sum()) / (seed_count * (seed_count - 1))
+    return float(seed_means.var(ddof=1)) / seed_count, interaction
 
 
 def difference_interval(

@@ -12,7 +12,7 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.result_tables import paired_differences
+from drivax.evaluation.result_tables import paired_difference
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
 from drivax.files import write_json
 from drivax.learning.config import TrainConfig
@@ -154,7 +154,7 @@ def run_demo(
     report = write_report([run, *runs], out / "report.html", overwrite=True)
     policy = results["policy"]
     differences = {
-        name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _METRICS}
+        name: {metric: paired_difference(policy, results[name], metric).as_dict() for metric in _METRICS}
         for name in REFERENCES
     }
     summaries = [result.summary() for result in results.values()]

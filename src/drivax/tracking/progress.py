@@ -18,7 +18,7 @@ class Progress:
     """A context manager that reports progress, rate and remaining time, and prints a summary at the end.
 
     Args:
-        what: Name of the work ("converting").
+        work: Name of the work ("converting").
         unit: Counted unit ("scenarios").
         total: Final count; None if unknown.
         stream: Text file to write to; standard error by default, so that standard output contains only results.
@@ -27,14 +27,13 @@ class Progress:
     """
 
     def __init__(
-        self, what: str, unit: str, total: int | None = None, *, stream: Any = None,
+        self, work: str, unit: str, total: int | None = None, *, stream: Any = None,
         interval_s: float = INTERVAL_S, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        self.what, self.unit, self.total = escape_controls(what), unit, total
+        self.work, self.unit, self.total = escape_controls(work), unit, total
         self.done = 0
         self._stream = sys.stderr if stream is None else stream
-        self._interval_s = interval_s
-        self._clock = clock
+        self._interval_s, self._clock = interval_s, clock
         self._start = self._last = clock()
         self._bar: Any = None
         self._task: Any = None
@@ -78,15 +77,13 @@ class Progress:
         if self.total:
             count = f"{self.done:,} of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
             remaining = f"{duration((self.total - self.done) / rate)} left" if rate > 0 else ""
-        fields = (f"{self.what}: {count}", f"{_format_number(rate)}/s", remaining, note)
+        fields = (f"{self.work}: {count}", f"{_format_number(rate)}/s", remaining, note)
         return ", ".join(field for field in fields if field)
 
     def summary(self) -> str:
         """Return count, duration and rate as one line."""
-        seconds = self._clock() - self._start
-        return (
-            f"{self.what}: {self.done:,} {self.unit} in {duration(seconds)}, {_format_number(self.rate())}/s"
-        )
+        text, rate = duration(self._clock() - self._start), _format_number(self.rate())
+        return f"{self.work}: {self.done:,} {self.unit} in {text}, {rate}/s"
 
     def _print(self, text: str) -> None:
         self._stream.write(text + "\n")
@@ -97,13 +94,11 @@ class Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        description, rate, note = map(
-            partial(TextColumn, markup=False),
-            ("{task.description}", "{task.fields[rate]}", "{task.fields[note]}"),
-        )
+        formats = ("{task.description}", "{task.fields[rate]}", "{task.fields[note]}")
+        description, rate, note = map(partial(TextColumn, markup=False), formats)
         columns = (description, BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), note)
         self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
-        self._task = self._bar.add_task(self.what, total=self.total, rate="", note="")
+        self._task = self._bar.add_task(self.work, total=self.total, rate="", note="")
         self._bar.start()
 
 

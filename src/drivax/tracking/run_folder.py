@@ -100,11 +100,7 @@ class RunFolder:
         if not (path / RUN_FILE).is_file():
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
         present_kind = _kind(path)
-        if (
-            kind is not None
-            and present_kind is not None
-            and (present_kind in _TRAINING_KINDS) != (kind in _TRAINING_KINDS)
-        ):
+        if len({name in _TRAINING_KINDS for name in (kind, present_kind) if name is not None}) > 1:
             problem = f"output folder contains a run of kind {present_kind}, not {kind}"
             raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)
@@ -144,7 +140,7 @@ class RunFolder:
             DataError: ``config.yaml`` is missing or edited.
             UsageError: It does not match ``cls``, or names code that is not trusted.
         """
-        file = existing(self.path / CONFIG_FILE, _RERUN)
+        file = require_file(self.path / CONFIG_FILE, _RERUN)
         return settings.load(cls, file, overrides, trust=trust)
 
     @property
@@ -183,10 +179,10 @@ class RunFolder:
         Raises:
             DataError: The file is missing, or a row is damaged.
         """
-        return list(read_rows(existing(self.metrics, "train again")))
+        return list(read_rows(require_file(self.metrics, "train again")))
 
 
-def existing(path: Path, cure: str) -> Path:
+def require_file(path: Path, cure: str) -> Path:
     """Return the path of a file.
 
     Raises:
@@ -238,9 +234,8 @@ def seed_folders(path: str | Path) -> list[Path]:
     if _kind(path) != "seeds":
         return [path]
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
-    seeds = {folder: re.fullmatch(r"seed-(-?\d+)", folder.name) for folder in folders}
-    numbers = {folder: int(match[1]) for folder, match in seeds.items() if match}
-    return sorted(numbers, key=numbers.__getitem__)
+    seeds = {f: int(match[1]) for f in folders if (match := re.fullmatch(r"seed-(-?\d+)", f.name))}
+    return sorted(seeds, key=seeds.__getitem__)
 
 
 def _kind(path: Path) -> str | None:
@@ -258,9 +253,8 @@ def run_and_step(name: str) -> tuple[str, int | None]:
     """
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
-        raise UsageError(
-            f"{step!r} is not a checkpoint step", cure="write RUN@STEP, for example runs/a@100000"
-        )
+        cure = "write RUN@STEP, for example runs/a@100000"
+        raise UsageError(f"{step!r} is not a checkpoint step", cure=cure)
     return run, int(step) if at else None
 
 
@@ -287,18 +281,17 @@ def is_policy(name: str | Path) -> bool:
     return str(name).startswith(ZOO) or Path(name).is_dir()
 
 
-def learned_from(planner: str) -> list[dict[str, Any]]:
+def policy_training_sets(planner: str) -> list[dict[str, Any]]:
     """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining.
 
     Other planners have none.
     """
-    folder = planner.partition("@")[0]
-    path = policy_folder(folder) if is_policy(folder) else Path(folder)
+    path = policy_folder(planner.partition("@")[0])
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
-    return trained_on(info) if info.get("kind") in ("training", "policy") else []
+    return training_sets(info) if info.get("kind") in ("training", "policy") else []
 
 
-def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+def training_sets(info: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the data sets in the ``run.json`` of a training run without duplicates, its own sets first."""
     by_hash: dict[str, dict[str, Any]] = {}
     networks_from = info.get("networks_from") or {}

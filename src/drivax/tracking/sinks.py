@@ -32,8 +32,8 @@ class JsonLines:
     def __init__(self, file: str | Path, resume_step: int | None = None) -> None:
         self.path = Path(file)
         if resume_step is not None and self.path.exists():
-            lines = [line for line, row in _rows(self.path) if row["step"] <= resume_step]
-            write_text(self.path, "".join(lines), follow=False)
+            rows = [row for row in read_rows(self.path) if row["step"] <= resume_step]
+            write_text(self.path, "".join(f"{json.dumps(row)}\n" for row in rows), follow=False)
         elif self.path.is_symlink():
             self.path.unlink()
         self._file = self.path.open("wb" if resume_step is None else "ab")
@@ -132,21 +132,16 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
     Raises:
         DataError: A row is damaged.
     """
-    for _, row in _rows(Path(file)):
-        yield row
-
-
-def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield every line with its row; an incomplete last line is ignored."""
+    file = Path(file)
     lines = read_text(file, "train again").splitlines(keepends=True)
-    for number, line in enumerate(lines):
+    for number, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)
             if not isinstance(row["step"], int):
                 raise ValueError("a step that is no integer")
         except DAMAGE as error:
-            if number == len(lines) - 1 and not line.endswith("\n"):
+            if number == len(lines) and not line.endswith("\n"):
                 return
             cure = "delete the row"
-            raise DataError("not a metrics row", file=file, record=number + 1, cure=cure) from error
-        yield line if line.endswith("\n") else line + "\n", row
+            raise DataError("not a metrics row", file=file, record=number, cure=cure) from error
+        yield row
