@@ -197,10 +197,13 @@ def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = 
 
 
 def hashes(validation: ScenarioSet | HoldOut | None, weights: np.ndarray | None) -> dict[str, Any]:
-    """Return the hash of the validation set (or the recordings held out) and that of weights, for ``run.json``."""
-    note = validation.note() if isinstance(validation, HoldOut) else getattr(validation, "hash", None)
-    digest = None if weights is None else hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
-    return {"validation": note, "weights": digest}
+    """Return the hash of the validation set, or the held-out recordings, and that of weights, for ``run.json``."""
+    notes: dict[str, Any] = {"validation": None, "weights": None}
+    if validation is not None:
+        notes["validation"] = validation.note() if isinstance(validation, HoldOut) else validation.hash
+    if weights is not None:
+        notes["weights"] = hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
+    return notes
 
 
 def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:

@@ -95,10 +95,6 @@ class Mixture:
         """Refuse replay buffers of states: those of the blocks differ."""
         refuse_stored_states("a mixture of traffic")
 
-    def observe(self, data: ScenarioBank, stored: Any) -> NoReturn:
-        """Refuse, as :meth:`stored`."""
-        self.stored(stored)
-
     def observe_all(self, data: ScenarioBank, stored: Any) -> NoReturn:
         """Refuse, as :meth:`stored`."""
         self.stored(stored)
