@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -118,12 +118,12 @@ def train(
         RunFolder.check(out, call.overwrite, "training")
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
-    scenarios = _Scenarios.of(config, data, weights, validation_set)
-    environment, bank = _environment(config, scenarios.training, trust)
+    scenarios, weights, validation_scenarios = _divide(config, data, weights, validation_set)
+    environment, bank = _environment(config, scenarios, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    held_out = _held_out(config, environment, learner, scenarios)
+    held_out = _held_out(config, environment, learner, validation_scenarios)
     seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
-    experience = training_data(config.algorithm, environment, bank, scenarios.weights)
+    experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
@@ -154,34 +154,27 @@ def _validation_set(
     return hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None
 
 
-@dataclass(frozen=True)
-class _Scenarios:
-    """Scenarios to train on, with their weights, and scenarios that rank checkpoints."""
+def _divide(
+    config: TrainConfig,
+    data: ScenarioSet,
+    weights: np.ndarray | None,
+    validation: ScenarioSet | HoldOut | None,
+) -> tuple[Sequence[Scenario], np.ndarray | None, Sequence[Scenario] | None]:
+    """Return scenarios to train on, with their weights, and those to validate on, divided if the set holds out some.
 
-    training: Sequence[Scenario]
-    weights: np.ndarray | None
-    validation: Sequence[Scenario] | None
-
-    @classmethod
-    def of(
-        cls, config: TrainConfig, data: ScenarioSet, weights: np.ndarray | None,
-        validation: ScenarioSet | HoldOut | None,
-    ) -> Self:  # fmt: skip
-        """Divide the set if it holds out recordings.
-
-        Raises:
-            UsageError: The validation set has another length, patience has none, or weights do not fit.
-        """
-        if isinstance(validation, HoldOut) and validation.recordings:
-            if weights is not None:
-                weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
-            return cls(data.take(validation.training), weights, data.take(validation.validation))
-        if isinstance(validation, ScenarioSet):
-            check_lengths(data, validation)
-            return cls(data, weights, validation)
-        if config.patience:
-            raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-        return cls(data, weights, None)
+    Raises:
+        UsageError: The validation set has another length, patience has none, or weights do not fit.
+    """
+    if isinstance(validation, HoldOut) and validation.recordings:
+        if weights is not None:
+            weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
+        return data.take(validation.training), weights, data.take(validation.validation)
+    if isinstance(validation, ScenarioSet):
+        check_lengths(data, validation)
+        return data, weights, validation
+    if config.patience:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    return data, weights, None
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
@@ -226,12 +219,12 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _held_out(
-    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: _Scenarios
+    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: Sequence[Scenario] | None
 ) -> Validation | None:
-    """Return the validation, with the data of a learner's held-out metrics; None without any."""
-    if scenarios.validation is None:
+    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without any."""
+    if scenarios is None:
         return None
-    held_out = Validation.of(scenarios.validation)
+    held_out = Validation.of(scenarios)
     if not isinstance(learner, HeldOutMetrics):
         return held_out
     return replace(held_out, data=training_data(config.algorithm, environment, held_out.bank))
