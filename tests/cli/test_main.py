@@ -32,11 +32,10 @@ def probe(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Makes ``drivax probe`` run a function."""
 
     def install(function: Any, overrides: bool = False) -> None:
-        module = types.ModuleType("drivax_probe")
+        module = types.ModuleType("drivax.cli.probe")
         module.Probe, module.run = Probe, function  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "drivax_probe", module)
-        command = cli.Command("drivax_probe", "Probe", "for tests", overrides)
-        monkeypatch.setattr(cli, "COMMANDS", {**cli.COMMANDS, "probe": command})
+        monkeypatch.setitem(sys.modules, "drivax.cli.probe", module)
+        monkeypatch.setattr(cli, "COMMANDS", {**cli.COMMANDS, "probe": cli.Command("for tests", overrides)})
 
     return install
 
@@ -157,12 +156,11 @@ def test_command_help(probe: Any, capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_each_command_help_has_an_example_within_100_columns(name: str, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    command = cli.COMMANDS[name]
     assert cli.main([name, "--help"]) == 0
     out = capsys.readouterr().out
     assert f"drivax {name}" in out
     assert max(map(len, out.splitlines())) <= 100
-    config = getattr(importlib.import_module(command.module), command.config)
+    config = getattr(importlib.import_module(f"drivax.cli.{name}"), name.capitalize())
     assert dataclasses.is_dataclass(config)
     assert config.__dataclass_params__.frozen  # type: ignore[attr-defined]
     assert "Example" in (config.__doc__ or "")

@@ -153,7 +153,7 @@ def test_stored_states_give_the_same_observation(experience, bank, driving):
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rollout.state)
     again = jax.jit(driving.observe_all)(bank, rows)
     np.testing.assert_allclose(again["route"], rollout.extra["seen"].reshape(again["route"].shape), atol=1e-5)
-    one = jax.jit(driving.observe)(bank, jax.tree.map(lambda leaf: leaf[7], rows))
+    one = jax.jit(driving.simulator.observe)(bank, jax.tree.map(lambda leaf: leaf[7], rows))
     np.testing.assert_allclose(one["route"], again["route"][7], atol=1e-5)
 
 

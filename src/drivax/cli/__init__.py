@@ -1,7 +1,7 @@
 """The command line: one file per command.
 
-``drivax.cli.<command>`` defines a frozen dataclass (the command's name in CamelCase) from which tyro builds the flags,
-with examples in its docstring, and ``run(args) -> int``. A command's modules are imported only when it runs, so that
+``drivax.cli.<command>`` defines a frozen dataclass (``drivax.cli.train.Train``) from which tyro builds the flags, with
+examples in its docstring, and ``run(args) -> int``. A command's modules are imported only when it runs, so that
 ``drivax --help`` answers at once. A command with ``overrides=True`` takes further ``--section.key VALUE`` settings of
 its configuration, which ``run`` gets as a second argument.
 """
@@ -23,7 +23,7 @@ from functools import partial
 from importlib import metadata
 from inspect import getdoc
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from drivax.compilation import report_compilation, use_compilation_cache
 from drivax.errors import (
@@ -37,61 +37,43 @@ from drivax.errors import (
 from drivax.escaping import escape_controls, show
 from drivax.seal import allow_edited, edited_files
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 
 @dataclass(frozen=True)
 class Command:
-    """The module and the class of a command, and its line in the list of commands."""
+    """The line of a command in the list of commands, and whether it takes settings of its configuration."""
 
-    module: str
-    config: str
     summary: str
     overrides: bool = False
 
 
 #: Flags of all commands.
 _FLAGS = ("--debug", "--no-cache", "--edited")
-#: Width of help that is not printed to a terminal.
+#: Largest width of tables, and the width of help, that are not printed to a terminal.
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
 #: Until a signal that came at a bad moment is sent again (s).
 _LATER_S = 0.01
 COMMANDS = {
-    "demo": Command(
-        "drivax.cli.demo",
-        "Demo",
-        "the whole pipeline on the built-in world: generate, train, evaluate, report",
-    ),
-    "doctor": Command("drivax.cli.doctor", "Doctor", "what is installed, or what a file or folder contains"),
-    "generate": Command(
-        "drivax.cli.generate", "Generate", "generate scenarios of the built-in world", overrides=True
-    ),
-    "convert": Command("drivax.cli.convert", "Convert", "convert a public data set to a scenario set"),
-    "export": Command("drivax.cli.export", "Export", "write a part of a set, or a set in another format"),
-    "inspect": Command("drivax.cli.inspect", "Inspect", "summarise, audit and verify scenario sets"),
-    "view": Command("drivax.cli.view", "View", "browse and play a scenario set on one HTML page"),
-    "curate": Command(
-        "drivax.cli.curate", "Curate", "score how critical each scenario of a set is", overrides=True
-    ),
-    "train": Command(
-        "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
-    ),
-    "evaluate": Command(
-        "drivax.cli.evaluate", "Evaluate", "evaluate a planner on a scenario set", overrides=True
-    ),
-    "judge": Command("drivax.cli.judge", "Judge", "evaluate a run again by the rules of another program"),
-    "compare": Command(
-        "drivax.cli.compare", "Compare", "test whether one planner is better than another", overrides=True
-    ),
-    "study": Command(
-        "drivax.cli.study", "Study", "run an experiment with controls and verdicts", overrides=True
-    ),
-    "report": Command("drivax.cli.report", "Report", "one HTML page from runs; or videos, or tables"),
-    "bench": Command(
-        "drivax.cli.bench", "Bench", "measure the speed of the simulator on this machine", overrides=True
-    ),
+    "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
+    "doctor": Command("what is installed, or what a file or folder contains"),
+    "generate": Command("generate scenarios of the built-in world", overrides=True),
+    "convert": Command("convert a public data set to a scenario set"),
+    "export": Command("write a part of a set, or a set in another format"),
+    "inspect": Command("summarise, audit and verify scenario sets"),
+    "view": Command("browse and play a scenario set on one HTML page"),
+    "curate": Command("score how critical each scenario of a set is", overrides=True),
+    "train": Command("train a planner from a configuration file", overrides=True),
+    "evaluate": Command("evaluate a planner on a scenario set", overrides=True),
+    "judge": Command("evaluate a run again by the rules of another program"),
+    "compare": Command("test whether one planner is better than another", overrides=True),
+    "study": Command("run an experiment with controls and verdicts", overrides=True),
+    "report": Command("one HTML page from runs; or videos, or tables"),
+    "bench": Command("measure the speed of the simulator on this machine", overrides=True),
 }
-
 
 Record = TypeVar("Record")
 
@@ -100,6 +82,14 @@ def record_of(cls: type[Record], args: Any, **values: Any) -> Record:
     """Return a configuration record from the flags of the same names; ``values`` replace flags."""
     names = [field.name for field in fields(cls) if field.name not in values]  # type: ignore[arg-type]
     return cls(**{name: getattr(args, name) for name in names}, **values)
+
+
+def console() -> Console:
+    """Return a console of at most 100 columns that prints text as it is."""
+    from rich.console import Console
+
+    width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
+    return Console(width=width, highlight=False, markup=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -230,19 +220,17 @@ def overview() -> str:
     """Return the list of commands that ``drivax --help`` prints; at most 100 columns."""
     width = max(map(len, COMMANDS))
     rows = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
-    return "\n".join(
-        (
-            "drivax trains, curates and evaluates driving planners on recorded traffic.",
-            "",
-            "usage: drivax COMMAND [options]      drivax COMMAND --help  explains one, with an example",
-            "",
-            *rows,
-            "",
-            "  --version  print the version      --debug  show the traceback of an error",
-            "  --no-cache  compile all programs again, and store none",
-            "  --edited    use files that were edited after drivax wrote them; results say so",
-        )
-    )
+    return "\n".join((
+        "drivax trains, curates and evaluates driving planners on recorded traffic.",
+        "",
+        "usage: drivax COMMAND [options]      drivax COMMAND --help  explains one, with an example",
+        "",
+        *rows,
+        "",
+        "  --version  print the version      --debug  show the traceback of an error",
+        "  --no-cache  compile all programs again, and store none",
+        "  --edited    use files that were edited after drivax wrote them; results say so",
+    ))  # fmt: skip
 
 
 def _dispatch(arguments: list[str], use_cache: bool) -> int:
@@ -256,9 +244,8 @@ def _dispatch(arguments: list[str], use_cache: bool) -> int:
         return 0
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
-        raise UsageError(
-            f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS, otherwise="see drivax --help")
-        )
+        cure = did_you_mean(name, COMMANDS, otherwise="see drivax --help")
+        raise UsageError(f"unknown {kind} {name!r}", cure=cure)
     return _run(name, COMMANDS[name], rest, use_cache)
 
 
@@ -271,12 +258,12 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
     if not use_cache:
         # Also for a folder of JAX's own variable, which is read when a command imports JAX.
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-    module = importlib.import_module(command.module)
+    module = importlib.import_module(f"drivax.cli.{name}")
     if "jax" in sys.modules:
         check_memory_limit()
     if cache and "jax" in sys.modules:
         report_compilation(partial(show, file=sys.stderr))
-    config = getattr(module, command.config)
+    config = getattr(module, name.capitalize())
     parse: Any = partial(tyro.cli, return_unknown_args=True) if command.overrides else tyro.cli
     parsed = parse(
         config, prog=f"drivax {name}", args=arguments, description=_wrap(getdoc(config) or ""),

@@ -15,17 +15,16 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from drivax.cli import console
 from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
 from drivax.errors import UsageError
 from drivax.escaping import escape_controls
 from drivax.files import format_bytes, free_bytes
 from drivax.tracking.run_folder import zoo
 
-_COLUMNS = 100
 #: Modules and purpose of every extra.
 _EXTRAS = {
     "womd": (("google.protobuf", "google_crc32c"), "Waymo, ScenarioMax"),
@@ -59,19 +58,16 @@ class Doctor:
 
 def run(args: Doctor) -> int:
     """Print the findings."""
-    console = Console(
-        width=min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS, highlight=False
-    )
     if args.digest:
         if args.path is not None:
             raise UsageError("--digest is about this machine, not about a path", cure="leave out one of them")
-        console.print(_table(digests()))
+        console().print(_table(digests()))
         return 0
     if args.path is None:
-        console.print(_table(machine()))
+        console().print(_table(machine()))
         return 0
     diagnosis = diagnose(args.path)
-    console.print(_table(findings(diagnosis)))
+    console().print(_table(findings(diagnosis)))
     return 0 if diagnosis.convertible else 1
 
 

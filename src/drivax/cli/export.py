@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from drivax.cli import record_of
 from drivax.escaping import show
 
 
@@ -46,22 +47,14 @@ class Export:
 
 def run(args: Export) -> int:
     """Export, and print the number of elements that did not fit the format."""
-    from drivax.datasets.export import writer as export
+    from drivax.datasets.doctor import count_text
+    from drivax.datasets.export import writer
     from drivax.tracking.progress import Progress
 
-    options = export.Export(
-        format=args.format,
-        filters=args.filter,
-        ids=args.ids,
-        limit=args.limit,
-        paths=args.paths,
-        shard_size=args.shard_size,
-        overwrite=args.overwrite,
-    )
+    options = record_of(writer.Export, args, filters=args.filter)
     with Progress("exporting", "scenarios") as bar:
-        result = export.export(args.set, args.out, options, lambda done, total: bar.update(done, "", total))
+        result = writer.export(args.set, args.out, options, lambda done, total: bar.update(done, "", total))
     lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(result.lost.items()))
-    files = "1 file" if result.files == 1 else f"{result.files:,} files"
-    scenarios = "1 scenario" if result.scenarios == 1 else f"{result.scenarios:,} scenarios"
-    show(f"{result.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
+    content = f"{count_text(result.scenarios, 'scenario')} in {count_text(result.files, 'file')}"
+    show(f"{result.path}: {content}" + (f"; no room for {lost}" if lost else ""))
     return 0

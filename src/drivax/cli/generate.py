@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from drivax.cli import record_of
 from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.scenario.schema import CAPACITIES, Scenario
@@ -80,14 +81,8 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
     if args.benchmark and world != WorldConfig(domain=world.domain):
         raise UsageError("the benchmark has a fixed world", cure="leave out all of its settings but --domain")
     shares = None if args.split is None else parse_shares(args.split)
-    options = Generation(
-        workers=args.workers if args.workers is not None else os.cpu_count() or 1,
-        capacity=args.capacity,
-        future_s=args.future_s,
-        egos=args.egos,
-        overwrite=args.overwrite,
-        world=world,
-    )
+    workers = (os.cpu_count() or 1) if args.workers is None else args.workers
+    options = record_of(Generation, args, workers=workers, world=world)
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
 

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from drivax.cli import console
 from drivax.escaping import show
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from drivax.evaluation.observation_statistics import ObservationStatistics
     from drivax.report.inspection import Inspection
 
-_COLUMNS = 100
 #: Number of scenarios for --observations, evenly spread over the selected ones.
 _OBSERVED_SCENARIOS = 256
 
@@ -93,29 +91,21 @@ def _print(inspections: list[Inspection]) -> None:
     """Print one set in detail, or several side by side."""
     from drivax.report import inspection as tables
 
-    console = _console()
+    terminal = console()
     if len(inspections) > 1:
         for table in tables.comparison(inspections):
-            console.print(table.rich())
-            console.print()
+            terminal.print(table.rich())
+            terminal.print()
         return
     (inspection,) = inspections
-    console.print(tables.overview(inspection).rich())
-    console.print()
+    terminal.print(tables.overview(inspection).rich())
+    terminal.print()
     audit = tables.audit_table(inspection)
-    console.print("audit: not done" if audit is None else audit.rich())
-    console.print()
-    console.print(tables.scenarios_table(inspection).rich())
+    terminal.print("audit: not done" if audit is None else audit.rich())
+    terminal.print()
+    terminal.print(tables.scenarios_table(inspection).rich())
     if len(inspection) > tables.MAX_LISTED:
-        console.print(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
-
-
-def _console() -> Console:
-    """Return a console of at most 100 columns that prints text as it is."""
-    from rich.console import Console
-
-    width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
-    return Console(width=width, highlight=False, markup=False)
+        terminal.print(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
 
 
 def _check_flags(args: Inspect) -> None:
@@ -172,7 +162,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
 def _print_observations(statistics: ObservationStatistics) -> None:
     from drivax.report import inspection as tables
 
-    console = _console()
-    console.print(tables.observation_overview(statistics))
-    console.print()
-    console.print(tables.observation_table(statistics).rich())
+    terminal = console()
+    terminal.print(tables.observation_overview(statistics))
+    terminal.print()
+    terminal.print(tables.observation_table(statistics).rich())

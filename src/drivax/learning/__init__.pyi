@@ -10,6 +10,7 @@ from .environment import collect as collect
 from .experience import Experience as Experience
 from .experience import WeightedSet as WeightedSet
 from .experience import sample_steps as sample_steps
+from .loop import TrainOptions as TrainOptions
 from .loop import make_agent as make_agent
 from .loop import train as train
 from .loop import usable_steps as usable_steps

@@ -110,7 +110,7 @@ class OfflineAlgorithm(Protocol):
 
 @runtime_checkable
 class HeldOutMetrics(Protocol):
-    """A learner that computes metrics on held-out data in addition to driving there."""
+    """A learner that computes metrics on held-out data, in addition to those of driving."""
 
     def held_out_metrics(self, data: Any, state: Any) -> dict[str, float]:
         """Return values to log as ``validation/<name>``; ``data`` is :func:`training_data` of the held-out set."""
@@ -122,8 +122,10 @@ def training_data(
 ) -> Any:
     """Return the data of a learner's iterations: the environment's, or the logged experience in them.
 
-    ``weights`` are ``[N, T]`` of every logged step, at least 0 (None: uniform); UsageError unless the algorithm is
-    offline.
+    ``weights`` are ``[N, T]`` of every logged step, at least 0; None: uniform.
+
+    Raises:
+        UsageError: There are weights, but the algorithm does not learn from logged steps.
     """
     offline = isinstance(config, OfflineAlgorithm)
     experience = config.experience(environment, data, weights) if offline else None

@@ -48,10 +48,8 @@ def large_logs(row: Mapping[str, float]) -> dict[str, str]:
 def cure(problem: str, checkpoint: str | None) -> str:
     """Return what to do about a divergence, given the last healthy checkpoint as ``RUN@STEP``."""
     name = problem.split(" ")[0]
-    is_reward = name.startswith("reward/")
-    change = (
-        f"correct the reward term {name.removeprefix('reward/')}" if is_reward else "lower the learning rate"
-    )
+    term = name.removeprefix("reward/")
+    change = "lower the learning rate" if term == name else f"correct the reward term {term}"
     if checkpoint is None:
         return f"{change} and start again with --overwrite; there is no healthy checkpoint yet"
     return f"{change} and start a new run from the last healthy checkpoint: --from {checkpoint}"

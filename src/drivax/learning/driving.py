@@ -124,13 +124,9 @@ class Driving:
         """Return the context: index, step, history, and reactive traffic."""
         return state.context
 
-    def observe(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
-        """Observe a context."""
-        return dict(self.simulator.observe(data, stored))
-
     def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
         """Observe a batch of contexts."""
-        return jax.vmap(self.observe, (None, 0))(data, stored)
+        return dict(jax.vmap(self.simulator.observe, (None, 0))(data, stored))
 
     def cache(self, data: ScenarioBank, state: SimState) -> Frame:
         """Return the frame of all agents, which the current observation and the next step both need."""

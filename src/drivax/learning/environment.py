@@ -1,7 +1,7 @@
 """The environment protocol, and rollouts of a batch of environments that reset themselves.
 
 ``learning.driving`` implements it for scenarios. An environment is configuration only: its data (for driving the
-scenario bank) is an argument of every function, and all functions but :meth:`Environment.observe` act on a batch.
+scenario bank) is an argument of every function, and all functions act on a batch.
 """
 
 from __future__ import annotations
@@ -85,10 +85,6 @@ class Environment(Protocol):
 
     def stored(self, state: Any) -> Any:
         """Return the part of states that the replay buffer stores; they can be observed from it."""
-        ...
-
-    def observe(self, data: Any, stored: Any) -> dict[str, Array]:
-        """Observe one stored state (not a batch)."""
         ...
 
     def observe_all(self, data: Any, stored: Any) -> dict[str, Array]:

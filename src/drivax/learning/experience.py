@@ -58,9 +58,12 @@ class Sampler:
 
 
 def sampler(weights: np.ndarray) -> Sampler:
-    """Return a sampler of steps with probabilities proportional to ``weights`` ``[N, T]``; DataError if all are 0.
+    """Return a sampler of steps with probabilities proportional to ``weights`` ``[N, T]``.
 
     A step with a probability below ``2^-32`` may never be drawn.
+
+    Raises:
+        DataError: All weights are 0.
     """
     total = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not total[-1] > 0.0:
@@ -182,7 +185,9 @@ class ExperienceConfig:
 
         All logs of a scenario have its weights.
 
-        Raises UsageError if there is no expert or the weights do not fit the data, DataError if no step is usable.
+        Raises:
+            UsageError: There is no expert, or the weights do not fit the data.
+            DataError: No step is usable.
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
@@ -190,10 +195,10 @@ class ExperienceConfig:
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)
         weights = check_weights(weights, (usable.shape[0] // expert.egos, usable.shape[1]))
-        weighted = sampler(np.asarray(usable) * np.repeat(weights, expert.egos, axis=0))
+        by_weight = sampler(np.asarray(usable) * np.repeat(weights, expert.egos, axis=0))
         if self.weighted == "all":
-            return Experience(data, expert, usable, uniform, weighted)
-        return Experience(data, expert, usable, uniform, uniform, weighted)
+            return Experience(data, expert, usable, uniform, by_weight)
+        return Experience(data, expert, usable, uniform, uniform, by_weight)
 
 
 def environment_data(data: Any) -> Any:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -62,11 +62,33 @@ def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] 
     return learner
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Options of a call of :func:`train`; other than a :class:`TrainConfig` they are not saved in the run.
+
+    Attributes:
+        resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
+        overwrite: Replace an existing run folder.
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
+        log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
+        trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
+            in the traffic may name.
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    seeds: int = 1
+    log: Callable[[str], None] = lambda line: None
+    trust: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise UsageError(f"{self.seeds} seeds", cure="use 1 or more")
+
+
 def train(
     config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
-    validation: ScenarioSet | Literal["held_out"] | None = "held_out", resume: bool = False,
-    overwrite: bool = False, seeds: int = 1, log: Callable[[str], None] = lambda line: None,
-    trust: Sequence[str] = (),
+    validation: ScenarioSet | Literal["held_out"] | None = "held_out", **options: Any,
 ) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
@@ -76,12 +98,7 @@ def train(
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
             of its scenarios (at most 256). None trains on all scenarios without validation.
-        resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
-        overwrite: Replace an existing run folder.
-        seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
-        log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
-        trust: Modules, besides drivax and those that ``config`` names, whose code the run to resume and policies in the
-            traffic may name.
+        options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
@@ -90,87 +107,74 @@ def train(
         DrivaxError: Memory ran out.
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
+    call, out, folders = TrainOptions(**options), Path(out), list[RunFolder]()
+    trust = (*call.trust, *modules_of(config))
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    out, folders, trust = Path(out), list[RunFolder](), (*trust, *modules_of(config))
-    split, validation = _hold_out(data, validation, out, resume)
-    notes = hashes(validation, weights) | ({} if split is None else {"validation": split.note()})
-    if resume:
-        config, folders = _resumed_folders(data, notes, out, seeds, trust)
+    validation_set = _validation_set(data, validation, out, call.resume)
+    notes = hashes(validation_set, weights)
+    if call.resume:
+        config, folders = _resumed_folders(data, notes, out, call.seeds, trust)
     else:
-        RunFolder.check(out, overwrite, "training")
-        config = _with_step(config)
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
-    scenarios = _Scenarios.of(config, data, weights, split or validation)
-    environment, bank = _environment(config, scenarios.training, trust)
+        RunFolder.check(out, call.overwrite, "training")
+        if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
+            config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
+    scenarios, weights, validation_scenarios = _divide(config, data, weights, validation_set)
+    environment, bank = _environment(config, scenarios, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    held_out, held_out_data = _held_out(config, environment, learner, scenarios)
-    numbers = range(config.seed, config.seed + (len(folders) or seeds))
-    experience = training_data(config.algorithm, environment, bank, scenarios.weights)
-    program = Program(Seeds(learner, tuple(numbers)), experience, config.devices)
+    held_out = _held_out(config, environment, learner, validation_scenarios)
+    seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
+    experience = training_data(config.algorithm, environment, bank, weights)
+    program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
-    if split is not None:
-        log(split.text())
-    log(memory.text())
-    networks = None if resume else pretrained_networks(config.begin_from, program, log)  # they may not fit
+    if isinstance(validation_set, HoldOut):
+        call.log(validation_set.text())
+    call.log(memory.text())
+    # Read before folders are created, because they may not fit.
+    networks = {} if call.resume else pretrained_networks(config.begin_from, program, call.log)
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
         stack.enter_context(explain_full_disk(out))
-        folders = folders or _create_folders(config, data, notes, out, numbers, overwrite)
+        folders = folders or _create_folders(config, data, notes, out, seeds, call.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
-        _learn(_Run(config, program, logs, held_out, held_out_data, networks, log, trust))
+        _Training(config, program, logs, held_out, networks, call.log, trust).run()
     return RunFolder.open(out)
 
 
-def _hold_out(
+def _validation_set(
     data: ScenarioSet, validation: ScenarioSet | Literal["held_out"] | None, out: Path, resume: bool
-) -> tuple[HoldOut | None, ScenarioSet | None]:
-    """Return the recordings that a new run holds out, or those that the run to resume held out, and the set."""
+) -> ScenarioSet | HoldOut | None:
+    """Return the validation set, or the recordings that a new run holds out or the run to resume held out."""
     if not isinstance(validation, str):
-        return None, validation
+        return validation
     if not resume:
-        return hold_out(data.entries), None
+        return hold_out(data.entries)
     recorded = RunFolder.open(out).info.get("validation")
-    return (hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None), None
+    return hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None
 
 
-def _with_step(config: TrainConfig) -> TrainConfig:
-    """Return a configuration that begins from a run at its step, so that resuming finds the same checkpoint."""
-    if config.begin_from is None:
-        return config
-    return replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
+def _divide(
+    config: TrainConfig,
+    data: ScenarioSet,
+    weights: np.ndarray | None,
+    validation: ScenarioSet | HoldOut | None,
+) -> tuple[Sequence[Scenario], np.ndarray | None, Sequence[Scenario] | None]:
+    """Return scenarios to train on, with their weights, and those to validate on, divided if the set holds out some.
 
-
-@dataclass(frozen=True)
-class _Scenarios:
-    """Scenarios to train on, with their weights, and scenarios that rank checkpoints."""
-
-    training: Sequence[Scenario]
-    weights: np.ndarray | None
-    validation: Sequence[Scenario] | None
-
-    @classmethod
-    def of(
-        cls, config: TrainConfig, data: ScenarioSet, weights: np.ndarray | None,
-        validation: ScenarioSet | HoldOut | None,
-    ) -> Self:  # fmt: skip
-        """Divide the set if it holds out recordings.
-
-        Raises:
-            UsageError: The validation set has another length, patience has none, or weights do not fit.
-        """
-        if isinstance(validation, HoldOut) and validation.recordings:
-            if weights is not None:
-                weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
-            return cls(data.take(validation.training), weights, data.take(validation.validation))
-        if isinstance(validation, ScenarioSet):
-            check_lengths(data, validation)
-            return cls(data, weights, validation)
-        if config.patience:
-            raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-        return cls(data, weights, None)
+    Raises:
+        UsageError: The validation set has another length, patience has none, or weights do not fit.
+    """
+    if isinstance(validation, HoldOut) and validation.recordings:
+        if weights is not None:
+            weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
+        return data.take(validation.training), weights, data.take(validation.validation)
+    if isinstance(validation, ScenarioSet):
+        check_lengths(data, validation)
+        return data, weights, validation
+    if config.patience:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    return data, weights, None
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
@@ -185,10 +189,14 @@ def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = 
     return np.asarray(usable.any(axis=1))
 
 
-def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, Any]:
-    """Return hashes of the validation set and of the weights, for ``run.json``."""
-    digest = None if weights is None else hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
-    return {"validation": None if validation is None else validation.hash, "weights": digest}
+def hashes(validation: ScenarioSet | HoldOut | None, weights: np.ndarray | None) -> dict[str, Any]:
+    """Return the hash of the validation set, or the held-out recordings, and that of weights, for ``run.json``."""
+    notes: dict[str, Any] = {"validation": None, "weights": None}
+    if validation is not None:
+        notes["validation"] = validation.note() if isinstance(validation, HoldOut) else validation.hash
+    if weights is not None:
+        notes["weights"] = hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
+    return notes
 
 
 def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
@@ -211,15 +219,15 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _held_out(
-    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: _Scenarios
-) -> tuple[Validation | None, Any]:
-    """Return the validation, and the data of a learner's held-out metrics; None without any."""
-    if scenarios.validation is None:
-        return None, None
-    held_out = Validation.of(scenarios.validation)
+    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: Sequence[Scenario] | None
+) -> Validation | None:
+    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without any."""
+    if scenarios is None:
+        return None
+    held_out = Validation.of(scenarios)
     if not isinstance(learner, HeldOutMetrics):
-        return held_out, None
-    return held_out, training_data(config.algorithm, environment, held_out.bank)
+        return held_out
+    return replace(held_out, data=training_data(config.algorithm, environment, held_out.bank))
 
 
 def _environment(
@@ -286,108 +294,165 @@ def _resumed_folders(
 
 
 @dataclass(frozen=True)
-class _Run:
+class _Training:
+    """The iterations of a training, with the log of each seed; ``networks`` are pretrained ones of a new run."""
+
     config: TrainConfig
     program: Program
     logs: Sequence[TrainingLog]
     validation: Validation | None
-    held_out_data: Any
-    #: Pretrained networks; None: not read yet, since a resumed run rarely needs them.
-    networks: Mapping[str, Any] | None
+    networks: Mapping[str, Any]
     log: Callable[[str], None]
     trust: Sequence[str]
 
-    def steps(self, iteration: int) -> int:
-        """Environment steps of each seed after an iteration."""
+    def run(self) -> None:
+        """Run the remaining iterations.
+
+        Raises:
+            DivergenceError: A seed diverged; the others ran to the end.
+            Preempted: SIGTERM stopped the run.
+        """
+        config, program = self.config, self.program
+        done, state = self._start()
+        with Progress("training", "steps", self._steps(config.iterations)) as progress, StopSignal() as stop:
+            progress.update(self._steps(done))
+            for iteration in range(done + 1, config.iterations + 1):
+                if all(log.stopped for log in self.logs):
+                    break
+                started = time.perf_counter()
+                state, values = program.step(state)
+                values, finite = jax.device_get((values, program.all_finite(state)))
+                rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
+                # Read once, so that all seeds write a checkpoint of the same iteration.
+                preempted = stop.received and iteration < config.iterations
+                means = (mean_logs(program.seeds.member(values, number)) for number in range(len(self.logs)))
+                rows = [row | {"steps_per_second": rate} for row in means]
+                self._check(iteration, state, rows, np.atleast_1d(finite))
+                self._record(iteration, state, rows, preempted)
+                success = [row["rollout/success"] for row in rows if "rollout/success" in row]
+                note = f"success {sum(success) / len(success):.2f}" if success else ""
+                progress.update(self._steps(iteration), note)
+                if preempted:
+                    problem = f"SIGTERM stopped the training after {self._steps(iteration):,} steps"
+                    raise Preempted(problem, cure="continue it with --resume")
+        for log in self.logs:
+            if log.divergence is not None:
+                raise log.divergence
+
+    def _steps(self, iteration: int) -> int:
+        """Return the environment steps of each seed after an iteration."""
         return iteration * self.config.algorithm.steps_per_iteration
 
+    def _start(self) -> tuple[int, Any]:
+        """Return the number of finished iterations and the state: of the newest common checkpoint, or initial."""
+        unfinished = [log for log in self.logs if not log.out_of_patience]
+        if all(log.divergence is not None for log in unfinished):
+            # The user may have corrected a reward term.
+            for log in unfinished:
+                log.retry()
+        active = [number for number, log in enumerate(self.logs) if not log.stopped]
+        if not active:
+            return self.config.iterations, None
+        logs = [self.logs[number] for number in active]
+        step, states = self._restore(logs)
+        for log in logs:
+            log.start(step)
+        if step is None:
+            networks = self.networks or pretrained_networks(self.config.begin_from, self.program, self.log)
+            return 0, initial_state(self.program, networks)
+        # Seeds that stopped write nothing more: they take the state of another.
+        restored = dict(zip(active, states, strict=True))
+        states = [restored.get(number, states[0]) for number in range(len(self.logs))]
+        return step // self.config.algorithm.steps_per_iteration, self.program.state_of(states)
 
-def _learn(run: _Run) -> None:
-    """Run the remaining iterations.
+    def _restore(self, logs: Sequence[TrainingLog]) -> tuple[int | None, list[Any]]:
+        """Return the newest step of which each seed has a healthy checkpoint, and their states; None without any.
 
-    Raises:
-        DivergenceError: A seed diverged; the others ran to the end.
-        Preempted: SIGTERM stopped the run.
-    """
-    config, program = run.config, run.program
-    done, state = _start(run)
-    with Progress("training", "steps", run.steps(config.iterations)) as progress, StopSignal() as stop:
-        progress.update(run.steps(done))
-        for iteration in range(done + 1, config.iterations + 1):
-            if all(log.stopped for log in run.logs):
-                break
-            started = time.perf_counter()
-            state, values = program.step(state)
-            values, finite = jax.device_get((values, program.all_finite(state)))
-            rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
-            # Read once, so that all seeds write a checkpoint of the same iteration.
-            preempted = stop.received and iteration < config.iterations
-            means = (mean_logs(program.seeds.member(values, number)) for number in range(len(run.logs)))
-            rows = [row | {"steps_per_second": rate} for row in means]
-            _check(run, iteration, state, rows, np.atleast_1d(finite))
-            _record(run, iteration, state, rows, preempted)
-            success = [row["rollout/success"] for row in rows if "rollout/success" in row]
-            note = f"success {sum(success) / len(success):.2f}" if success else ""
-            progress.update(run.steps(iteration), note)
-            if preempted:
-                problem = f"SIGTERM stopped the training after {run.steps(iteration):,} steps"
-                raise Preempted(problem, cure="continue it with --resume")
-    for log in run.logs:
-        if log.divergence is not None:
-            raise log.divergence
+        Raises:
+            DataError: All checkpoints are damaged, or seeds have none of the same step.
+        """
+        template = self.program.seeds.member_shapes(self.program.shapes)
+        steps = [set(log.checkpoints.steps()) for log in logs]
+        errors: list[DataError] = []
+        for step in sorted(set.intersection(*steps), reverse=True):
+            try:
+                states = [_healthy_state(log.checkpoints, template, step) for log in logs]
+            except DataError as error:
+                errors.append(error)
+                continue
+            for error in errors:
+                self.log(f"warning: {error.file}: {error.problem}; resumes from step {step:,}")
+            return step, states
+        if errors:
+            raise errors[0]
+        # A process that is killed at the first checkpoint has written that of some seeds.
+        if all(steps) or max(map(len, steps)) > 1:
+            problem = "the seeds have no checkpoint of the same step"
+            raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
+        return None, []
 
+    def _check(
+        self, iteration: int, state: LearnerState, rows: list[dict[str, float]], finite: np.ndarray
+    ) -> None:
+        """Stop each seed whose rewards, losses or trained leaves are not finite; warn of large values."""
+        seeds, steps = self.program.seeds, self._steps(iteration)
+        for number, log in enumerate(self.logs):
+            if log.stopped:
+                continue
+            problem = nonfinite_log(rows[number])
+            if problem is None and not finite[number]:
+                problem = nonfinite_leaf(seeds.member(state, number))
+            if problem is not None:
+                log.write(steps, rows[number])
+                self._stop_diverged(number, steps, problem)
+                continue
+            for warning in log.new_warnings(rows[number]):
+                place = f"seed {seeds.seeds[number]}: {warning} at {steps:,} steps"
+                self.log(f"warning: {place}: training may diverge")
 
-def _start(run: _Run) -> tuple[int, Any]:
-    """Return the number of finished iterations and the state: of the newest checkpoint of all seeds, or initial."""
-    program = run.program
-    unfinished = [log for log in run.logs if not log.out_of_patience]
-    if all(log.divergence is not None for log in unfinished):
-        # The user may have corrected a reward term.
-        for log in unfinished:
-            log.retry()
-    active = [number for number, log in enumerate(run.logs) if not log.stopped]
-    if not active:
-        return run.config.iterations, None
-    logs = [run.logs[number] for number in active]
-    step, states = _restore(run, logs)
-    for log in logs:
-        log.start(step)
-    if step is None:
-        networks = run.networks
-        if networks is None:
-            networks = pretrained_networks(run.config.begin_from, program, run.log)
-        return 0, initial_state(program, networks)
-    # Seeds that stopped write nothing more: they take the state of another.
-    restored = dict(zip(active, states, strict=True))
-    states = [restored.get(number, states[0]) for number in range(len(run.logs))]
-    return step // run.config.algorithm.steps_per_iteration, program.state_of(states)
+    def _stop_diverged(self, number: int, steps: int, problem: str) -> None:
+        self.logs[number].diverge(steps, problem)
+        if len(self.logs) > 1:
+            self.log(f"seed {self.program.seeds.seeds[number]}: diverged at {steps:,} steps: {problem}")
 
+    def _record(
+        self, iteration: int, state: LearnerState, rows: list[dict[str, float]], preempted: bool
+    ) -> None:
+        """Log, validate and save one iteration of every seed that has not stopped."""
+        config, seeds, steps = self.config, self.program.seeds, self._steps(iteration)
+        last = iteration == config.iterations
+        evaluates = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+        saves = last or evaluates or preempted or iteration % config.checkpoint_every == 0
+        logs = [(number, log) for number, log in enumerate(self.logs) if not log.stopped]
+        for number, log in logs:
+            row = rows[number]
+            if evaluates and self.validation is not None:
+                try:
+                    row |= self._validate(self.validation, state, number)
+                except DivergenceError as error:
+                    self._stop_diverged(number, steps, error.problem)
+            rank = log.write(steps, row)
+            if saves and log.divergence is None:
+                log.save(steps, seeds.member(state, number), rank)
+            if log.out_of_patience and not last:
+                problem = f"no better for {config.patience} validations, stopped at {steps:,} steps"
+                self.log(f"seed {seeds.seeds[number]}: {problem}")
+        # Not before all seeds have a checkpoint of this step, so that a killed run can resume.
+        for _, log in logs if saves else ():
+            log.checkpoints.delete_superseded()
 
-def _restore(run: _Run, logs: Sequence[TrainingLog]) -> tuple[int | None, list[Any]]:
-    """Return the newest step of which each seed has a healthy checkpoint, and their states; None without any.
-
-    Raises:
-        DataError: All checkpoints are damaged, or seeds have none of the same step.
-    """
-    template = run.program.seeds.member_shapes(run.program.shapes)
-    steps = [set(log.checkpoints.steps()) for log in logs]
-    errors: list[DataError] = []
-    for step in sorted(set.intersection(*steps), reverse=True):
-        try:
-            states = [_healthy_state(log.checkpoints, template, step) for log in logs]
-        except DataError as error:
-            errors.append(error)
-            continue
-        for error in errors:
-            run.log(f"warning: {error.file}: {error.problem}; resumes from step {step:,}")
-        return step, states
-    if errors:
-        raise errors[0]
-    # A process that is killed at the first checkpoint has written that of some seeds.
-    if all(steps) or max(map(len, steps)) > 1:
-        problem = "the seeds have no checkpoint of the same step"
-        raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
-    return None, []
+    def _validate(self, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:
+        """Validate one seed, on the first device."""
+        seeds, device = self.program.seeds, self.program.devices[0]
+        parameters = jax.device_put(seeds.member(state.parameters, number), device)
+        planner = seeds.learner.planner(parameters, "policy", samples=False)
+        traffic = find_traffic(self.config.validation_traffic, self.trust)
+        row = validate(planner, validation, self.config.task, traffic)
+        if isinstance(seeds.learner, HeldOutMetrics):
+            member = jax.device_put(seeds.member(state, number), device)
+            metrics = seeds.learner.held_out_metrics(validation.data, member)
+            row |= {f"validation/{name}": value for name, value in metrics.items()}
+        return row
 
 
 def _healthy_state(checkpoints: Checkpoints, template: Any, step: int) -> Any:
@@ -401,74 +466,6 @@ def _healthy_state(checkpoints: Checkpoints, template: Any, step: int) -> Any:
         cure = "start again with --overwrite and a lower learning rate"
         raise DataError(f"checkpoint of step {step}: {problem}", file=checkpoints.folder, cure=cure)
     return state
-
-
-def _check(
-    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], finite: np.ndarray
-) -> None:
-    """Stop each seed whose rewards, losses or trained leaves are not finite; warn of large values."""
-    seeds, steps = run.program.seeds, run.steps(iteration)
-    for number, log in enumerate(run.logs):
-        if log.stopped:
-            continue
-        problem = nonfinite_log(rows[number])
-        if problem is None and not finite[number]:
-            problem = nonfinite_leaf(seeds.member(state, number))
-        if problem is not None:
-            log.write(steps, rows[number])
-            _stop_diverged(run, number, steps, problem)
-            continue
-        for warning in log.new_warnings(rows[number]):
-            run.log(
-                f"warning: seed {seeds.seeds[number]}: {warning} at {steps:,} steps: training may diverge"
-            )
-
-
-def _stop_diverged(run: _Run, number: int, steps: int, problem: str) -> None:
-    run.logs[number].diverge(steps, problem)
-    if len(run.logs) > 1:
-        run.log(f"seed {run.program.seeds.seeds[number]}: diverged at {steps:,} steps: {problem}")
-
-
-def _record(
-    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], preempted: bool
-) -> None:
-    """Log, validate and save one iteration of every seed that has not stopped."""
-    config, steps = run.config, run.steps(iteration)
-    last = iteration == config.iterations
-    evaluates = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
-    saves = last or evaluates or preempted or iteration % config.checkpoint_every == 0
-    logs = [(number, log) for number, log in enumerate(run.logs) if not log.stopped]
-    for number, log in logs:
-        row = rows[number]
-        if evaluates and run.validation is not None:
-            try:
-                row |= _validation(run, run.validation, state, number)
-            except DivergenceError as error:
-                _stop_diverged(run, number, steps, error.problem)
-        rank = log.write(steps, row)
-        if saves and log.divergence is None:
-            log.save(steps, run.program.seeds.member(state, number), rank)
-        if log.out_of_patience and not last:
-            seed, patience = run.program.seeds.seeds[number], config.patience
-            run.log(f"seed {seed}: no better for {patience} validations, stopped at {steps:,} steps")
-    # Not before all seeds have a checkpoint of this step, so that a killed run can resume.
-    for _, log in logs if saves else ():
-        log.checkpoints.delete_superseded()
-
-
-def _validation(run: _Run, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:
-    """Validate one seed, on the first device."""
-    seeds, device = run.program.seeds, run.program.devices[0]
-    parameters = jax.device_put(seeds.member(state.parameters, number), device)
-    planner = seeds.learner.planner(parameters, "policy", samples=False)
-    traffic = find_traffic(run.config.validation_traffic, run.trust)
-    row = validate(planner, validation, run.config.task, traffic)
-    if isinstance(seeds.learner, HeldOutMetrics):
-        member = jax.device_put(seeds.member(state, number), device)
-        metrics = seeds.learner.held_out_metrics(run.held_out_data, member)
-        row |= {f"validation/{name}": value for name, value in metrics.items()}
-    return row
 
 
 @dataclass(frozen=True)
@@ -549,7 +546,7 @@ def replace_networks(state: Any, networks: Mapping[str, Any], at: str = "") -> A
 
 
 def _networks(state: Any, at: str = "") -> dict[str, Any]:
-    """Networks of a state by their paths."""
+    """Return the networks of a state by their paths."""
     networks: dict[str, Any] = {}
     for _, path, value in _fields(state, at):
         if _is_state(value):
@@ -560,7 +557,7 @@ def _networks(state: Any, at: str = "") -> dict[str, Any]:
 
 
 def _fields(state: Any, at: str) -> Iterable[tuple[str, str, Any]]:
-    """Name, path and value of the fields of a state that hold networks."""
+    """Yield name, path and value of the fields of a state that hold networks."""
     for name in getattr(type(state), "networks", ("parameters",)):
         yield name, f"{at}.{name}", getattr(state, name)
 
@@ -570,7 +567,7 @@ def _is_state(value: Any) -> bool:
 
 
 def _source(path: str, stored: Iterable[str]) -> str | None:
-    """Path of a network in a checkpoint: its name in the state, or in the learner of a warm start."""
+    """Return the path of a network in a checkpoint: its name in the state, or in the learner of a warm start."""
     name = path[path.rindex(".") :]
     for source in (name, f".learner{name}"):
         if any(is_part(leaf, [source]) for leaf in stored):

@@ -66,8 +66,8 @@ class Mixture:
         for name, block in self.blocks:
             before = getattr(data, "traffic", ())
             data = block.prepare(data)
-            kept = [id(record) for record in getattr(data, "traffic", ())]
-            if not all(id(record) in kept for record in before):
+            after = [id(record) for record in getattr(data, "traffic", ())]
+            if not all(id(record) in after for record in before):
                 cure = "mix at most one trained policy, and one kind of reactive vehicles"
                 raise UsageError(f"traffic {name} replaces data of another traffic", cure=cure)
         return data
@@ -94,10 +94,6 @@ class Mixture:
     def stored(self, state: Any) -> NoReturn:
         """Refuse replay buffers of states: those of the blocks differ."""
         refuse_stored_states("a mixture of traffic")
-
-    def observe(self, data: ScenarioBank, stored: Any) -> NoReturn:
-        """Refuse, as :meth:`stored`."""
-        self.stored(stored)
 
     def observe_all(self, data: ScenarioBank, stored: Any) -> NoReturn:
         """Refuse, as :meth:`stored`."""

@@ -133,7 +133,7 @@ class PolicyTraffic(PlannerTraffic):
         return f"driven_by_{Path(self.run).name}{base}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """Return the bank with the policy, and with what ``base`` needs; DataError if the checkpoint is damaged."""
+        """Return the bank with the policy, and with what ``base`` needs."""
         bank = super().prepare(bank)
         return with_driver(bank, load_policy(self.run, bank, samples=self.samples, trust=self.trust)[0])
 

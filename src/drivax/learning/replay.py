@@ -121,23 +121,26 @@ class ReplayBuffer:
         )
 
     def add(self, replay: Replay, rollout: Rollout) -> Replay:
-        """Write a rollout over the oldest rows; UsageError if it has more steps than the buffer has rows.
+        """Write a rollout over the oldest rows.
 
         The rollout must continue the last one, keep states or observations according to ``store``, and have raw actions
         in [-1, 1].
+
+        Raises:
+            UsageError: It has more steps than the buffer has rows.
         """
         rows, steps = replay.reward.shape[0], rollout.reward.shape[0]
         if steps > rows:
             problem = f"{steps} steps do not fit a replay buffer of {rows} rows"
             raise UsageError(problem, cure="raise replay.capacity")
         observation = rollout.observation
-        new = {name: getattr(rollout, name) for name in ("reward", "terminated", "alive")}
-        new |= {"action": rollout.raw_action}
-        new |= {"stored": rollout.state if observation is None else _cast(observation, jnp.bfloat16)}
+        stored = rollout.state if observation is None else _cast(observation, jnp.bfloat16)
+        new = {"stored": stored, "action": rollout.raw_action}
+        new |= {name: getattr(rollout, name) for name in ("reward", "terminated", "alive")}
         old = {name: getattr(replay, name) for name in new}
         index = (replay.next_row + jnp.arange(steps)) % rows
-        written = jax.tree.map(lambda ring, values: ring.at[index].set(values), old, new)
-        return replace(replay, **written, next_row=(replay.next_row + steps) % rows)
+        columns = jax.tree.map(lambda ring, values: ring.at[index].set(values), old, new)
+        return replace(replay, **columns, next_row=(replay.next_row + steps) % rows)
 
     def draw(self, replay: Replay, key: Array, shape: tuple[int, ...]) -> ReplayIndex:
         """Draw steps uniformly, with replacement, among those with a successor, of which there must be one.
@@ -170,10 +173,10 @@ class ReplayBuffer:
         )
 
         def observe(row: Array) -> dict[str, Array]:
-            kept = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
+            sampled = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
             if replay.store == "state":
-                return self.environment.observe_all(data, kept)
-            return _cast(kept, jnp.float32)
+                return self.environment.observe_all(data, sampled)
+            return _cast(sampled, jnp.float32)
 
         return Transitions(
             observation=observe(row),

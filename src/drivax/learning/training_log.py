@@ -40,10 +40,11 @@ _ORDER = ("accuracy", "progress_ratio", "comfortable")
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out scenarios that rank checkpoints."""
+    """Held-out scenarios that rank checkpoints, and the ``data`` of a learner's metrics on them, None without any."""
 
     bank: ScenarioBank
     names: Sequence[Mapping[str, str]]
+    data: Any = None
 
     @classmethod
     def of(cls, data: Iterable[Scenario]) -> Validation:

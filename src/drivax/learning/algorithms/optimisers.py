@@ -11,6 +11,7 @@ import optax
 from jaxtyping import Array
 
 from drivax.errors import UsageError
+from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.program import device_count, sum_over_devices
 
 #: Samples per chunk and CPU: intermediate results of a gradient stay in the second-level cache.
@@ -48,6 +49,16 @@ def sum_gradients(
     # Fusions with the surrounding program would round differently in each program.
     inputs = jax.lax.optimization_barrier((parameters, samples))
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
+
+
+def add_auxiliary(
+    loss: AuxiliaryLoss | None, parameters: Any, key: Array, logs: dict[str, Array], gradient: Any
+) -> tuple[dict[str, Array], Any]:
+    """Add the values that an auxiliary loss logs to ``logs``, and its gradient to ``gradient``."""
+    if loss is None:
+        return logs, gradient
+    auxiliary_gradient, auxiliary_logs = jax.grad(loss, has_aux=True)(parameters, key)
+    return auxiliary_logs | logs, jax.tree.map(jnp.add, gradient, auxiliary_gradient)
 
 
 def clipped_adam(

@@ -13,14 +13,9 @@ from flax import nnx
 from jaxtyping import Array, Bool
 
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.averaging import (
-    average,
-    check_average,
-    trained_parameters,
-    unless_first,
-)
+from drivax.learning.algorithms.averaging import average, check_average, trained_parameters, unless_first
 from drivax.learning.algorithms.constraints import Constraints
-from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
+from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -37,6 +32,9 @@ from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import clipped_surrogate_loss, generalised_advantages
 from drivax.scenario.record import record
+
+#: Parameters, the optimiser's state, and whether ``target_kl`` stopped the updates.
+_Carry = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -222,48 +220,51 @@ class Ppo:
 
         The state is the one that the rollout was sampled with, with the environments after it.
         """
-        config, first = self.config, trained_parameters(state)
+        config, before = self.config, trained_parameters(state)
         _, update_key, key = jax.random.split(state.key, 3)
         if self.past is not None:
             rollout = replace(rollout, alive=rollout.alive.at[:, self.past.environments].set(False))
         reward, multipliers, constraint_logs = self.constraints.update(state.multipliers, rollout)
         rollout = replace(rollout, reward=reward)
-        batch = self._batch(rollout, self.network(first).value(state.environments.observation))
-
-        def epoch(carry: tuple[Any, ...], key: Array) -> tuple[tuple[Any, ...], dict[str, Array]]:
-            order_key, noise_key = jax.random.split(key)
-            order = jax.random.permutation(order_key, config.steps_per_iteration)
-            chunk = chunk_size(config.steps_per_iteration // config.minibatches)
-            order = order.reshape(config.minibatches, -1, chunk)
-            # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
-            shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=2)
-            keys = jax.random.split(noise_key, config.minibatches)
-            return jax.lax.scan(update, carry, (shuffled, keys))
-
-        def update(carry: tuple[Any, ...], inputs: tuple[Any, Array]) -> tuple[Any, dict[str, Array]]:
-            (parameters, optimiser, stops), (minibatch, key) = carry, inputs
-            logs, gradient = self._gradient(parameters, minibatch, key, auxiliary_loss)
-            logs["gradient_norm"] = optax.tree.norm(gradient)
-            change, updated = self.optimiser.update(gradient, optimiser, parameters)
-            updated = (optax.apply_updates(parameters, change), updated)
-            if config.target_kl is not None:
-                stops |= logs["kl"] > config.target_kl
-                updated = jax.tree.map(partial(jnp.where, stops), (parameters, optimiser), updated)
-                logs["skipped_share"] = stops.astype(jnp.float32)
-            return (*updated, stops), logs
-
-        carry, keys = (
-            (first, state.optimiser, jnp.zeros((), bool)),
-            jax.random.split(update_key, config.epochs),
-        )
+        batch = self._batch(rollout, self.network(before).value(state.environments.observation))
+        carry = (before, state.optimiser, jnp.zeros((), bool))
+        epoch, keys = partial(self._epoch, batch, auxiliary_loss), jax.random.split(update_key, config.epochs)
         (parameters, optimiser, _), logs = jax.lax.scan(epoch, carry, keys)
         if settling is not None:
-            fixed = nnx.State({**parameters.raw_mapping, "policy": first.raw_mapping["policy"]})
+            fixed = nnx.State({**parameters.raw_mapping, "policy": before.raw_mapping["policy"]})
             parameters = jax.tree.map(partial(jnp.where, settling), fixed, parameters)
         losses = {f"loss/{name}": value.mean() for name, value in (logs | constraint_logs).items()}
         after = replace(state, optimiser=optimiser, key=key, iteration=state.iteration + 1)
         past, averaged = self._past(state, parameters), average(state, parameters, config.average)
         return replace(after, multipliers=multipliers, past=past, **averaged), losses
+
+    def _epoch(
+        self, batch: dict[str, Any], auxiliary_loss: AuxiliaryLoss | None, carry: _Carry, key: Array
+    ) -> tuple[_Carry, dict[str, Array]]:
+        """Shuffle a flattened rollout, and take an update on each of its minibatches."""
+        order_key, noise_key = jax.random.split(key)
+        steps, minibatches = self.config.steps_per_iteration, self.config.minibatches
+        order = jax.random.permutation(order_key, steps)
+        order = order.reshape(minibatches, -1, chunk_size(steps // minibatches))
+        # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
+        shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=2)
+        keys = jax.random.split(noise_key, minibatches)
+        return jax.lax.scan(partial(self._update, auxiliary_loss), carry, (shuffled, keys))
+
+    def _update(
+        self, auxiliary_loss: AuxiliaryLoss | None, carry: _Carry, inputs: tuple[dict[str, Any], Array]
+    ) -> tuple[_Carry, dict[str, Array]]:
+        """Take an update on a minibatch, unless ``target_kl`` stops the updates of this iteration."""
+        (parameters, optimiser, stops), (minibatch, key) = carry, inputs
+        logs, gradient = self._gradient(parameters, minibatch, key, auxiliary_loss)
+        logs["gradient_norm"] = optax.tree.norm(gradient)
+        change, next_optimiser = self.optimiser.update(gradient, optimiser, parameters)
+        after = (optax.apply_updates(parameters, change), next_optimiser)
+        if self.config.target_kl is not None:
+            stops |= logs["kl"] > self.config.target_kl
+            after = jax.tree.map(partial(jnp.where, stops), (parameters, optimiser), after)
+            logs["skipped_share"] = stops.astype(jnp.float32)
+        return (*after, stops), logs
 
     def _past(self, state: PpoState, parameters: Any) -> Any:
         """Return the older copy after an iteration, given the new parameters; None without any."""
@@ -315,11 +316,7 @@ class Ppo:
         logs, gradient = sum_gradients(self._loss, parameters, samples)
         variance = jnp.maximum(deviations(target)[1], 1e-8)
         logs["explained_variance"] = 1.0 - logs["value"] / variance
-        if auxiliary_loss is None:
-            return logs, gradient
-        auxiliary = jax.grad(auxiliary_loss, has_aux=True)
-        auxiliary_gradient, auxiliary_logs = auxiliary(parameters, auxiliary_key)
-        return auxiliary_logs | logs, jax.tree.map(jnp.add, gradient, auxiliary_gradient)
+        return add_auxiliary(auxiliary_loss, parameters, auxiliary_key, logs, gradient)
 
     def _loss(self, parameters: Any, samples: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
         """Return the weighted sum of the samples' losses, and sums to log."""

@@ -19,7 +19,7 @@ from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
-from drivax.learning.algorithms.optimisers import chunk_size, clipped_adam, sum_gradients
+from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -314,12 +314,8 @@ class Sac(OffPolicy[SacConfig]):
         samples = (transitions, jax.random.split(key, (count, 2)))
         samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
         logs, gradient = sum_gradients(share_of_loss, trained, samples)
-        if auxiliary_loss is None:
-            return logs, gradient
-        auxiliary = jax.grad(auxiliary_loss, has_aux=True)
-        auxiliary_gradient, auxiliary_logs = auxiliary(trained.policy, auxiliary_key)
-        policy = jax.tree.map(jnp.add, gradient.policy, auxiliary_gradient)
-        return auxiliary_logs | logs, replace(gradient, policy=policy)
+        logs, policy = add_auxiliary(auxiliary_loss, trained.policy, auxiliary_key, logs, gradient.policy)
+        return logs, replace(gradient, policy=policy)
 
     def loss(
         self, trained: SacParameters, target: Any, batch: Transitions, keys: Array
