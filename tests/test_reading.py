@@ -138,7 +138,9 @@ def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
         read_json(tmp_path / "c", "again")
 
 
-@pytest.mark.parametrize("read", [lambda file: list(read_rows(file)), _read_columns, city])
+@pytest.mark.parametrize(
+    "read", [lambda file: list(read_rows(file)), lambda file: _read_columns(file, 9), city]
+)
 def test_logs_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
     """Values take up to 27 times as much memory as their text."""
     file = tmp_path / "large"
@@ -146,6 +148,15 @@ def test_logs_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
     os.truncate(file, 75 << 20)  # sparse
     with pytest.raises(DataError, match="has 79 MB, more than the 67 MB that are read"):
         read(file)
+
+
+def test_large_evaluations_have_large_tables(tmp_path):
+    file = tmp_path / "episodes.csv"
+    file.touch()
+    for size, scenarios, most in ((130 << 20, 100_000, "102 MB"), (2 << 30, 10**9, "537 MB")):
+        os.truncate(file, size)  # sparse
+        with pytest.raises(DataError, match=f"more than the {most} that are read"):
+            _read_columns(file, scenarios)
 
 
 def test_threads_parse_headers_in_turn(monkeypatch):

@@ -87,13 +87,13 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
         return file.read_bytes()
 
 
-def read_text(file: Path, cure: str) -> str:
+def read_text(file: Path, cure: str, most: int = MOST_TEXT) -> str:
     """Return the content of a UTF-8 file.
 
     Raises:
-        DataError: It is missing, larger than :data:`MOST_TEXT`, or not text.
+        DataError: It is missing, larger than ``most`` bytes, or not text.
     """
-    data = read_bytes(file, cure)
+    data = read_bytes(file, cure, most)
     with explain_damage(file, cure, "is not text"):
         return data.decode()
 

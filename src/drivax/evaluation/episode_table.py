@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections import defaultdict
@@ -18,7 +19,7 @@ from jaxtyping import Float, Float32, Int16, Int64
 from drivax.errors import DataError
 from drivax.escaping import csv_rows, csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
-from drivax.reading import explain_damage, read_arrays, read_json, read_text
+from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, read_arrays, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
@@ -44,6 +45,8 @@ NOT_SUMMARISED = tuple(name for name, column in COLUMNS.items() if not column.su
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
+#: Largest table: bytes of a row, of which most have 300, and of all.
+_MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
 #: Largest trajectories: bytes of all, and more per episode than any capacity takes.
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
@@ -119,7 +122,7 @@ class EpisodeTable:
         if run.kind != "evaluation":
             problem, file = f"run is of kind {run.kind!r}, not evaluation", run.path / "run.json"
             raise DataError(problem, file=file, cure="give a folder written by drivax evaluate")
-        keys, metrics = _read_columns(run.path / "episodes.csv")
+        keys, metrics = _read_columns(run.path / "episodes.csv", _count_scenarios(run.info))
         crashes = _read_crashes(run.path / "crashes.json")
         for file in (CONFIG_FILE, "summary.json"):
             check_seal(run.path / file)
@@ -296,9 +299,17 @@ def _cell(value: Any) -> str:
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
 
-def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
+def _count_scenarios(info: Mapping[str, Any]) -> int:
+    """Return the number of scenarios of an evaluation, or 0 if its ``run.json`` does not say it."""
+    with contextlib.suppress(*DAMAGE):
+        return sum(int(data["scenarios"]) for data in info["data"])
+    return 0
+
+
+def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    text = read_text(require_file(path, _RERUN), _RERUN)
+    most = min(max(MOST_TEXT, scenarios * _MOST_ROW_BYTES), _MOST_TABLE_BYTES)
+    text = read_text(require_file(path, _RERUN), _RERUN, most)
     with explain_damage(path, _RERUN, "cannot be read"):
         rows = csv_rows(text)
     header = rows[0] if rows else []
