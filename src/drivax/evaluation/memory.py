@@ -49,16 +49,16 @@ def free_memory(device: Any) -> int | None:
     return max(min(free), 0) if free else memory_of(device)
 
 
-def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> int:
-    """Return the number of scenarios that fit in half of the free memory, at least ``lanes``.
+def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:
+    """Return the number of scenarios to load at a time: as many as fit in half of the free memory.
 
-    ``lanes`` is the number of scenarios of a program call. A scenario exists twice while its bank is built. ``free``
-    is in bytes, or None if unknown.
+    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`. A scenario exists twice
+    while its bank is built. ``free`` is in bytes, or None if unknown, for :data:`MOST` scenarios.
     """
     if free is None:
         return MOST
-    available = free // 2 - lanes * _PROGRAM_BYTES
-    return int(min(max(available // (2 * scenario_bytes), lanes), MOST))
+    available = free // 2 - width * _PROGRAM_BYTES
+    return int(min(max(available // (2 * scenario_bytes), width), MOST))
 
 
 @contextmanager

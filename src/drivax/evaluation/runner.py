@@ -49,7 +49,7 @@ from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
 #: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
-LANES, LANES_ELSEWHERE = 16, 256
+CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
 #: Maximum number of scenarios in an error message, and of crashes in a list.
 _MAX_NAMED = _MAX_LISTED = 5
 #: Columns of the headline table, with their short names.
@@ -62,9 +62,9 @@ Names = Sequence[Mapping[str, str]]
 Progress = Callable[[int, int], None]
 
 
-def lanes() -> int:
+def program_width() -> int:
     """Return the number of scenarios per program call on this platform."""
-    return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
+    return CPU_WIDTH if jax.default_backend() == "cpu" else ACCELERATOR_WIDTH
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
 def _batch_size(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
     """Return the number of scenarios that fit in memory at a time."""
     single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
-    return scenarios_at_a_time(single.nbytes, lanes(), free_memory(jax.devices()[0]))
+    return scenarios_at_a_time(single.nbytes, program_width(), free_memory(jax.devices()[0]))
 
 
 def _banks(
@@ -335,7 +335,7 @@ class _Evaluation:
 
     def episodes(self, bank: ScenarioBank) -> Iterator[Episodes]:
         """Run the scenarios of a bank in order, and yield their episodes in batches."""
-        bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
+        bank, width = prepare_bank(self.simulator.traffic, bank), program_width()
         index = jnp.arange(width, dtype=jnp.int32)
         for first in range(0, len(bank), width):
             count = min(width, len(bank) - first)
