@@ -16,7 +16,7 @@ from typing import Any
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.runner import evaluate, lanes
+from drivax.evaluation.runner import evaluate, program_width
 from drivax.learning.policies import find_traffic
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
@@ -48,7 +48,7 @@ def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, 
         progress=lambda done, whole: ends.append(time.perf_counter()),
     )
     batch = (ends[-1] - ends[0]) / (len(ends) - 1)
-    return 1000 / lanes() * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
+    return 1000 / program_width() * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
 
 
 def measured(data: Path, planners: list[str]) -> dict[str, Any]:
