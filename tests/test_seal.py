@@ -312,3 +312,11 @@ def test_policies_of_the_zoo_are_sealed(name):
     assert sorted(entries) == ["config.yaml", "policy.npz", "run.json"]
     for file in entries:
         check_seal(policy_folder(name) / file)
+
+
+def test_resumed_training_deletes_what_its_end_did_not(tmp_path):
+    """A kill between writing a checkpoint and deleting the one that it supersedes leaves both."""
+    run = RunFolder.open(training(tmp_path / "run"))
+    with TrainingLog(run, "score", keep=1, patience=0) as log:
+        log.start(200)
+        assert log.checkpoints.steps() == [200]

@@ -187,9 +187,10 @@ class TrainingLog:
     def start(self, step: int | None) -> None:
         """Open a new log, or the log of the run up to a step.
 
-        Later rows and checkpoints, and files of killed processes, are deleted.
+        Later rows and checkpoints, superseded checkpoints, and files of killed processes are deleted.
         """
         self.checkpoints.drop_after(-1 if step is None else step)
+        self.checkpoints.delete_superseded()
         for leftover in self.folder.path.glob(".*.partial*"):
             if leftover.is_file():
                 leftover.unlink()

@@ -317,10 +317,10 @@ def _train_and_evaluate_arm(job: Job) -> float:
     start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(refuse_link(run / "checkpoints")).steps()
-    if config.iterations * config.algorithm.steps_per_iteration not in steps:
-        _check_not_evaluated(job, steps)
-        validation = ScenarioSet.open(study.sets.validation)
-        train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
+    _check_not_evaluated(job, steps)
+    validation = ScenarioSet.open(study.sets.validation)
+    # A finished training ends at once, and deletes what its interruption left.
+    train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])
     for name in study.evaluations(job.arm):
