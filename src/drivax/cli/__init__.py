@@ -55,8 +55,8 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
-#: Until a signal that came at a bad moment is sent again (s).
-_LATER_S = 0.01
+#: Until a signal that came at a bad moment is sent again, at first and at most (s).
+_LATER_S, _LATEST_S = 0.01, 0.5
 COMMANDS = {
     "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
     "doctor": Command("what is installed, or what a file or folder contains"),
@@ -149,10 +149,15 @@ def _stop_at_signals() -> Iterator[None]:
     previous = {number: signal.getsignal(number) for number in signals}
     handled = [n for n in signals if previous[n] in (signal.SIG_DFL, signal.default_int_handler)]
     report_unraisable = sys.unraisablehook
+    wait_s = _LATER_S
 
     def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal wait_s
         if _is_bad_moment(frame):
-            _send_later(number)
+            _send_later(number, wait_s)
+            wait_s = min(
+                2 * wait_s, _LATEST_S
+            )  # On a busy machine, a signal every 10 ms takes all of the time.
         elif number == signal.SIGINT:
             raise KeyboardInterrupt
         else:
@@ -167,7 +172,7 @@ def _stop_at_signals() -> Iterator[None]:
             return
         for number in handled:
             signal.signal(number, stop)
-        _send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT)
+        _send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _LATER_S)
 
     try:
         sys.unraisablehook = stop_later
@@ -190,9 +195,9 @@ def _is_bad_moment(frame: FrameType | None) -> bool:
     return False
 
 
-def _send_later(number: int) -> None:
+def _send_later(number: int, wait_s: float) -> None:
     """Send a signal to this process again, from a thread."""
-    timer = threading.Timer(_LATER_S, os.kill, (os.getpid(), number))
+    timer = threading.Timer(wait_s, os.kill, (os.getpid(), number))
     timer.daemon = True
     timer.start()
 
