@@ -572,6 +572,7 @@ def _call_on_disk() -> int:
 def main() -> int:
     """Return 1 if an output differed, a command hung or failed, or a file was left."""
     args = _parse()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # A job in the background would ignore it.
     if args.mode == "page":
         _write_page()
         return 0

@@ -61,6 +61,18 @@ def test_dead_worker_is_one_line(tasks):
         futures[0].result()
 
 
+def test_workers_ignore_what_their_parent_ignores():
+    """A shell's background job ignores Ctrl-C."""
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with worker_pool(1) as pool:
+            worker = pool.submit(os.getpid).result()
+            os.kill(worker, signal.SIGINT)
+            assert pool.submit(os.getpid).result() == worker
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
 @pytest.mark.parametrize("end", ["time.sleep(60)", "pool.submit(time.sleep, 60); time.sleep(60)"])
 def test_workers_end_with_a_killed_parent(tmp_path, end):
     (tmp_path / "program.py").write_text(PROGRAM.format(end=end))

@@ -114,8 +114,9 @@ def _start(core_queue: Any) -> None:
     if core_queue is not None:
         # JAX starts one thread per core, so restrict the cores first.
         os.sched_setaffinity(0, {core_queue.get()})
-    # On Ctrl-C, workers exit at once and silently; the parent cleans up.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # On Ctrl-C, workers exit at once and silently; the parent cleans up, unless it ignores the signal (cmd &).
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
