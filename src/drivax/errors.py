@@ -101,9 +101,7 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
     ``file`` counts if the system's error names none. Other errors are None.
     """
     number = getattr(error, "errno", None)
-    if isinstance(error, MemoryError) or (
-        isinstance(error, ImportError) and "failed to map segment" in str(error)
-    ):
+    if isinstance(error, MemoryError):
         number = errno.ENOMEM
     elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         number = errno.EAGAIN
@@ -122,8 +120,11 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
 def check_memory_limit() -> None:
     """Raise a UsageError if this process may take so little memory that JAX would abort it."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY and (error := explain_system(MemoryError())):
-        raise error
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
+        problem = (
+            f"JAX needs {_LEAST_MEMORY // 1024} kB of memory, the limit of this process is {limit // 1024}"
+        )
+        raise UsageError(problem, cure="raise the limit: ulimit -v unlimited")
 
 
 def missing_package(error: ImportError) -> UsageError | None:

@@ -182,14 +182,16 @@ def test_closed_pipe_is_not_an_error():
     assert (result.stdout, result.stderr) == ("d", "")
 
 
-@pytest.mark.parametrize("limit", ["300000", "700000", "1300000"])
-def test_low_memory_limit_is_one_line(limit):
-    shell = f"ulimit -v {limit}; exec '{sys.executable}' -m drivax evaluate --planner idm --data missing --out run"
+@pytest.mark.parametrize(
+    "command", ["evaluate --planner idm --data none --out run", "inspect none", "doctor"]
+)
+@pytest.mark.parametrize("limit", ["500000", "1300000"])
+def test_low_memory_limit_is_one_line(limit, command):
+    shell = f"ulimit -v {limit}; exec '{sys.executable}' -m drivax {command}"
     result = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, check=False)
-    assert result.returncode in (1, 2) and result.stderr.startswith(
-        f"drivax: cannot allocate memory (limit of memory in kB: {limit}); "
-    ), result.stderr
-    assert result.stderr.count("\n") == 1
+    needed = "drivax: JAX needs 1433600 kB of memory, the limit of this process is"
+    assert result.stderr == f"{needed} {limit}; raise the limit: ulimit -v unlimited\n"
+    assert (result.returncode, result.stdout) == (2, "")
 
 
 class Callback:
@@ -237,6 +239,32 @@ def test_signals_wait_for_the_end_of_an_import(number, tmp_path, monkeypatch):
     finally:
         signal.signal(signal.SIGINT, previous)
     assert sys.modules["interrupted"].complete
+
+
+def test_import_that_never_ends_is_interrupted(tmp_path, monkeypatch):
+    (tmp_path / "endless.py").write_text(
+        "import os, time\nos.kill(os.getpid(), 15)\nwhile True: time.sleep(9)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(cli, "_PATIENCE_S", 0.2)
+    with pytest.raises(cli.Stopped), cli._stop_at_signals():
+        importlib.import_module("endless")
+
+
+def test_two_signals_in_an_import_wake_the_main_thread(tmp_path, monkeypatch):
+    numbers = [int(signal.SIGINT), int(signal.SIGTERM)]
+    code = f"import os, time\nfor number in {numbers}: os.kill(os.getpid(), number)\ntime.sleep(0.1)\n"
+    (tmp_path / "both.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    started = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
+            importlib.import_module("both")
+            time.sleep(20)
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert time.monotonic() - started < 10
 
 
 def test_interrupt_at_exit_prints_no_traceback():

@@ -16,6 +16,7 @@ import signal
 import sys
 import textwrap
 import threading
+import time
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -55,8 +56,8 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
-#: Until a signal that came at a bad moment is sent again, at first and at most (s).
-_LATER_S, _LATEST_S = 0.01, 0.5
+#: A signal that comes at a bad moment is sent again after the first time, and has an effect after the second (s).
+_LATER_S, _PATIENCE_S = 0.01, 10.0
 COMMANDS = {
     "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
     "doctor": Command("what is installed, or what a file or folder contains"),
@@ -123,7 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError):  # a terminal that hung up
             show(f"drivax: {escape_controls(line)}", sys.stderr)
     finally:
-        if argv is None:  # The process ends: Ctrl-C stops what JAX does at exit without a traceback.
+        # The process ends: Ctrl-C stops what JAX does at exit without a traceback.
+        if argv is None and signal.getsignal(signal.SIGINT) == signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
     return status
 
@@ -138,52 +140,80 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _stop_at_signals() -> Iterator[None]:
-    """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed; ignore them from then on.
+    """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed, and ignore them from then on.
 
-    These and Ctrl-C wait until an import is done, because modules of C++ crash when an exception interrupts their
-    initialisation, and until a worker process has its arguments. A signal that the process ignores already (nohup)
-    stays so. Only the main thread has signals.
+    A signal that the process ignores already (nohup) stays ignored. Python handles signals in its main thread only.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
     previous = {number: signal.getsignal(number) for number in signals}
-    handled = [n for n in signals if previous[n] in (signal.SIG_DFL, signal.default_int_handler)]
-    report_unraisable = sys.unraisablehook
-    wait_s = _LATER_S
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        nonlocal wait_s
-        if _is_bad_moment(frame):
-            _send_later(number, wait_s)
-            wait_s = min(
-                2 * wait_s, _LATEST_S
-            )  # On a busy machine, a signal every 10 ms takes all of the time.
-        elif number == signal.SIGINT:
-            raise KeyboardInterrupt
-        else:
-            for other in (signal.SIGTERM, signal.SIGHUP):
-                signal.signal(other, signal.SIG_IGN)
-            raise Stopped(signal.Signals(number))
-
-    def stop_later(lost: sys.UnraisableHookArgs) -> None:
-        # Python drops exceptions of callbacks, such as JAX's garbage collection callback: send the signal again.
-        if not isinstance(error := lost.exc_value, KeyboardInterrupt):
-            report_unraisable(lost)
-            return
-        for number in handled:
-            signal.signal(number, stop)
-        _send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _LATER_S)
-
+    stop = _SignalHandler([n for n in signals if previous[n] in (signal.SIG_DFL, signal.default_int_handler)])
     try:
-        sys.unraisablehook = stop_later
-        for number in handled:
-            signal.signal(number, stop)
+        stop.install()
         yield
     finally:
-        if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
-            sys.unraisablehook = report_unraisable
-        for number in handled:
+        stop.remove()
+        for number in stop.signals:
             signal.signal(number, previous[number])
+
+
+class _SignalHandler:
+    """Raises :class:`Stopped`, or KeyboardInterrupt at Ctrl-C, when an exception does no harm.
+
+    A signal waits until an import is done, because modules of C++ crash when an exception interrupts their
+    initialisation, and until a worker process has its arguments; but not longer than 10 s.
+    """
+
+    def __init__(self, signals: Sequence[signal.Signals]) -> None:
+        self.signals = signals
+        self._timers: dict[int, threading.Timer] = {}
+        self._first_s: dict[int, float] = {}
+        self._report_unraisable = sys.unraisablehook
+
+    def install(self) -> None:
+        """Handle the signals, and exceptions that Python drops."""
+        sys.unraisablehook = self._raise_again
+        for number in self.signals:
+            signal.signal(number, self)
+
+    def remove(self) -> None:
+        """Send no signal again."""
+        for timer in self._timers.values():
+            timer.cancel()
+        if sys.unraisablehook == self._raise_again:
+            sys.unraisablehook = self._report_unraisable
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal in the main thread, which executes ``frame``."""
+        now_s = time.monotonic()
+        waited_s = now_s - self._first_s.setdefault(number, now_s)
+        if waited_s < _PATIENCE_S and _is_bad_moment(frame):
+            # Ever later, because on a busy machine a signal every 10 ms takes all of the time.
+            self._send_later(number, max(_LATER_S, waited_s / 2))
+            return
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        for other in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(other, signal.SIG_IGN)
+        raise Stopped(signal.Signals(number))
+
+    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
+        # Python drops exceptions of callbacks, such as JAX's garbage collection callback.
+        error = dropped.exc_value
+        if not isinstance(error, KeyboardInterrupt):
+            self._report_unraisable(dropped)
+            return
+        self.install()
+        self._send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _LATER_S)
+
+    def _send_later(self, number: int, wait_s: float) -> None:
+        """Send a signal to the main thread again, which wakes it if it waits."""
+        if number in self._timers:
+            self._timers[number].cancel()
+        main_thread = threading.main_thread().ident
+        self._timers[number] = threading.Timer(wait_s, signal.pthread_kill, (main_thread, number))
+        self._timers[number].daemon = True
+        self._timers[number].start()
 
 
 def _is_bad_moment(frame: FrameType | None) -> bool:
@@ -193,13 +223,6 @@ def _is_bad_moment(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _send_later(number: int, wait_s: float) -> None:
-    """Send a signal to this process again, from a thread."""
-    timer = threading.Timer(wait_s, os.kill, (os.getpid(), number))
-    timer.daemon = True
-    timer.start()
 
 
 def describe(error: BaseException) -> tuple[str, int]:
@@ -263,9 +286,9 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
     if not use_cache:
         # Also for a folder of JAX's own variable, which is read when a command imports JAX.
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-    module = importlib.import_module(f"drivax.cli.{name}")
-    if "jax" in sys.modules:
+    if name != "convert":  # All others import JAX at once or later.
         check_memory_limit()
+    module = importlib.import_module(f"drivax.cli.{name}")
     if cache and "jax" in sys.modules:
         report_compilation(partial(show, file=sys.stderr))
     config = getattr(module, name.capitalize())
