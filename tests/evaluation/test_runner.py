@@ -298,3 +298,8 @@ def test_disk_space_is_checked_before_the_first_episode(scenarios, tmp_path, mon
     with pytest.raises(DataError, match=r"run: no space: needs about \d+ kB, the disk has 1 kB left"):
         run_evaluation(config, Expert(), ScenarioSet.open(tmp_path / "set"), tmp_path / "run")
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_unknown_options_are_refused():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'sed'"):
+        evaluate(Expert(), [], sed=3)

@@ -1,9 +1,9 @@
 """Digest of standard episodes: one value on all machines that simulate the same up to rounding.
 
-Rule-based planners drive 64 scenarios of the built-in world. The digest covers which metrics are defined, truths,
-counts and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would differ
-between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its unit
-that is farthest from all 64 values (docs/guide/reproducibility.md has distance and noise).
+Rule-based planners drive 64 scenarios of the built-in world. The digest covers truths, counts, which of them are
+defined, and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would
+differ between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its
+unit that is farthest from all 64 values (docs/guide/reproducibility.md has distance and noise).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from drivax.synthetic.generate import Generation, generate
 
 #: Number and seed of the scenarios; planners with their traffic.
 SCENARIOS, SEED = 64, 33
-DRIVES = (("constant_velocity", "log"), ("idm", "log"), ("idm", "idm"))
+ROLLOUTS = (("constant_velocity", "log"), ("idm", "log"), ("idm", "idm"))
 #: Units of the grids, metres.
 UNITS = {"distance": 2.0, "progress": 2.0, "goal_distance": 2.0, "ade": 1.0}
 #: Metrics that are truths or counts.
@@ -48,7 +48,7 @@ def standard_digests() -> Iterator[tuple[str, str]]:
         data = ScenarioSet.open(generate(Path(folder) / "set", SCENARIOS, SEED, options).path)
         yield "scenarios", data.hash[:16]
         digests = []
-        for planner, traffic in DRIVES:
+        for planner, traffic in ROLLOUTS:
             table = evaluate(PLANNERS[planner](), data, traffic=make_traffic(traffic))
             digests.append(episode_digest(table))
             yield f"{planner}, {traffic}", digests[-1]

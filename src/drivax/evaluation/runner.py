@@ -227,6 +227,8 @@ def evaluate(
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """
+    if unknown := sorted(options.keys() - Options.__annotations__.keys()):
+        raise TypeError(f"evaluate() got an unexpected keyword argument {unknown[0]!r}")
     batch, sizes, progress = options.get("batch"), options.get("sizes"), options.get("progress")
     start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
     if batch is not None and batch < 1:

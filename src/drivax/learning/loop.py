@@ -64,7 +64,7 @@ def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """Options of a call of :func:`train`; other than a :class:`TrainConfig` they are not saved in the run.
+    """Options of :func:`train`. Unlike those of :class:`TrainConfig`, they are not saved in the run.
 
     Attributes:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.

@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import sys
+import threading
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -35,6 +36,8 @@ _RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _OTHER = "use another checkpoint, or train again"
 _CHUNK_BYTES = 1 << 24
+#: Threads of Orbax end within this time after a failure (s).
+_LATE_S = 2.0
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
 
@@ -355,12 +358,22 @@ def _silence_writers() -> Iterator[None]:
         if str(lost.exc_value) != "Event loop is closed":
             report(lost)
 
+    def restore() -> None:
+        logger.setLevel(level)
+        if sys.unraisablehook is report_other:
+            sys.unraisablehook = report
+
     logger.setLevel(logging.CRITICAL)
     sys.unraisablehook = report_other
-    yield
-    # Not after an error or an interruption, because threads of Orbax still run and fail.
-    logger.setLevel(level)
-    sys.unraisablehook = report
+    try:
+        yield
+    except BaseException:
+        # Threads of Orbax still run, and fail.
+        timer = threading.Timer(_LATE_S, restore)
+        timer.daemon = True
+        timer.start()
+        raise
+    restore()
 
 
 def _load_arrays(

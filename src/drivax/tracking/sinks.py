@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import json
@@ -16,7 +17,7 @@ from drivax.errors import DataError
 from drivax.files import refuse_link, sync_and_close, write_text
 from drivax.reading import DAMAGE, read_text
 
-#: TensorBoard shows new values within this time (s).
+#: Least time between two flushes (s).
 _FLUSH_S = 10.0
 
 
@@ -72,7 +73,8 @@ class TensorBoard:
         self._next_flush = 0.0
         if resume_step is not None:
             start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
-            self._file.write_event(self._event(step=resume_step + 1, session_log=start))
+            now = time.time()
+            self._file.write_event(self._event(wall_time=now, step=resume_step + 1, session_log=start))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Add a scalar for each value."""
@@ -116,8 +118,9 @@ class MetricLog:
 
     def close(self) -> None:
         """Flush to disk."""
-        for sink in self.sinks:
-            sink.close()
+        with contextlib.ExitStack() as stack:
+            for sink in self.sinks:
+                stack.callback(sink.close)
 
     def __enter__(self) -> Self:
         return self
