@@ -1,8 +1,8 @@
 """Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
 Recorded data sets are mined for interactions, since most driving is on empty roads. This module rolls out a reference
-driver from several steps of the same traffic: it follows its leader and stops at red lights, but ignores all other
-agents. A collision shows that good driving takes more than car following.
+driver from several steps of the same traffic: it follows its leader and stops at red and yellow lights, but ignores all
+other agents. A collision shows that good driving takes more than car following.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ def _stop_line_m(
     for span in path.spans:
         if network.lanes[span.lane].control == Control.SIGNAL:
             distance = span.begin_m - front
-            shut = (colour[:, span.lane] == Colour.RED) | (colour[:, span.lane] == Colour.YELLOW)
-            result = np.minimum(result, np.where(shut & (distance > 0), distance, np.inf))
+            is_closed = (colour[:, span.lane] == Colour.RED) | (colour[:, span.lane] == Colour.YELLOW)
+            result = np.minimum(result, np.where(is_closed & (distance > 0), distance, np.inf))
     return result
 
 
@@ -139,9 +139,9 @@ def _hits(
     """Whether an agent overlaps ego and did not come from behind; agents that did are added to ``behind``."""
     half, side = size_m / 2
     near, far, right, left = extent
-    maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
-    behind |= maybe & ((near + far) / 2 <= at - half)
-    user, start = np.nonzero(maybe & ~behind)
+    is_close = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
+    behind |= is_close & ((near + far) / 2 <= at - half)
+    user, start = np.nonzero(is_close & ~behind)
     result = np.zeros(len(at), bool)
     if not len(user):
         return result
