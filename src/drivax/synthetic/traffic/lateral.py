@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve
 from drivax.synthetic.roads.network import RoadNetwork
@@ -46,16 +47,18 @@ def displace_path(
 ) -> tuple[Path, _Samples]:
     """Displace a path to the left by a smooth offset at each sample.
 
-    ``occupied`` are further lanes that the vehicle occupies, in positions of the old path. Returns the new path, and
-    the position on it of each sample of the old one, m.
+    ``occupied`` are further lanes that the vehicle occupies, in positions of the old path.
+
+    Returns:
+        The new path, and the position on it of each sample of the old one, m.
     """
     curve, step = path.curve, path.step_m
-    normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
     slope = np.gradient(aside_m, step)
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
-    moved_curve = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
-    old = step * np.arange(len(moved_curve.xy))
-    new = moved_curve.arc_m
+    xy = curve.xy + aside_m[:, None] * left_normals(curve.heading)
+    new_curve = Curve(xy, curve.heading + np.arctan2(slope, stretch))
+    old = step * np.arange(len(xy))
+    new = new_curve.arc_m
     count = max(2, round(float(new[-1]) / STEP_M) + 1)
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
@@ -64,10 +67,10 @@ def displace_path(
     lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _enter_span(span, source, lane, lane_m)
-    moved, step = interpolate_curve(moved_curve, new, position), float(new[-1]) / (count - 1)
+    new_curve, step = interpolate_curve(new_curve, new, position), float(new[-1]) / (count - 1)
     spans = _moved_spans(path, occupied, old, new)
-    curvature = mean_curvature(moved, step)
-    return Path(moved, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
+    curvature = mean_curvature(new_curve, step)
+    return Path(new_curve, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
 
 
 def _moved_spans(
@@ -165,10 +168,10 @@ def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) 
     old = target.step_m * np.arange(len(target.curve.xy))
     offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
     own = {span.lane for span in target.spans}
-    left = along + _EXIT_SHARE * length_m
+    exit_m = along + _EXIT_SHARE * length_m
     occupied = tuple(
         LaneSpan(
-            s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(left, along + s.end_m - at_m + 2.0)
+            s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(exit_m, along + s.end_m - at_m + 2.0)
         )
         for s in present.spans
         if s.lane not in own and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
@@ -192,9 +195,9 @@ def detour_path(
     """Build a detour to the left by ``aside_m``; ``adjacent`` are the lanes that it may enter."""
     begin, out_end, back_begin, end = positions
     old = path.step_m * np.arange(len(path.curve.xy))
-    out_end = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
+    out = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
     back = quintic_step(old, (back_begin, 1.0, 0.0), end - back_begin)
-    return displace_path(path, aside_m * out_end * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
+    return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
 
 
 @dataclass(frozen=True)
@@ -209,10 +212,10 @@ class DetourRequest:
 
 
 def detour_request(
-    tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
+    tables: PathTables, row: int, position: float, speed: float, size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    position, adjacent, world = float(now[0]), [], tables.worlds.world[row]
+    adjacent, world = [], tables.worlds.world[row]
     network = tables.worlds.networks[world]
     lane, along = tables.lanes_at(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
@@ -223,7 +226,7 @@ def detour_request(
                 adjacent.append(
                     LaneSpan(other, position - float(along[0, 0]), scale, position, position + _ADJACENT_M)
                 )
-    return DetourRequest(tables.paths[row], position, float(now[1]), size_m, tuple(adjacent))
+    return DetourRequest(tables.paths[row], position, speed, size_m, tuple(adjacent))
 
 
 class Detours:

@@ -27,7 +27,8 @@ def speed_profile(
 ) -> Float64[np.ndarray, " p"]:
     """Highest speed at each sample that respects limits and bends, and brakes in time for those ahead.
 
-    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with ``vmax = min(factor x limit, sqrt(a_lat / |k|))``.
+    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with
+    ``vmax = min(factor x limit, sqrt(a_lat / |k|), top)``.
     """
     cap = np.minimum((factor * path.limit_mps) ** 2, lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-6))
     cap = np.minimum(cap, top_mps**2)
@@ -75,7 +76,7 @@ class Worlds:
 
     def __init__(self, networks: Sequence[RoadNetwork], vehicles: Sequence[int]) -> None:
         self.networks = tuple(networks)
-        lanes, crossings = ([len(n.lanes) for n in networks], [len(n.crossings) for n in networks])
+        lanes, crossings = [len(n.lanes) for n in networks], [len(n.crossings) for n in networks]
         self.first_row, self.first_lane, self.first_crossing = (
             np.concatenate(([0], np.cumsum(count))) for count in (vehicles, lanes, crossings)
         )

@@ -90,7 +90,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """Mask of signalised connectors over a crossing, except turns into the crossed road, which yield."""
+    """Mask of signalised connectors over a crossing, except turns into its road without an arrow, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
@@ -178,10 +178,10 @@ class Pedestrians:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
         if self._any_crosses:
-            users = self._crosses & (self._position_m < self._across)
-            users &= self._position_m > self._kerb - _OCCUPY_M
-            users &= self._released | self._has_priority | (self._position_m > self._kerb)
-            occupied[self._crossing[users]] = True
+            is_on = self._crosses & (self._position_m < self._across)
+            is_on &= self._position_m > self._kerb - _OCCUPY_M
+            is_on &= self._released | self._has_priority | (self._position_m > self._kerb)
+            occupied[self._crossing[is_on]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
         return result, occupied
@@ -295,7 +295,7 @@ def _arrivals(
 
 
 def _is_in_box(x: _Values, y: _Values, boxes: Float64[np.ndarray, "6 w v"]) -> _Mask:
-    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length and the width."""
+    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length, half the width."""
     box_x, box_y, cos, sin, half_length, half_width = boxes
     dx, dy = x[:, None] - box_x, y[:, None] - box_y
     along = np.abs(dx * cos + dy * sin)
@@ -311,7 +311,7 @@ def place_pedestrians(
 ) -> tuple[Pedestrian, ...]:
     """Draw pedestrians along sidewalks, in both directions, and at crossings, ``per_100m / 2`` on average at each.
 
-    They reach the kerbs between 4 s before and 8 s after time 0.
+    Those at crossings reach the kerb between 4 s before and 8 s after time 0 if nothing stops them.
     """
     pedestrians = []
     for sidewalk in network.sidewalks:
@@ -341,7 +341,8 @@ def _draw_crossing_pedestrian(
     ahead = (far - near) / np.hypot(*(far - near))
     shift = lateral * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
-    before, after = (_along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng))
+    before = _along_sidewalk(network, near, -ahead, rng)
+    after = _along_sidewalk(network, far, ahead, rng)
     points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])

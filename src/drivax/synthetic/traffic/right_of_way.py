@@ -53,7 +53,7 @@ class TrafficState:
     """State of all vehicles when drivers decide.
 
     Attributes:
-        colour, to_red: Colour of each lane's light, and time until it turns red, s.
+        colour, to_red: Colour of each lane's light, and time until a yellow one turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         committed: Number of connectors that each planned vehicle (by row) enters without yielding.
@@ -188,15 +188,15 @@ class RightOfWay:
         connectors = begin.shape[1]
         entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
         self._granted = np.maximum(self._granted, entered)
-        stop, halts = self._closed_lines(state)
-        self._granted = np.maximum(np.minimum(self._granted, halts), entered)
+        stop, closed_slot = self._closed_lines(state)
+        self._granted = np.maximum(np.minimum(self._granted, closed_slot), entered)
         for row, count in state.committed.items():
             self._granted[row] = max(count, entered[row])
         near = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
         index = np.minimum(self._granted, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
-        requests = (distance >= 0) & (distance <= near) & state.active & (halts > index)
+        requests = (distance >= 0) & (distance <= near) & state.active & (closed_slot > index)
         for row in state.committed:
             requests[row], stop[row] = False, np.inf
         self._denied &= requests
@@ -243,13 +243,13 @@ class RightOfWay:
         speed = state.speed[:, None]
         to_stop = speed**2 / (2 * np.maximum(distance, 0.05))
         colour = state.colour.take(connector)
-        late = distance > speed * state.to_red.take(connector)
-        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (late & (to_stop <= 5.0))
-        halt = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
-        halt &= distance < np.inf
-        first = halt.argmax(axis=1)
+        is_late = distance > speed * state.to_red.take(connector)
+        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (is_late & (to_stop <= 5.0))
+        is_closed = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
+        is_closed &= distance < np.inf
+        first = is_closed.argmax(axis=1)
         flat = first + count * self._rows
-        has_line = halt.ravel().take(flat)
+        has_line = is_closed.ravel().take(flat)
         return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
     def _grant(
@@ -338,8 +338,8 @@ class RightOfWay:
         if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
         blockers = self._blockers(state, rules, request, holders)
-        has_priority = {blocker.connector for blocker in blockers} & set(rules.yields_to[connector].tolist())
-        if not blockers or has_priority:
+        prior = set(rules.yields_to[connector].tolist())
+        if not blockers or any(blocker.connector in prior for blocker in blockers):
             return False
         for blocker in blockers:
             speed = float(state.speed[blocker.row])
@@ -370,11 +370,11 @@ class RightOfWay:
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
-        own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
+        own_speed, acceleration = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + rules.zone_begin[connector, own]
         through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]
-        enter = time_to_cover(to_zone, own_speed, push, top)
-        leave = time_to_cover(through_zone, own_speed, push, top)
+        enter = time_to_cover(to_zone, own_speed, acceleration, top)
+        leave = time_to_cover(through_zone, own_speed, acceleration, top)
         wait_s = state.step * DT_S - self._stopped_at_s[i] if self._stopped_at_s[i] < np.inf else 0.0
         patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
         least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)

@@ -58,15 +58,17 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, ScriptedUser,
 
 #: Distance between the front bumper and a stop line at standstill, m.
 _LINE_GAP_M = 1.0
-#: Distance kept to an obstacle in the lane, which leaves room for passing it, and to the end of a lane, m.
-_OBSTACLE_GAP_M, _LANE_END_GAP_M = 5.0, 10.0
+#: Distance kept to an obstacle in the lane, which leaves room for passing it, m.
+_OBSTACLE_GAP_M = 5.0
+#: Distance kept to the end of a lane in addition to the IDM's gap of 2 m, m.
+_LANE_END_GAP_M = 10.0
 #: Time constant with which a driver follows the speed profile, s.
 _SPEED_TIME_S = 0.6
 #: Deceleration beyond which a driver's own jerk limit is replaced, m/s2, and the limit that replaces it, m/s3.
 _EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
 #: Steps between decisions about lane changes and detours.
 _DECISION_STEPS = 5
-#: Steps between the end of a decision to leave the lane and the next one.
+#: Least number of steps from the start of a lane change or detour to that of the next one.
 _REST_STEPS = round(4.0 / DT_S)
 #: Braking that drivers accept for pedestrians, m/s2: to start to brake, and once they brake.
 _COMFORTABLE_MPS2, _HARDEST_MPS2 = 3.0, 8.0
@@ -415,7 +417,7 @@ class _Simulation:
         return preferred
 
     def _stop_gap(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
-        """Return the gap to the next place to stop (line, crossing, obstacle, lane end), plus the IDM's gap of 2 m."""
+        """Return the gap for the IDM, which keeps 2 m, to the next line, crossing, obstacle or lane end to stop at."""
         tables, front = self._tables, self._position_m + self._half_m
         committed = {}
         for row, plan, at in self._plans:
@@ -555,11 +557,9 @@ class _Simulation:
         )
         standing = standing.concatenate(self._moving_users.select(large & own_users))
         moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
-        position, size = (
-            float(self._position_m[row]),
-            (2 * float(self._half_m[row]), float(self._width_m[row])),
-        )
-        request = detour_request(self._tables, row, (position, self._speed[row]), size)
+        position, speed = float(self._position_m[row]), float(self._speed[row])
+        size = 2 * float(self._half_m[row]), float(self._width_m[row])
+        request = detour_request(self._tables, row, position, speed, size)
         detour = self._runs[world].traffic.detours.find(request, standing, moving)
         if detour is not None:
             self._switch_path(t, row, detour[0], position, detour[1])
