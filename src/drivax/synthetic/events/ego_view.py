@@ -174,7 +174,7 @@ class EgoView:
     def edge_m(self, station: float, side: int) -> float:
         """Distance of the nearest road edge from ego's path at a station, to the left (1) or right (-1), m."""
         origin, heading = self.track.place(station)
-        outward = side * left_normals(heading)
+        outward = side * np.array([-np.sin(heading), np.cos(heading)])
         best = math.inf
         for edge in self.roles.network.edges:
             a = edge.xy - origin
