@@ -136,12 +136,12 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     begin, end = xp.zeros_like(dx), never
     for axis_x, axis_y, reach in _axis_terms(a, b):
         distance, speed = dx * axis_x + dy * axis_y, vx * axis_x + vy * axis_y
-        moving = abs(speed) > 1e-9
+        is_moving = abs(speed) > 1e-9
         # At rest on this axis, any divisor serves: the result is not selected.
-        inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
+        inverse = 1.0 / xp.where(is_moving, speed, xp.ones_like(speed))
         first, second = (-reach - distance) * inverse, (reach - distance) * inverse
         overlaps = abs(distance) < reach
-        enter = xp.where(moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
-        leave = xp.where(moving, xp.maximum(first, second), never)
+        enter = xp.where(is_moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
+        leave = xp.where(is_moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, never)

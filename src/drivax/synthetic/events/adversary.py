@@ -129,8 +129,8 @@ def least_ttc(
     time = time_to_overlap(own, speed * toward, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
     time = np.where(overlap(own, other), 0.0, time)
     # Braking does not avoid actors from behind.
-    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
-    return float(np.min(np.where(ahead & actor.valid[steps], time, 5.0), initial=5.0))
+    is_ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
+    return float(np.min(np.where(is_ahead & actor.valid[steps], time, 5.0), initial=5.0))
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
@@ -165,9 +165,9 @@ def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[in
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
     gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
-    same = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
-    meets = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & same
-    return tuple(rows[meets.any(axis=1)].tolist())
+    is_parallel = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
+    is_in_lane = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & is_parallel
+    return tuple(rows[is_in_lane.any(axis=1)].tolist())
 
 
 def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
@@ -177,8 +177,8 @@ def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
     headings = motion.heading[rows][:, moves]
-    crosses = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
-    row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
+    is_crossing = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
+    row, step = np.nonzero(motion.valid[rows][:, moves] & is_crossing & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSING_MARGIN_M
     other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
@@ -203,16 +203,16 @@ def enter_when_clear(
     other = boxes(motion.xy[users, :end], motion.heading[users, :end], motion.size_m[users, None, :2])
     is_kept = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
     valid = motion.valid[users, :end] & extra.valid[:end] & is_kept
-    near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
-    user, step = np.nonzero(valid & near)
+    is_near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
+    user, step = np.nonzero(valid & is_near)
     forward = box[0, step, 2:4] * np.where(extra.speed[step] < 0, -1.0, 1.0)[:, None]
-    ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
-    on_foot = motion.kind[users][user] == AgentKind.PEDESTRIAN
-    meets = step[overlap(box[0, step], other[user, step]) & (ahead | on_foot)]
+    is_ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
+    is_pedestrian = motion.kind[users][user] == AgentKind.PEDESTRIAN
+    collisions = step[overlap(box[0, step], other[user, step]) & (is_ahead | is_pedestrian)]
     appears = int(np.argmax(extra.valid))
-    if len(meets):
+    if len(collisions):
         # It appears after its last collision.
-        appears = max(appears, int(meets.max()) + 5)
+        appears = max(appears, int(collisions.max()) + 5)
     if appears >= end or not extra.valid[appears]:
         return None
     distance = np.hypot(*(extra.xy[appears] - motion.xy[0, appears]))

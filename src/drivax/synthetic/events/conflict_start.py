@@ -100,9 +100,9 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 
     sides = (extent.near_m, extent.far_m, extent.right_m, extent.left_m)
     extent_m = np.stack([table(side, np.inf) for side in sides])
-    near = np.isfinite(extent_m[0]).any(axis=1)
+    is_near = np.isfinite(extent_m[0]).any(axis=1)
     box = boxes(users.xy, users.heading, users.size_m).reshape(*shape, 6)
-    return _Others(extent_m[:, near], table(along, 0.0)[near], box[near])
+    return _Others(extent_m[:, is_near], table(along, 0.0)[is_near], box[is_near])
 
 
 def _leader(
@@ -113,8 +113,8 @@ def _leader(
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far, right, left = extent
     side = size_m[1] / 2 + _SIDE_M
-    ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
-    gap = np.where(ahead, near, np.inf) - at - size_m[0] / 2
+    is_ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
+    gap = np.where(is_ahead, near, np.inf) - at - size_m[0] / 2
     first = gap.argmin(axis=0), np.arange(len(at))
     return gap[first], others.speed[:, now][first]
 

@@ -145,12 +145,12 @@ class EgoView:
         xy, heading = self.track.place(station)
         points, headings, lane = self._lane_points
         gap = np.hypot(*(points - xy).T)
-        near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
-        if not near.any():
+        is_near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
+        if not is_near.any():
             return -1
-        on_route = near & np.isin(lane, self.roles.route)
-        candidates = on_route if on_route.any() else near
-        return int(lane[candidates][np.argmin(gap[candidates])])
+        is_on_route = is_near & np.isin(lane, self.roles.route)
+        is_candidate = is_on_route if is_on_route.any() else is_near
+        return int(lane[is_candidate][np.argmin(gap[is_candidate])])
 
     def neighbour(self, station: float, side: int) -> int:
         """Return the neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
@@ -215,10 +215,10 @@ class EgoView:
         count = self.motion.vehicles
         station, lateral = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
-        same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
-        on = self.motion.valid[:count, step] & (np.abs(lateral) < 1.0) & same
-        on[0] = False
-        return station, on
+        is_parallel = np.cos(self.motion.heading[:count, step] - heading) > 0.8
+        is_on_path = self.motion.valid[:count, step] & (np.abs(lateral) < 1.0) & is_parallel
+        is_on_path[0] = False
+        return station, is_on_path
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """Return the scenario with a new leader, whose rear bumper is at stations from a step on; IDM slows ego."""

@@ -166,11 +166,11 @@ def find_conflicts(
 ) -> Conflicts:  # fmt: skip
     """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
     margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
-    still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
+    is_static = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
-    moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)
+    moving = _box_conflicts(ego, others, valid & ~is_static[:, None], margin)
     # Static users are tested at one step only.
-    once = _box_conflicts(ego, others[:, :1], still[:, None], margin)
+    once = _box_conflicts(ego, others[:, :1], is_static[:, None], margin)
     steps = others.shape[1]
     user, point, hard = (np.repeat(values, steps) for values in (once.user, once.point, once.hard))
     return Conflicts(
@@ -194,11 +194,11 @@ def _box_conflicts(
     row, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     row = np.repeat(row, _STRIDE)
-    inside = (point >= 0) & (point < len(ego))
-    row, point = row[inside], point[inside]
+    is_inside = (point >= 0) & (point < len(ego))
+    row, point = row[is_inside], point[is_inside]
     other, ego_box = others[user[row], step[row]], ego[point]
-    close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
-    row, point, other, ego_box = row[close], point[close], other[close], ego_box[close]
+    is_close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
+    row, point, other, ego_box = row[is_close], point[is_close], other[is_close], ego_box[is_close]
     hard = overlap(_grow_boxes(ego_box, np.array(HARD_M)), other)
     return Conflicts(user[row], step[row], point, hard)
 
@@ -262,8 +262,8 @@ def arrivals(
             if span.lane in watched:
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
-                on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
+                is_on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
                 window = np.ones(round(_YIELD_S / DT_S) + 1)
-                coming = np.convolve(on_lane[::-1], window, mode="full")[: len(on_lane)][::-1] > 0
-                result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
+                is_coming = np.convolve(is_on_lane[::-1], window, mode="full")[: len(is_on_lane)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(is_on_lane), bool)) | is_coming
     return result

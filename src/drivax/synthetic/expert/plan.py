@@ -218,15 +218,15 @@ def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
 def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
     conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.vulnerable)
-    follows = np.zeros(len(state.others), bool)
+    is_follower = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
     step, point = conflicts.step[order][first], conflicts.point[order][first]
     box = state.others[users, step]
     along = box[:, 2] * np.cos(candidate.heading[point]) + box[:, 3] * np.sin(candidate.heading[point])
-    behind = candidate.base_m[point] < state.passed_m[step]
-    follows[users] = behind & (along > 0.7) & ~state.unreactive[users]
-    return conflicts.select(~follows[conflicts.user])
+    is_behind = candidate.base_m[point] < state.passed_m[step]
+    is_follower[users] = is_behind & (along > 0.7) & ~state.unreactive[users]
+    return conflicts.select(~is_follower[conflicts.user])
 
 
 def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Option:

@@ -80,9 +80,9 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     v, s = np.arange(speeds), np.arange(places)
     before = v - change[:, None]
     source = s - (before + v)[..., None]
-    possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
+    is_possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
     # Impossible transitions come from an extra state with infinite cost.
-    source = np.where(possible, before[..., None] * places + source, speeds * places)
+    source = np.where(is_possible, before[..., None] * places + source, speeds * places)
     a = change * unit
     effort = _ACCELERATION * a**2 + _HARD_BRAKING * np.maximum(_COMFORT_MPS2 - a, 0.0) ** 2
     effort = (effort * _STEP_S).astype(np.float32)

@@ -161,8 +161,8 @@ def inside(
 
 def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
     """Whether a corner of the box leaves the road at any step."""
-    moved = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
-    points = corners(box[moved]).reshape(-1, 2)
+    is_new = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
+    points = corners(box[is_new]).reshape(-1, 2)
     return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
 
 

@@ -321,12 +321,12 @@ class LaneChanges:
         pair, world = np.arange(len(vehicles)), self._worlds.world[vehicles]
         rows = self._worlds.rows[world]
         separation = occupancy.position_m.take(rows, axis=0) - position[:, None, None]
-        seen = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
-        seen[rows == vehicles[:, None]] = False
+        is_candidate = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
+        is_candidate[rows == vehicles[:, None]] = False
         half_of_column = self._half_of_column[world]
         neighbours = []
         for distance in (separation, -separation):
-            slots = np.where(seen & (distance >= 0), distance, np.inf)
+            slots = np.where(is_candidate & (distance >= 0), distance, np.inf)
             # NumPy would reduce so short a last axis several times more slowly.
             gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - half_of_column
             column = gap.argmin(axis=1)

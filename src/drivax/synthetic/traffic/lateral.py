@@ -101,12 +101,12 @@ def _enter_span(
     span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied."""
-    occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
+    is_occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
     for slot in range(SLOTS):
-        free = occupied & (lane[:, slot] < 0)
-        lane[free, slot] = span.lane
-        lane_m[free, slot] = (at[free] - span.begin_m) / span.scale
-        occupied &= ~free
+        is_free = is_occupied & (lane[:, slot] < 0)
+        lane[is_free, slot] = span.lane
+        lane_m[is_free, slot] = (at[is_free] - span.begin_m) / span.scale
+        is_occupied &= ~is_free
 
 
 def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: float) -> _Samples:
@@ -241,17 +241,18 @@ class Detours:
         half_width, half_length = request.size_m[1] / 2, request.size_m[0] / 2
         obstacles, _ = _extents(request, standing, request.at_m, LOOK_M + 40.0)
         front, side = request.at_m + half_length, half_width + DETOUR_MARGIN_M
-        blocks = (obstacles.right_m < side) & (obstacles.left_m > -side) & (obstacles.near_m > front - 0.5)
-        if not blocks.any():
+        is_blocking = (obstacles.right_m < side) & (obstacles.left_m > -side)
+        is_blocking &= obstacles.near_m > front - 0.5
+        if not is_blocking.any():
             return None
-        first = float(obstacles.near_m[blocks].min())
+        first = float(obstacles.near_m[is_blocking].min())
         if not 2.0 < first - front < LOOK_M:
             return None
         last = first
         for k in np.argsort(obstacles.near_m, kind="stable"):
-            if blocks[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
+            if is_blocking[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
                 last = max(last, float(obstacles.far_m[k]))
-        group = blocks & (obstacles.near_m <= last)
+        group = is_blocking & (obstacles.near_m <= last)
         left = float(obstacles.left_m[group].max()) + half_width + _PASSING_GAP_M
         right = float(obstacles.right_m[group].min()) - half_width - _PASSING_GAP_M
         for lateral in sorted([left, right], key=abs):
@@ -272,12 +273,12 @@ class Detours:
         begin, out_end, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
-        blocks = (obstacles.near_m < back) & (obstacles.far_m > out_end)
-        blocks &= (obstacles.right_m < high) & (obstacles.left_m > low)
+        is_blocking = (obstacles.near_m < back) & (obstacles.far_m > out_end)
+        is_blocking &= (obstacles.right_m < high) & (obstacles.left_m > low)
         edges, _ = _extents(request, self._edge, (out_end + back) / 2, (end - begin) / 2 + 15.0)
-        sweep = (edges.near_m > out_end) & (edges.near_m < back)
-        sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
-        if blocks.any() or sweep.any():
+        is_edge_near = (edges.near_m > out_end) & (edges.near_m < back)
+        is_edge_near &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
+        if is_blocking.any() or is_edge_near.any():
             return False
         path, position = request.path, request.at_m
         duration_s = (end - position) / max(request.speed, _PASS_MPS) + 1.0
@@ -285,12 +286,13 @@ class Detours:
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
         relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
         speed = near.speed * np.cos(relative_heading)
-        meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
-        ahead = (others.far_m > position) & (others.near_m + np.minimum(speed, 0.0) * duration_s < end + 5.0)
-        behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
+        is_beside = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
+        nearest_m = others.near_m + np.minimum(speed, 0.0) * duration_s
+        is_ahead = (others.far_m > position) & (nearest_m < end + 5.0)
+        is_behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
-        ahead &= ~((speed > 1.0) & (others.near_m > back))
-        return not bool(np.any(meets & (ahead | behind)))
+        is_ahead &= ~((speed > 1.0) & (others.near_m > back))
+        return not bool(np.any(is_beside & (is_ahead | is_behind)))
 
 
 def _detour_positions(

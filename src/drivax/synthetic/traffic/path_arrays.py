@@ -202,8 +202,8 @@ class PathTables:
         """``begin`` of the spans that vehicles occupy at their positions, nan elsewhere."""
         rows = self._limited.nonzero()[0]
         own = at_m[rows, None]
-        occupied = (self.from_m[rows] <= own) & (own <= self.until_m[rows])
-        self._present[rows] = np.where(occupied, self.begin[rows], np.nan)
+        is_occupied = (self.from_m[rows] <= own) & (own <= self.until_m[rows])
+        self._present[rows] = np.where(is_occupied, self.begin[rows], np.nan)
         return self._present
 
     def interpolate(

@@ -203,21 +203,21 @@ class Pedestrians:
     def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
         to_kerb = self._kerb - self._position_m
-        waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
-        waiting = waiting.nonzero()[0]
+        is_waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
+        waiting = is_waiting.nonzero()[0]
         if not len(waiting):
             return
         crossing_s = (self._across[waiting] - self._position_m[waiting]) / self._free_speed[waiting]
         # Starting from standstill takes v / (2 a) longer.
         crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
         # Traffic matters only to those whose conflicting lights stay red.
-        red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
-        waiting, crossing_s = waiting[red], crossing_s[red]
+        stays_red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
+        waiting, crossing_s = waiting[stays_red], crossing_s[stays_red]
         for world in np.unique(self.world[waiting]).tolist():
-            among = self.world[waiting] == world
+            is_local = self.world[waiting] == world
             rows = self._worlds.vehicles(world)
             rows = np.flatnonzero(active[rows]) + rows.start
-            self._release_in(world, waiting[among], crossing_s[among], vehicles.select(rows))
+            self._release_in(world, waiting[is_local], crossing_s[is_local], vehicles.select(rows))
 
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of a world if its active vehicles leave them a gap."""
@@ -225,20 +225,19 @@ class Pedestrians:
         local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
         any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
-        gap = np.where(
-            self._yielding[crossing], hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
-        ).nonzero()[0]
+        has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
+        safe = np.where(self._yielding[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
-        if len(gap):
-            blocked = overlap(conflicts.strip[local[place[gap]], None], boxes[None]).any(axis=1)
-            self._released[waiting[gap]] = ~blocked
+        if len(safe):
+            is_blocked = overlap(conflicts.strip[local[place[safe]], None], boxes[None]).any(axis=1)
+            self._released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:
         """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
         room = self._last * self._step_m - self._position_m
         if self._any_crosses:
-            waits = self._crosses & ~self._released & (self._position_m <= self._kerb)
-            kerb = np.where(waits, self._kerb - _WAIT_M - self._position_m, math.inf)
+            is_waiting = self._crosses & ~self._released & (self._position_m <= self._kerb)
+            kerb = np.where(is_waiting, self._kerb - _WAIT_M - self._position_m, math.inf)
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
@@ -302,8 +301,8 @@ def _is_in_box(x: _Values, y: _Values, boxes: Float64[np.ndarray, "6 w v"]) -> _
     dy *= cos
     dx *= sin
     dy -= dx
-    inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
-    return np.logical_or.reduce(inside, axis=1)
+    is_inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
+    return np.logical_or.reduce(is_inside, axis=1)
 
 
 def place_pedestrians(

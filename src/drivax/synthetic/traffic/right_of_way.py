@@ -93,8 +93,8 @@ def conflict_zones(
             if np.any(box[a][0] > box[b][1] + CLEARANCE_M) or np.any(box[b][0] > box[a][1] + CLEARANCE_M):
                 continue
             dx, dy = (np.subtract.outer(xy_a[:, k], other[:, k]) for k in (0, 1))
-            near = dx * dx + dy * dy < CLEARANCE_M**2
-            for i, j, hit in ((a, b, near.any(axis=1)), (b, a, near.any(axis=0))):
+            is_near = dx * dx + dy * dy < CLEARANCE_M**2
+            for i, j, hit in ((a, b, is_near.any(axis=1)), (b, a, is_near.any(axis=0))):
                 if hit.any():
                     step = network.lanes[i].length_m / (hit.size - 1)
                     places = np.flatnonzero(hit)
@@ -312,8 +312,8 @@ class RightOfWay:
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
         exit_m = state.tables.connector_end[i, request.slot]
-        full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
-        if full and tail >= line - 1.0 and control != _NONE:
+        is_full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
+        if is_full and tail >= line - 1.0 and control != _NONE:
             return False
         return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)
 
@@ -357,15 +357,15 @@ class RightOfWay:
         begin, scale = tables.begin[vehicles][:, others], tables.scale[vehicles][:, others]
         reach = begin + scale * rules.zone_begin[others, connector] - state.front_m[vehicles, None]
         clear = begin + scale * rules.zone_end[others, connector] - state.rear_m[vehicles, None]
-        coming = (clear > 0) & state.active[vehicles, None]
-        coming[i - vehicles.start] = False
+        is_coming = (clear > 0) & state.active[vehicles, None]
+        is_coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
         is_red = state.colour[self._worlds.first_lane[world] + others] == _RED
-        waits = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
-        coming &= ~(waits & (reach > 0))
-        if not coming.any():
+        is_waiting = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
+        is_coming &= ~(is_waiting & (reach > 0))
+        if not is_coming.any():
             return True
-        rows, columns = np.nonzero(coming)
+        rows, columns = np.nonzero(is_coming)
         speed, own = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
