@@ -106,7 +106,7 @@ class Generation:
             )
         if self.future_s < 8.0:
             raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
-        _ = self.sizes
+        _ = self.sizes  # refuses other lengths and numbers of egos
         self.world.check()
 
     @property
@@ -364,7 +364,8 @@ def generate_benchmark(
     options.check()
     if options.world != WorldConfig(domain=options.world.domain) or options.future_s != 8.0:
         raise UsageError(
-            "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
+            "the benchmark's future_s is 8, and its world is fixed but for its domain",
+            cure="use generate for other settings",
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))
