@@ -101,8 +101,7 @@ class WorldConfig:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
         timing = self.signal_timing
-        is_complete = len(timing) == 3 and math.isclose(sum(timing), 1.0, abs_tol=1e-6)
-        if not is_complete or min(timing) < 0.0:
+        if min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1e-6):
             raise UsageError(f"signal_timing is {list(timing)}", cure="use three shares that add up to 1")
         self.noise.check()
         self.sensor.check()
