@@ -150,16 +150,16 @@ class Pedestrians:
         self._size_m = np.array([pedestrian.size_m[:2] for pedestrian in pedestrians], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
         self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
-        self._crosses = self._crossing >= 0
+        self._has_crossing = self._crossing >= 0
         self._crossing += worlds.first_crossing[self.world]
-        self._any_crosses = bool(self._crosses.any())
+        self._any_crosses = bool(self._has_crossing.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
         marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
         lights = np.concatenate([conflicts.red.any(axis=1) for conflicts in self._conflicts])
-        self._yielding = marked | lights
+        self._has_yielding_drivers = marked | lights
         self._has_priority = np.zeros(len(curves), bool)
-        self._has_priority[self._crosses] = (marked & ~lights)[self._crossing[self._crosses]]
-        self._released, self._is_blocked = np.zeros((2, len(curves)), bool)
+        self._has_priority[self._has_crossing] = (marked & ~lights)[self._crossing[self._has_crossing]]
+        self._is_released, self._is_blocked = np.zeros((2, len(curves)), bool)
 
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask
@@ -178,9 +178,9 @@ class Pedestrians:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
         if self._any_crosses:
-            is_on = self._crosses & (self._position_m < self._across)
+            is_on = self._has_crossing & (self._position_m < self._across)
             is_on &= self._position_m > self._kerb - _OCCUPY_M
-            is_on &= self._released | self._has_priority | (self._position_m > self._kerb)
+            is_on &= self._is_released | self._has_priority | (self._position_m > self._kerb)
             occupied[self._crossing[is_on]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
@@ -203,7 +203,7 @@ class Pedestrians:
     def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
         to_kerb = self._kerb - self._position_m
-        is_waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
+        is_waiting = self._has_crossing & ~self._is_released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
         waiting = is_waiting.nonzero()[0]
         if not len(waiting):
             return
@@ -226,17 +226,17 @@ class Pedestrians:
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
         any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
-        safe = np.where(self._yielding[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
+        safe = np.where(self._has_yielding_drivers[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(safe):
             is_blocked = overlap(conflicts.strip[local[place[safe]], None], boxes[None]).any(axis=1)
-            self._released[waiting[safe]] = ~is_blocked
+            self._is_released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:
         """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
         room = self._last * self._step_m - self._position_m
         if self._any_crosses:
-            is_waiting = self._crosses & ~self._released & (self._position_m <= self._kerb)
+            is_waiting = self._has_crossing & ~self._is_released & (self._position_m <= self._kerb)
             kerb = np.where(is_waiting, self._kerb - _WAIT_M - self._position_m, math.inf)
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.

@@ -172,34 +172,34 @@ class RightOfWay:
         self._length = drivers.size_m[:, 0]
         count = len(self._length)
         self._rows = np.arange(count)
-        self._granted = np.zeros(count, int)  # number of connectors on the path
+        self._grants = np.zeros(count, int)  # number of connectors on the path
         self._stopped_at_s = np.full(count, np.inf)  # time of the stop at the requested connector, s
-        self._requested = np.full(count, -1)
-        self._denied = np.zeros(count, bool)
+        self._connector = np.full(count, -1)  # of the last request
+        self._is_denied = np.zeros(count, bool)
 
     def reset_vehicle(self, row: int, tables: PathTables, front_m: float) -> None:
         """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
-        self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
-        self._stopped_at_s[row], self._requested[row] = np.inf, -1
+        self._grants[row] = int(np.sum(tables.connector_begin[row] < front_m))
+        self._stopped_at_s[row], self._connector[row] = np.inf, -1
 
     def stop_line_m(self, state: TrafficState) -> PerVehicle:
         """Decide all requests and return the distance to the next line at which to stop (infinite: none)."""
         begin = state.tables.connector_begin
         connectors = begin.shape[1]
         entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
-        self._granted = np.maximum(self._granted, entered)
+        self._grants = np.maximum(self._grants, entered)
         stop, closed_slot = self._closed_lines(state)
-        self._granted = np.maximum(np.minimum(self._granted, closed_slot), entered)
+        self._grants = np.maximum(np.minimum(self._grants, closed_slot), entered)
         for row, count in state.committed.items():
-            self._granted[row] = max(count, entered[row])
+            self._grants[row] = max(count, entered[row])
         near = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
-        index = np.minimum(self._granted, connectors - 1)
+        index = np.minimum(self._grants, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
         requests = (distance >= 0) & (distance <= near) & state.active & (closed_slot > index)
         for row in state.committed:
             requests[row], stop[row] = False, np.inf
-        self._denied &= requests
+        self._is_denied &= requests
         rows = requests.nonzero()[0]
         if len(rows):
             holders = self._holders(state)
@@ -221,7 +221,7 @@ class RightOfWay:
     def _holders(self, state: TrafficState) -> list[_Holders]:
         """List the vehicles of each world that hold a connector."""
         tables = state.tables
-        is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
+        is_held = np.arange(tables.connector.shape[1]) < self._grants[:, None]
         is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
         row, slot = np.nonzero(is_held & (tables.connector >= 0))
         world = self._worlds.world[row]
@@ -259,8 +259,8 @@ class RightOfWay:
         rules = self._rules[world]
         for request in requests:
             i = request.row
-            if self._requested[i] != request.connector:
-                self._requested[i], self._stopped_at_s[i] = request.connector, np.inf
+            if self._connector[i] != request.connector:
+                self._connector[i], self._stopped_at_s[i] = request.connector, np.inf
             has_stopped = request.speed < _STOPPED_MPS and request.distance_m < _STOPPED_M
             if has_stopped and self._stopped_at_s[i] == np.inf:
                 self._stopped_at_s[i] = state.step * DT_S
@@ -272,9 +272,9 @@ class RightOfWay:
             granted = granted or self._may_enter(state, rules, request, holders, waiting)
             if not granted and self._clears_in_time(state, rules, request, holders):
                 continue
-            self._denied[i] = not granted
+            self._is_denied[i] = not granted
             if granted:
-                self._granted[i] = request.slot + 1
+                self._grants[i] = request.slot + 1
                 self._stopped_at_s[i] = np.inf
                 holders.append((i, connector))
             else:
@@ -307,7 +307,7 @@ class RightOfWay:
         if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
             return False
         tail = float(state.front_m[i] + state.room_m[i])
-        if tail < line and self._denied[state.leader[i]]:
+        if tail < line and self._is_denied[state.leader[i]]:
             return False
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
@@ -361,7 +361,7 @@ class RightOfWay:
         is_coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
         is_red = state.colour[self._worlds.first_lane[world] + others] == _RED
-        is_waiting = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
+        is_waiting = is_red | (self._is_denied & (state.speed < 0.5))[vehicles, None]
         is_coming &= ~(is_waiting & (reach > 0))
         if not is_coming.any():
             return True
