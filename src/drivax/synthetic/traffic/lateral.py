@@ -286,13 +286,13 @@ class Detours:
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
         relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
         speed = near.speed * np.cos(relative_heading)
-        is_beside = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
+        is_in_corridor = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
         nearest_m = others.near_m + np.minimum(speed, 0.0) * duration_s
         is_ahead = (others.far_m > position) & (nearest_m < end + 5.0)
         is_behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
         is_ahead &= ~((speed > 1.0) & (others.near_m > back))
-        return not bool(np.any(is_beside & (is_ahead | is_behind)))
+        return not bool(np.any(is_in_corridor & (is_ahead | is_behind)))
 
 
 def _detour_positions(
