@@ -114,13 +114,8 @@ class CrossTraffic(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
-        connectors = sorted(
-            {
-                other
-                for connector in view.connectors
-                for other in self._lower_priority_conflicts(network, connector)
-            }
-        )
+        conflicts = [self._lower_priority_conflicts(network, connector) for connector in view.connectors]
+        connectors = sorted(set[int]().union(*conflicts))
         if not connectors:
             return None
         lane = int(rng.choice(connectors))

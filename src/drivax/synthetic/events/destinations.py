@@ -87,8 +87,8 @@ def route_past(
 ) -> DestinationRoute | None:
     """Draw a route past a destination to the end of the map, or return None if this draw fails.
 
-    It fails if a light or sign would delay ego before the destination's lane, if the roads are too short for the time
-    of arrival, if ego would start on a connector, and if the route would repeat lanes.
+    It fails if a light or sign would delay ego, the roads before the destination are too short for the time of arrival,
+    ego would start on a connector, or the route would repeat lanes.
     """
     time, position = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
     lane, lanes = destination.lane, [destination.lane]

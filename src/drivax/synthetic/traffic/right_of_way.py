@@ -172,7 +172,7 @@ class RightOfWay:
         self._length = drivers.size_m[:, 0]
         count = len(self._length)
         self._rows = np.arange(count)
-        self._grants = np.zeros(count, int)  # number of connectors on the path
+        self._grants = np.zeros(count, int)  # number of connectors granted on the path
         self._stopped_at_s = np.full(count, np.inf)  # time of the stop at the requested connector, s
         self._connector = np.full(count, -1)  # of the last request
         self._is_denied = np.zeros(count, bool)

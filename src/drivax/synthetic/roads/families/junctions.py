@@ -342,9 +342,8 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        first = self._draw_plot(rng, style, main).move_to(
-            Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
-        )
+        plot = self._draw_plot(rng, style, main)
+        first = plot.move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._draw_middle(rng, first.gate)
         second = self._draw_plot(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
