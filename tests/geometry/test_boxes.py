@@ -30,6 +30,15 @@ def test_boxes_overlap_within_a_horizon_if_the_time_to_overlap_is_shorter(pairs,
     assert np.array_equal(overlap_within(*pairs, horizon_s), expected)
 
 
+def test_corners_that_touch_in_passing_overlap_within_a_horizon_only():
+    box = np.array([0.0, 0.0, 1.0, 0.0, 2.0, 2.0])
+    # On its way along (1, 1) the centre passes (2, -2), where the corner (1, -1) touches.
+    other = np.array([0.0, -4.0, 1.0, 0.0, 2.0, 2.0])
+    motion = box, np.zeros(2), other, np.ones(2), 5.0
+    assert overlap_within(*motion)
+    assert time_to_overlap(*motion) == 5.0
+
+
 def test_overlap_within_no_time_is_overlap(pairs):
     a, _, b, _ = pairs
     assert np.array_equal(overlap_within(*pairs, 0.0), overlap(a, b))

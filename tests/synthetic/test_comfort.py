@@ -14,8 +14,7 @@ def test_smoothing_equals_scipy(window, order, derivative):
     assert np.allclose(smoother(40, window, order, derivative) @ values, expected, atol=1e-10)
 
 
-def test_quantities_equal_nuplan():
-    """The definitions of the decision record, computed with SciPy."""
+def test_comfort_quantities_equal_scipy():
     rng = np.random.default_rng(1)
     speed = 8.0 + np.cumsum(rng.normal(size=91)) * 0.1
     heading = np.cumsum(rng.normal(size=91)) * 0.02 + 3.1

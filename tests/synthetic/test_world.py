@@ -249,6 +249,7 @@ def test_noise_changes_other_agents_only():
             "signal_timing is [0.5, 0.5, 0.5]; use three shares that add up to 1",
         ),
         ({"signal_timing": (-0.5, 0.5, 1.0)}, "signal_timing is [-0.5, 0.5, 1.0]"),
+        ({"signal_timing": (float("nan"), 0.5, 0.5)}, "signal_timing is [nan, 0.5, 0.5]"),
         ({"sensor": SensorConfig(range_m=-1.0)}, "sensor.range_m is -1.0; use a finite number that is not"),
         (
             {"noise": NoiseConfig(speed_correlation=1.5)},

@@ -64,16 +64,15 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
         x, y = point[..., 0] - box[..., X], point[..., 1] - box[..., Y]
         return x * cos + y * sin, y * cos - x * sin
 
-    enters, leaves = None, None
+    enters, leaves = 0.0, 1.0
     halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
     for begin, stop, half in zip(local(start), local(end), halves, strict=True):
         step = stop - begin
-        # Parallel to these two sides: with a tiny step the segment is between them all along, or nowhere.
+        # A tiny step keeps a segment that is parallel to these two sides between them throughout, or never.
         step = xp.where(abs(step) < 1e-9, xp.full_like(step, 1e-9), step)
         first, second = (-half - begin) / step, (half - begin) / step
         low, high = xp.minimum(first, second), xp.maximum(first, second)
-        enters = xp.maximum(low, xp.zeros_like(low)) if enters is None else xp.maximum(enters, low)
-        leaves = xp.minimum(high, xp.ones_like(high)) if leaves is None else xp.minimum(leaves, high)
+        enters, leaves = xp.maximum(low, enters), xp.minimum(high, leaves)
     return enters, leaves
 
 
@@ -104,7 +103,8 @@ def overlap_within(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: 
     """Return whether boxes overlap within a horizon at constant velocities and fixed headings.
 
     Separating axis theorem for ``a`` and the area that ``b`` sweeps relative to it: the axes of both boxes and the
-    normal of the relative velocity. The same as ``time_to_overlap(...) < horizon_s``, without divisions.
+    normal of the relative velocity. Equal to ``time_to_overlap(...) < horizon_s`` without divisions, but a corner that
+    only touches the other box in passing counts as overlap.
     """
     half = horizon_s / 2
     vx, vy = ((velocity_b[..., axis] - velocity_a[..., axis]) * half for axis in (0, 1))
@@ -136,12 +136,12 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     begin, end = xp.zeros_like(dx), never
     for axis_x, axis_y, reach in _axis_terms(a, b):
         distance, speed = dx * axis_x + dy * axis_y, vx * axis_x + vy * axis_y
-        moving = abs(speed) > 1e-9
+        is_moving = abs(speed) > 1e-9
         # At rest on this axis, any divisor serves: the result is not selected.
-        inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
+        inverse = 1.0 / xp.where(is_moving, speed, xp.ones_like(speed))
         first, second = (-reach - distance) * inverse, (reach - distance) * inverse
         overlaps = abs(distance) < reach
-        enter = xp.where(moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
-        leave = xp.where(moving, xp.maximum(first, second), never)
+        enter = xp.where(is_moving, xp.minimum(first, second), xp.where(overlaps, xp.zeros_like(dx), never))
+        leave = xp.where(is_moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, never)

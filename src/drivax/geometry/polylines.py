@@ -19,9 +19,11 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Polylines:
-    """Concatenated polylines: points, the index of the first point of each (and the number of points), arc lengths.
+    """Concatenated polylines.
 
-    Arc lengths are measured from the start of each polyline, metres.
+    Attributes:
+        start: Index of the first point of each polyline, and finally the number of points.
+        arc: Arc length of each point from the start of its polyline, m.
     """
 
     points: Float[Array, "point dim"]
@@ -144,7 +146,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Mask of points to keep, within the tolerance of all dropped points.
+    """Mask of points to keep, so that the dropped ones lie within the tolerance of the simplified polylines.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
@@ -179,7 +181,7 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
 
 def _changes(values: Int[Array, " n"]) -> Int[Array, " change"]:
     """Indices at which a sequence begins or changes."""
-    return np.concatenate((values[:1] == values[:1], values[1:] != values[:-1])).nonzero()[0]
+    return np.concatenate(([0], np.flatnonzero(values[1:] != values[:-1]) + 1))[: len(values)]
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
@@ -217,7 +219,7 @@ def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
     """Heading at every point of a polyline by central differences, one-sided at the ends, radians."""
     xy = points[:, :2]
     chord = np.concatenate((xy[1:], xy[-1:])) - np.concatenate((xy[:1], xy[:-1]))
-    return np.arctan2(*chord.T[::-1])
+    return np.arctan2(chord[:, 1], chord[:, 0])
 
 
 def project(
@@ -252,17 +254,16 @@ def project_monotone(
         if k > 0:
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
-        # The segments in reach; the last point of the line begins none.
-        part = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
-        along_x, along_y, length, begin = step_x[part], step_y[part], span[part], arc[:-1][part]
-        if not len(length):  # the position before was at the end of the line
+        reach = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
+        along_x, along_y, length, begin = step_x[reach], step_y[reach], span[reach], arc[:-1][reach]
+        if not len(length):  # the previous position is the end of the line, which begins no segment
             result[k] = low
             continue
-        offset_x, offset_y = xy[k, 0] - x[part], xy[k, 1] - y[part]
-        fraction = (offset_x * along_x + offset_y * along_y) / square[part]
+        offset_x, offset_y = xy[k, 0] - x[reach], xy[k, 1] - y[reach]
+        fraction = (offset_x * along_x + offset_y * along_y) / square[reach]
         foot = np.minimum(np.maximum(fraction * length, low - begin), high - begin)
         foot = np.minimum(np.maximum(foot, 0.0), length)
-        fraction = foot / divisor[part]
+        fraction = foot / divisor[reach]
         residual_x, residual_y = offset_x - fraction * along_x, offset_y - fraction * along_y
         nearest = (residual_x * residual_x + residual_y * residual_y).argmin()
         result[k] = arc[i + nearest] + foot[nearest]

@@ -20,7 +20,7 @@ class Domain:
         shares: Relative frequency of each road family; families without one do not occur.
         pedestrians: Pedestrians per 100 m of sidewalk, low and high, drawn per scenario.
         parked_share: Share of occupied bays, low and high, drawn per scenario.
-        double_share: Share of scenarios with bays that have a double-parked car.
+        double_share: Probability of a double-parked car where a bay has room for one next to it.
     """
 
     name: str
@@ -62,7 +62,7 @@ _SHARES = (
 )
 #: Wide lanes, lights, higher speeds; roundabouts are rare.
 GRID_DOMAIN = Domain("grid", GRID, tuple((family, share) for family, share, _ in _SHARES))
-#: Narrow streets, roundabouts and signs instead of lights, dense traffic, cyclists, no highways.
+#: Narrow streets, more roundabouts and signs, fewer lights, dense traffic, more cyclists, no highways.
 RING_DOMAIN = Domain(
     name="ring",
     style=RING,

@@ -1,7 +1,7 @@
 """Scenario sets of the built-in world, drawn in worker processes and written in order, and the benchmark's splits.
 
-The bytes of a set depend only on the seed and the number of scenarios: not on the number of workers nor, with workers,
-on the processor. Nothing here imports JAX, so that workers start quickly; an audit that needs it is an argument.
+With workers, the bytes of a set depend only on its options, seed and number of scenarios: not on the number of workers
+or the processor. This module does not import JAX, so that workers start quickly; an audit that needs it is an argument.
 
 A map is drawn from (seed, number of the map), so sets of different seeds share no map. The seeds of the benchmark's
 splits are refused to users: training on its maps by accident is impossible.
@@ -106,7 +106,7 @@ class Generation:
             )
         if self.future_s < 8.0:
             raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
-        _ = self.sizes
+        _ = self.sizes  # refuses other lengths and numbers of egos
         self.world.check()
 
     @property
@@ -122,7 +122,7 @@ class FamilyCount:
     Attributes:
         kept: Number of scenarios.
         rejected: Number of rejected draws by cause.
-        unsuited: Number of draws in which the requested event could not happen.
+        unsuited: Number of draws in which the requested event could not happen or did not endanger ego.
         events: Number of scenarios with each labelled event.
     """
 
@@ -133,7 +133,7 @@ class FamilyCount:
 
     @property
     def rejection_rate(self) -> float:
-        """Share of rejected draws among those that could have the requested event."""
+        """Share of rejected draws among those with no event or a suitable one."""
         rejected = sum(self.rejected.values())
         return rejected / max(rejected + self.kept, 1)
 
@@ -193,7 +193,8 @@ def generate(
     Args:
         out: The scenario set to write; it appears when it is complete.
         scenarios: Number of scenarios.
-        seed: Scenario ``i`` of a seed is the same in every set; sets of different seeds have no map in common.
+        seed: Scenario ``i`` of a seed is the same in every set with the same options; sets of different seeds have no
+            map in common.
         options: Options.
         progress: Called after every scenario.
         audit: Called in a thread of this process with batches of scenarios; its results are stored with them.
@@ -214,7 +215,7 @@ def write_set(
     out: str | Path, scenarios: int, seed: int, options: Generation, notes: Mapping[str, Any],
     progress: Progress | None, audit: Audit | None,
 ) -> GeneratedSet:  # fmt: skip
-    """:func:`generate` without checks; ``notes`` go into the manifest's source."""
+    """Generate a set without checking the arguments; ``notes`` go into the manifest's source."""
     begin = time.monotonic()
     source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios, **notes}
     source["config"] = dataclasses.asdict(options.world)
@@ -223,9 +224,7 @@ def write_set(
     with (
         ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
-        closing(
-            _audit_batches(_count_draws(draws, counts, scenarios, progress), audit or _no_audit)
-        ) as pairs,
+        closing(_audit_batches(_count_draws(draws, counts, scenarios, progress), audit)) as pairs,
     ):
         for scenario, finding in pairs:
             writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
@@ -248,7 +247,7 @@ def _no_audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
 
 
 def _audit_batches(
-    scenarios: Iterator[Scenario], audit: Audit
+    scenarios: Iterator[Scenario], audit: Audit | None
 ) -> Generator[tuple[Scenario, dict[str, Any]], None, None]:
     """Audit scenarios in batches, in a thread that compiles the audit while others are drawn.
 
@@ -259,7 +258,7 @@ def _audit_batches(
     try:
         size = _FIRST
         while batch := list(islice(scenarios, size)):
-            waiting.append((batch, auditor.submit(audit, batch)))
+            waiting.append((batch, auditor.submit(audit or _no_audit, batch)))
             size = _BATCH
             if len(waiting) > _AHEAD_BATCHES:
                 yield from _pairs(*waiting.popleft())
@@ -352,7 +351,7 @@ def generate_benchmark(
 
     Args:
         out: A folder.
-        options: Options; of the world only the domain may differ from the default.
+        options: Options with the default ``future_s``; of the world only the domain may differ from the default.
         train: Size of the training set, for tests and trials; the other sets are scaled with it. Smaller sets are
             prefixes of the full ones.
         progress: Called after every scenario, with counts over all splits.
@@ -365,7 +364,8 @@ def generate_benchmark(
     options.check()
     if options.world != WorldConfig(domain=options.world.domain) or options.future_s != 8.0:
         raise UsageError(
-            "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
+            "the benchmark's future_s is 8, and its world is fixed but for its domain",
+            cure="use generate for other settings",
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))

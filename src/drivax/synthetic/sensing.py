@@ -24,10 +24,10 @@ _MAX_SIGMA = 3.0
 _BATCH_SIZE = 512
 
 
-def _refuse_negative(room: str, settings: Any) -> None:
+def _check_numbers(section: str, settings: Any) -> None:
     for name, value in vars(settings).items():
         if not 0.0 <= value < math.inf:
-            raise UsageError(f"{room}.{name} is {value}", cure="use a finite number that is not negative")
+            raise UsageError(f"{section}.{name} is {value}", cure="use a finite number that is not negative")
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class SensorConfig:
 
     def check(self) -> None:
         """Raise a UsageError for the first wrong setting."""
-        _refuse_negative("sensor", self)
+        _check_numbers("sensor", self)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class NoiseConfig:
 
     def check(self) -> None:
         """Raise a UsageError for the first wrong setting."""
-        _refuse_negative("noise", self)
+        _check_numbers("noise", self)
         for name, value in vars(self).items():
             if name.endswith("_correlation") and value >= 1.0:
                 raise UsageError(f"noise.{name} is {value}", cure="use a number from 0 to below 1")
@@ -95,9 +95,9 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
         [tracks.xy[order], np.cos(heading)[..., None], np.sin(heading)[..., None], size[..., :2]], axis=-1
     )
     blocks = tracks.kind[order] == AgentKind.VEHICLE
-    seen = np.empty(tracks.valid.shape, bool)
-    seen[order] = visible(box, size[..., 2].max(axis=1), tracks.valid[order], blocks, config)
-    return seen
+    is_visible = np.empty(tracks.valid.shape, bool)
+    is_visible[order] = visible(box, size[..., 2].max(axis=1), tracks.valid[order], blocks, config)
+    return is_visible
 
 
 def visible(
@@ -112,22 +112,22 @@ def visible(
     """
     offset = box[..., :2] - box[:1, :, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    near = valid & valid[:1] & (distance <= config.range_m)
-    near[0] = False
-    target, step = np.nonzero(near)
-    seen = np.zeros(valid.shape, bool)
-    seen[0] = valid[0]
+    in_range = valid & valid[:1] & (distance <= config.range_m)
+    in_range[0] = False
+    target, step = np.nonzero(in_range)
+    is_visible = np.zeros(valid.shape, bool)
+    is_visible[0] = valid[0]
     if not len(target):
-        return seen
+        return is_visible
     points = np.concatenate((corners(box[target, step]), box[target, step, None, :2]), axis=1)
-    hidden = np.zeros(points.shape[:2], bool)
-    row, other = _occluders(box, valid & blocks[:, None], target, step)
+    is_hidden = np.zeros(points.shape[:2], bool)
+    ray, occluder = _occluders(box, valid & blocks[:, None], target, step)
     eye = height_m[0] + config.above_roof_m
-    heights, when = (eye, height_m[target[row]] / 2), step[row]
-    cut = _cuts(box[0, when, :2], points[row], heights, box[other, when], height_m[other])
-    np.logical_or.at(hidden, row, cut)
-    seen[target, step] = ~hidden.all(axis=1)
-    return seen
+    heights, steps = (eye, height_m[target[ray]] / 2), step[ray]
+    is_cut = _cuts(box[0, steps, :2], points[ray], heights, box[occluder, steps], height_m[occluder])
+    np.logical_or.at(is_hidden, ray, is_cut)
+    is_visible[target, step] = ~is_hidden.all(axis=1)
+    return is_visible
 
 
 def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> tuple[_Pairs, _Pairs]:
@@ -140,9 +140,9 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
     radius = np.hypot(box[..., LENGTH], box[..., WIDTH]).max(axis=1) / 2
     # Users far from all rays cannot occlude.
     farthest = length.max() + 2.0 * (radius.max() + radius)
-    near = (blocking & (x**2 + y**2 < farthest[:, None] ** 2)).any(axis=1)
-    near[0] = False
-    near_rows = np.flatnonzero(near)
+    is_near = (blocking & (x**2 + y**2 < farthest[:, None] ** 2)).any(axis=1)
+    is_near[0] = False
+    near_rows = np.flatnonzero(is_near)
     pairs = []
     # Batches keep the tables in the processor's cache.
     for first in range(0, len(target), _BATCH_SIZE):
@@ -159,10 +159,10 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
         reach += length[batch]
         meets &= ahead < reach
         meets &= near_rows[:, None] != to
-        other, row = np.nonzero(meets)
-        pairs.append((row + first, near_rows[other]))
-    row, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return row, other
+        occluder, ray = np.nonzero(meets)
+        pairs.append((ray + first, near_rows[occluder]))
+    ray, occluder = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    return ray, occluder
 
 
 def _cuts(
@@ -178,7 +178,7 @@ def _cuts(
 
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
-    """Return the largest distance by which :func:`noisy` can move a corner of a box, m."""
+    """Return the largest distance by which :func:`noisy` can move a corner of a box, m (for small turns)."""
     maximum = _MAX_SIGMA * config.level
     turn = maximum * config.heading_rad
     along = maximum * config.along_m + turn * width_m / 2
@@ -198,13 +198,13 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     share[ego] = 0.0
     deviations = (config.along_m, config.across_m, config.heading_rad, config.speed_mps)
     correlations = (config.position_correlation,) * 2 + (config.heading_correlation, config.speed_correlation)
-    along, across, turn, faster = (
+    along, across, turn, speed_error = (
         config.level * sigma * share * _jitter(tracks.valid.shape, correlation, rng)
         for sigma, correlation in zip(deviations, correlations, strict=True)
     )
     heading = np.where(tracks.valid, wrap(tracks.heading + turn), 0.0)
-    # Noise neither moves standing users nor reverses moving ones.
-    speed = np.sign(speed) * np.maximum(np.abs(speed) + np.where(np.abs(speed) > 0.0, faster, 0.0), 0.0)
+    # Standing users stay at speed 0, and moving ones do not reverse.
+    speed = np.sign(speed) * np.maximum(np.abs(speed) + np.where(np.abs(speed) > 0.0, speed_error, 0.0), 0.0)
     velocity = speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     heading[ego], velocity[ego] = tracks.heading[ego], tracks.velocity[ego]
     return replace(

@@ -1,11 +1,12 @@
 """The built-in traffic world: one recording per seed and index, whose expert neither collides nor leaves the road.
 
-Everything is drawn from ``numpy.random.default_rng`` seeded with (seed, index, attempt), the roads with (seed, number
-of the map): a recording depends neither on the number of workers nor on other recordings.
+Everything is drawn from ``numpy.random.default_rng`` seeded with the seed and the numbers of the scenario (of the map
+for roads) and of the attempt: a recording depends neither on the number of workers nor on other recordings.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -56,8 +57,8 @@ _LIGHTS_M = 95.0
 #: Largest number of draws of a scenario, on one map, and with one kind of event.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
 #: Causes of rejection other than violations: the requested event cannot happen, or has no effect.
-UNSUITED = ("no_occasion", "no_threat")
-#: Number of stagings with the same roles.
+UNSUITED = _NO_OCCASION, _NO_THREAT = "no_occasion", "no_threat"
+#: Largest number of stagings with the same roles.
 _STAGINGS = 3
 #: Largest number of recorded users without ego, those nearest to it.
 _RECORDED = 76
@@ -99,10 +100,9 @@ class WorldConfig:
         for name in ("rare_rate", "critical_share", "lane_change_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
-        if min(self.signal_timing) < 0.0 or abs(sum(self.signal_timing) - 1.0) > 1e-6:
-            raise UsageError(
-                f"signal_timing is {list(self.signal_timing)}", cure="use three shares that add up to 1"
-            )
+        timing = self.signal_timing
+        if min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1e-6):
+            raise UsageError(f"signal_timing is {list(timing)}", cure="use three shares that add up to 1")
         self.noise.check()
         self.sensor.check()
         if self.scenarios_per_map < 1:
@@ -128,7 +128,7 @@ class GeneratedRecording:
 def generate_recording(
     seed: int, index: int, config: WorldConfig | None = None, steps: int = STEPS
 ) -> Recording:
-    """Generate the recording of a seed and index (both not negative) in a world with some settings."""
+    """Generate the recording of a seed and an index, neither of them negative."""
     return generate_one(seed, index, config or WorldConfig(), steps).recording
 
 
@@ -142,12 +142,13 @@ def generate_many(
 ) -> Iterator[GeneratedRecording]:
     """Generate recordings of at least 91 steps with their families and rejected attempts.
 
-    Their traffic is simulated together, which is faster and changes no recording. The kind of event is drawn first, so
-    kinds that fail more often are not rarer. A rare scenario has its own roads, which are redrawn if its event cannot
-    happen on them.
+    Their traffic is simulated together, which is faster and changes no recording. The kind of event is drawn first and
+    replaced only after 60 attempts, so kinds that fail more often are hardly rarer. A rare scenario has its own roads,
+    new ones for each attempt, on which its event can happen.
 
     Raises:
-        UsageError: Seed or index are negative, or no draw gives a clean expert.
+        UsageError: A setting is wrong, seed or index are negative, no roads suit the event, or no draw gives a clean
+            expert.
     """
     domain = config.check()
     return run_all(_generate(seed, index, config, domain, steps) for index in indices)
@@ -163,19 +164,20 @@ def _generate(
     rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
         event = events[attempt // _PER_KIND % len(events)]
-        sample = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
-        family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *sample))
+        map_number = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
+        family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *map_number))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = destinations_for(event, network, attempt > 0) if event else ()
         result = yield from _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
-        world, length = f"w{WORLD_VERSION}-{config.domain}-s{seed}", f"-t{steps}" if steps != STEPS else ""
+        world = f"w{WORLD_VERSION}-{config.domain}-s{seed}"
+        length = f"-t{steps}" if steps != STEPS else ""
         recording = replace(
             result,
             scenario_id=f"{world}{length}-{index:06d}-{family.name}",
-            segment=f"{world}-{'r' if event else 'm'}{sample[0]:06d}.{sample[1]}",
+            segment=f"{world}-{'r' if event else 'm'}{map_number[0]:06d}.{map_number[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
         return GeneratedRecording(recording, family.name, config.domain, dict(rejected))
@@ -203,8 +205,8 @@ def _draw_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Roa
         if not event or possible(event, network):
             return family, network
     raise UsageError(
-        f"no family of roads of the domain {domain.name} has what a {event.name.lower()} needs",
-        cure="use other families or a rare_rate of 0",
+        f"no roads of the domain {domain.name} allow the event {event.name.lower()}",
+        cure="use another domain or a rare_rate of 0",
     )
 
 
@@ -236,19 +238,35 @@ def _attempt(
         critical,
     )
     traffic = Traffic(roles, times)
-    if not draw.event:
-        motion, first = (yield Run(traffic)), None
-        if critical:
-            first = _critical_step(traffic, motion, rng)
-        begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
-        end = begin + draw.steps
-        traffic, motion = traffic.before_step(end), motion.before_step(end)
-        motion, cause = yield from expert.drive_ego(traffic, Staging(), begin, unplanned=motion)
-        if cause:
-            return cause
-        recording = _to_recording(roles, motion, begin, None, draw.steps)
-        return _add_perception(replace(recording, tags=tags), config, rng)
-    view, cause = EgoView(roles, (yield Run(traffic)), _WARM_UP), UNSUITED[0]
+    if draw.event:
+        result = yield from _stage_event(draw, traffic, rng)
+    else:
+        result = yield from _drive_without_event(traffic, draw.steps, critical, rng)
+    return result if isinstance(result, str) else _add_perception(result, config, rng)
+
+
+def _drive_without_event(
+    traffic: Traffic, steps: int, critical: bool, rng: np.random.Generator
+) -> Generator[Run, Motion, Recording | str]:
+    """Return a recording without perception noise, or the cause of its rejection.
+
+    A ``critical`` one begins at a critical step, if there is one.
+    """
+    motion, begin, tags = (yield Run(traffic)), _WARM_UP, {}
+    step = _critical_step(traffic, motion, rng) if critical else None
+    if step is not None:
+        begin, tags = step, {"critical": "yes"}
+    end = begin + steps
+    traffic, motion = traffic.before_step(end), motion.before_step(end)
+    motion, cause = yield from expert.drive_ego(traffic, Staging(), begin, unplanned=motion)
+    return cause or replace(_to_recording(traffic.roles, motion, begin, None, steps), tags=tags)
+
+
+def _stage_event(
+    draw: _Draw, traffic: Traffic, rng: np.random.Generator
+) -> Generator[Run, Motion, Recording | str]:
+    """Return a recording of the event without perception noise, or the cause of the last failure."""
+    view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
@@ -256,8 +274,8 @@ def _attempt(
         aware = staged.first_step - _LEAD_STEPS
         motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware)
         if not cause and endangers_ego(view, motion, staged):
-            return _add_perception(_to_recording(roles, motion, _WARM_UP, staged, draw.steps), config, rng)
-        cause = cause or UNSUITED[1]
+            return _to_recording(traffic.roles, motion, _WARM_UP, staged, draw.steps)
+        cause = cause or _NO_THREAT
     return cause
 
 
@@ -281,7 +299,7 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
 def _to_recording(
     roles: Roles, motion: Motion, first: int, staged: StagedEvent | None, steps: int
 ) -> Recording:
-    """Return the recording from a given step on, without id and segment."""
+    """Return the recording of ``steps`` steps from step ``first`` on, without id and segment."""
     network, motion = roles.network, motion.from_step(first)
     times = np.arange(steps) * DT_S
     events, tags = (), {}

@@ -22,11 +22,11 @@ CAR_M = (4.6, 1.85, 1.55)
 
 def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
     """Return distance and speed of a change between constant speeds from time 0 on (negative distances before)."""
-    lasts = abs(last_mps - first_mps) / rate_mps2
+    duration_s = abs(last_mps - first_mps) / rate_mps2
     rate = math.copysign(rate_mps2, last_mps - first_mps)
-    during = np.clip(times_s, 0.0, lasts)
+    during = np.clip(times_s, 0.0, duration_s)
     distance = first_mps * np.minimum(times_s, 0.0) + first_mps * during + rate * during**2 / 2
-    distance = distance + last_mps * np.maximum(times_s - lasts, 0.0)
+    distance = distance + last_mps * np.maximum(times_s - duration_s, 0.0)
     return distance, first_mps + rate * during
 
 
@@ -49,10 +49,10 @@ def gait(
     stopping = speed_mps**2 / (2 * loss)
     if distance_m < stopping + speed_mps**2 / (2 * gain):
         return None
-    slows = travel_s(distance_m - stopping, speed_mps, gain)
-    travelled_m, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
-    extra, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
-    return travelled_m + extra, np.where(times_s < slows, up, down)
+    braking_at_s = travel_s(distance_m - stopping, speed_mps, gain)
+    travelled_m, rising_mps = speed_change(0.0, speed_mps, gain, np.minimum(times_s, braking_at_s))
+    braked_m, falling_mps = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - braking_at_s, 0.0))
+    return travelled_m + braked_m, np.where(times_s < braking_at_s, rising_mps, falling_mps)
 
 
 def along_track(
@@ -72,11 +72,11 @@ def scripted_motion(
     """Build an actor headed along its motion; at rest it keeps its last heading, ``heading`` if it never moves."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
-    drives = speed > 0.3
-    if drives.any():
+    is_moving = speed > 0.3
+    if is_moving.any():
         angle = np.arctan2(step[:, 1], step[:, 0])
-        index = np.maximum.accumulate(np.where(drives, np.arange(len(xy)), -1))
-        index = np.where(index < 0, int(np.argmax(drives)), index)
+        index = np.maximum.accumulate(np.where(is_moving, np.arange(len(xy)), -1))
+        index = np.where(index < 0, int(np.argmax(is_moving)), index)
         heading = angle[index]
     return ScriptedUser(kind, size_m, xy, heading, speed, valid)
 
@@ -103,9 +103,8 @@ def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> S
     times = DT_S * (np.arange(len(arc)) - step)
     travelled_m, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
     position = np.where(times < 0, arc, np.minimum(arc[step] + travelled_m, arc))
-    grows = np.concatenate([[True], np.diff(arc) > 1e-6])
-    heading = np.interp(position, arc[grows], np.unwrap(user.heading)[grows])
+    is_new = np.concatenate([[True], np.diff(arc) > 1e-6])
+    heading = np.interp(position, arc[is_new], np.unwrap(user.heading)[is_new])
     speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
-    return replace(
-        user, xy=curves.interpolate(position, arc[grows], user.xy[grows]), heading=heading, speed=speed
-    )
+    xy = curves.interpolate(position, arc[is_new], user.xy[is_new])
+    return replace(user, xy=xy, heading=heading, speed=speed)

@@ -45,7 +45,10 @@ _BEHIND_S = 0.8
 def required_deceleration(
     speed_mps: float, room_m: Float64[np.ndarray, " k"], time_s: Float64[np.ndarray, " k"]
 ) -> float:
-    """Return the constant deceleration with which ego moves at most ``room_m`` by each time, 0 without need."""
+    """Return the constant deceleration with which ego moves at most ``room_m`` by each time, m/s2.
+
+    It is 0 if ego need not brake, and infinite if a distance is not positive.
+    """
     if np.any(room_m <= 0.0):
         return math.inf
     relevant = (time_s > 0) & (speed_mps * time_s > room_m)
@@ -84,8 +87,8 @@ def first_blocked_station(view: EgoView, adversary: ScriptedUser, step: int) -> 
     size = view.ego_size_m[:2]
     ego = boxes(xy, track.heading[begin:], size)
     reach = (math.hypot(*size) + math.hypot(*adversary.size_m[:2])) / 2
-    gap = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
-    time, index = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
+    squared_m2 = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
+    time, index = np.nonzero((squared_m2 < reach**2) & adversary.valid[step : last + 1, None])
     hit = overlap(ego[index], box[time])
     result = np.full(len(box), math.inf)
     np.minimum.at(result, time[hit], station[index[hit]])
@@ -126,8 +129,8 @@ def least_ttc(
     time = time_to_overlap(own, speed * toward, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
     time = np.where(overlap(own, other), 0.0, time)
     # Braking does not avoid actors from behind.
-    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
-    return float(np.min(np.where(ahead & actor.valid[steps], time, 5.0), initial=5.0))
+    is_ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
+    return float(np.min(np.where(is_ahead & actor.valid[steps], time, 5.0), initial=5.0))
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
@@ -162,9 +165,9 @@ def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[in
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
     gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
-    same = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
-    meets = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & same
-    return tuple(rows[meets.any(axis=1)].tolist())
+    is_parallel = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
+    is_in_lane = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & is_parallel
+    return tuple(rows[is_in_lane.any(axis=1)].tolist())
 
 
 def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
@@ -174,8 +177,8 @@ def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
     headings = motion.heading[rows][:, moves]
-    crosses = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
-    row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
+    is_crossing = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
+    row, step = np.nonzero(motion.valid[rows][:, moves] & is_crossing & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSING_MARGIN_M
     other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
@@ -185,37 +188,37 @@ def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
 def enter_when_clear(
     view: EgoView, extra: ScriptedUser, until: int, removed: tuple[int, ...]
 ) -> ScriptedUser | None:
-    """Delay the appearance of a new actor until it has no collision ahead.
+    """Delay the appearance of a new actor until it has no collision ahead up to step ``until``.
 
-    Other agents keep behind it, so only agents ahead of it and pedestrians count, up to step ``until``. The rows
-    ``removed`` do not take part.
+    Agents behind it react to it, so only agents ahead of it and pedestrians count. The rows ``removed`` do not take
+    part.
 
     Returns:
-        The actor, or None if it has a collision or ego would see it appear.
+        The actor, or None if it would appear in ego's view, too close to another agent, or after step ``until``.
     """
-    motion, last = view.motion, until + 1
+    motion, end = view.motion, until + 1
     along, across = _VEHICLE_MARGIN_M if extra.kind == AgentKind.VEHICLE else _OTHER_MARGIN_M
-    box = actor_boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
+    box = actor_boxes(extra)[None, :end] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
     users = slice(1, None)
-    other = boxes(motion.xy[users, :last], motion.heading[users, :last], motion.size_m[users, None, :2])
-    stays = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
-    valid = motion.valid[users, :last] & extra.valid[:last] & stays
-    near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
-    user, step = np.nonzero(valid & near)
+    other = boxes(motion.xy[users, :end], motion.heading[users, :end], motion.size_m[users, None, :2])
+    is_kept = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
+    valid = motion.valid[users, :end] & extra.valid[:end] & is_kept
+    is_near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
+    user, step = np.nonzero(valid & is_near)
     forward = box[0, step, 2:4] * np.where(extra.speed[step] < 0, -1.0, 1.0)[:, None]
-    ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
-    on_foot = motion.kind[users][user] == AgentKind.PEDESTRIAN
-    meets = step[overlap(box[0, step], other[user, step]) & (ahead | on_foot)]
+    is_ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
+    is_pedestrian = motion.kind[users][user] == AgentKind.PEDESTRIAN
+    collisions = step[overlap(box[0, step], other[user, step]) & (is_ahead | is_pedestrian)]
     appears = int(np.argmax(extra.valid))
-    if len(meets):
+    if len(collisions):
         # It appears after its last collision.
-        appears = max(appears, int(meets.max()) + 5)
-    if appears >= last or not extra.valid[appears]:
+        appears = max(appears, int(collisions.max()) + 5)
+    if appears >= end or not extra.valid[appears]:
         return None
     distance = np.hypot(*(extra.xy[appears] - motion.xy[0, appears]))
     is_visible = appears > view.first_step and distance < _APPEARANCE_M
-    scene = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if is_visible or not _is_clear(*scene):
+    is_clear = _is_clear(box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears])
+    if is_visible or not is_clear:
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 

@@ -53,7 +53,7 @@ _TOLERANCE_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
-    """Whether an event is possible in a network: it may need a light, a lane that ends, or bays."""
+    """Whether a network has what an event needs, such as a light, a lane that ends, or bays."""
     return SCRIPTS[kind].possible(network)
 
 
@@ -85,9 +85,11 @@ def stage(
         if draw >= _AS_REQUESTED and draw % _PER_SEVERITY == 0:
             severity_mps2 = draw_severity(rng)
         proposal = SCRIPTS[kind].propose(view, severity_mps2, rng)
-        checked = proposal and _check(proposal.view or view, proposal)
-        if proposal and checked:
-            required, staging = checked
+        if proposal is None:
+            continue
+        result = _check(proposal.view or view, proposal)
+        if result is not None:
+            required, staging = result
             actor = len(view.motion.kind) if proposal.vehicle is None else proposal.vehicle
             actors = (actor, *proposal.others)
             return StagedEvent(kind, staging, actors, proposal.first_step, proposal.last_step, required)
@@ -101,20 +103,17 @@ def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     low, high = SEVERITY_MPS2
     if not low <= required <= high or abs(required - proposal.severity_mps2) > _TOLERANCE_MPS2:
         return None
-    blocked = np.isfinite(first_blocked_station(view, adversary, begin))
-    entered = begin + int(np.argmax(blocked))
-    if (
-        not blocked.any()
-        or entered >= view.first_step + FULL_SWING
-        or not comes_close(view, adversary, begin)
-    ):
+    is_blocked = np.isfinite(first_blocked_station(view, adversary, begin))
+    entry = begin + int(np.argmax(is_blocked))
+    is_in_time = is_blocked.any() and entry < view.first_step + FULL_SWING
+    if not is_in_time or not comes_close(view, adversary, begin):
         return None
     staging = proposal.staging
     crossing = (row for extra in staging.extras for row in vehicles_that_cross(view, extra))
     removed = tuple(sorted({*staging.removed, *crossing}))
     if not set(removed).isdisjoint(proposal.others):
         return None
-    entering = (enter_when_clear(view, extra, entered, removed) for extra in staging.extras)
+    entering = (enter_when_clear(view, extra, entry, removed) for extra in staging.extras)
     extras = tuple(extra for extra in entering if extra is not None and extra.valid[begin])
     if len(extras) < len(staging.extras):
         return None

@@ -1,8 +1,8 @@
 """Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
 Recorded data sets are mined for interactions, since most driving is on empty roads. This module rolls out a reference
-driver from several steps of the same traffic: it follows its leader and stops at red lights, but ignores all other
-agents. A collision shows that good driving takes more than car following.
+driver from several steps of the same traffic: it follows its leader and stops at red and yellow lights, but ignores all
+other agents. A collision shows that good driving takes more than car following.
 """
 
 from __future__ import annotations
@@ -100,9 +100,9 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 
     sides = (extent.near_m, extent.far_m, extent.right_m, extent.left_m)
     extent_m = np.stack([table(side, np.inf) for side in sides])
-    near = np.isfinite(extent_m[0]).any(axis=1)
+    is_near = np.isfinite(extent_m[0]).any(axis=1)
     box = boxes(users.xy, users.heading, users.size_m).reshape(*shape, 6)
-    return _Others(extent_m[:, near], table(along, 0.0)[near], box[near])
+    return _Others(extent_m[:, is_near], table(along, 0.0)[is_near], box[is_near])
 
 
 def _leader(
@@ -113,8 +113,8 @@ def _leader(
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far, right, left = extent
     side = size_m[1] / 2 + _SIDE_M
-    ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
-    gap = np.where(ahead, near, np.inf) - at - size_m[0] / 2
+    is_ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
+    gap = np.where(is_ahead, near, np.inf) - at - size_m[0] / 2
     first = gap.argmin(axis=0), np.arange(len(at))
     return gap[first], others.speed[:, now][first]
 
@@ -127,8 +127,8 @@ def _stop_line_m(
     for span in path.spans:
         if network.lanes[span.lane].control == Control.SIGNAL:
             distance = span.begin_m - front
-            shut = (colour[:, span.lane] == Colour.RED) | (colour[:, span.lane] == Colour.YELLOW)
-            result = np.minimum(result, np.where(shut & (distance > 0), distance, np.inf))
+            is_closed = (colour[:, span.lane] == Colour.RED) | (colour[:, span.lane] == Colour.YELLOW)
+            result = np.minimum(result, np.where(is_closed & (distance > 0), distance, np.inf))
     return result
 
 
@@ -139,9 +139,9 @@ def _hits(
     """Whether an agent overlaps ego and did not come from behind; agents that did are added to ``behind``."""
     half, side = size_m / 2
     near, far, right, left = extent
-    maybe = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
-    behind |= maybe & ((near + far) / 2 <= at - half)
-    user, start = np.nonzero(maybe & ~behind)
+    is_close = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
+    behind |= is_close & ((near + far) / 2 <= at - half)
+    user, start = np.nonzero(is_close & ~behind)
     result = np.zeros(len(at), bool)
     if not len(user):
         return result

@@ -114,30 +114,25 @@ class CrossTraffic(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
-        connectors = sorted(
-            {
-                other
-                for connector in view.connectors
-                for other in self._lower_priority_conflicts(network, connector)
-            }
-        )
+        conflicts = [self._lower_priority_conflicts(network, connector) for connector in view.connectors]
+        connectors = sorted(set[int]().union(*conflicts))
         if not connectors:
             return None
         lane = int(rng.choice(connectors))
         path = _ActorPath.through(view, lane, rng)
         fastest = share * path.limit_mps
-        # Steps before the entry at which the actor can no longer stop: the event begins.
-        decides = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
-        scheduled = self._schedule(view, lane, path, (fastest, decides), severity_mps2)
-        if scheduled is None:
+        # The event begins this many steps before the entry: the actor can no longer stop.
+        lead = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
+        schedule = self._schedule(view, lane, path, fastest, lead, severity_mps2)
+        if schedule is None:
             return None
-        entry, adversary, required = scheduled
+        entry, adversary, required = schedule
         leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
         last = min(max(leaves, entry + 10), view.last_step)
         staging = Staging(extras=(adversary,), removed=removed)
-        return Proposal(staging, required, adversary, entry - decides, last)
+        return Proposal(staging, required, adversary, entry - lead, last)
 
     def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
@@ -159,47 +154,50 @@ class CrossTraffic(EventScript):
         return signalised and _is_straight(other) and abs(along) < _ALONG
 
     def _schedule(
-        self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
+        self, view: EgoView, lane: int, path: _ActorPath, fastest: float, lead: int, requested: float
     ) -> tuple[int, ScriptedUser, float] | None:
-        """Find the entry step of the actor for about this deceleration; also return its motion and severity."""
-        (fastest, decides), steps = pace, np.arange(view.steps)
-        first = view.first_step + EARLIEST + decides
-        last = min(view.first_step + LATEST + decides, view.last_step - 15)
+        """Find the entry step of the actor for about this deceleration; also return its motion and severity.
 
-        def entering(entry: int) -> ScriptedUser:
-            distance = path.distances(fastest, DT_S * (steps - entry))
+        ``fastest`` is its speed before the junction, m/s, and ``lead`` the number of steps from the event to the entry.
+        """
+        first = view.first_step + EARLIEST + lead
+        last = min(view.first_step + LATEST + lead, view.last_step - 15)
+
+        def actor(entry: int) -> ScriptedUser:
+            distance = path.distances(fastest, DT_S * (np.arange(view.steps) - entry))
             return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 
         if first > last:
             return None
         # Blocked stations of other entry steps are those of the first one, shifted in time.
-        blocked = first_blocked_station(view, entering(first), first - decides)
-        requires = np.zeros(last + 1)
+        blocked = first_blocked_station(view, actor(first), first - lead)
+        required = np.zeros(last + 1)
         for entry in range(first, last + 1):
-            begin = entry - decides + NOTICED
+            begin = entry - lead + NOTICED
             speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
                 room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
-                requires[entry] = required_on_samples(speed, room)
+                required[entry] = required_on_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
-        enters = np.arange(last + 1) - decides + int(np.argmax(np.isfinite(blocked)))
-        in_time = enters < view.first_step + FULL_SWING
-        fits = np.flatnonzero((requires > low) & (requires < high) & in_time)
-        for entry in fits[np.argsort(np.abs(requires[fits] - requested), kind="stable")[:6]].tolist():
+        blocked_at = np.arange(last + 1) - lead + int(np.argmax(np.isfinite(blocked)))
+        is_in_time = blocked_at < view.first_step + FULL_SWING
+        candidates = np.flatnonzero((required > low) & (required < high) & is_in_time)
+        order = np.argsort(np.abs(required[candidates] - requested), kind="stable")
+        for entry in candidates[order[:6]].tolist():
             # Ego at constant speed may pass before the actor arrives.
-            adversary = entering(entry)
-            if comes_close(view, adversary, entry - decides) and self._fits_lights(view, lane, entry):
-                return entry, adversary, float(requires[entry])
+            adversary = actor(entry)
+            if comes_close(view, adversary, entry - lead) and self._fits_lights(view, lane, entry):
+                return entry, adversary, float(required[entry])
         return None
 
     def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:
-        """Whether the light has been red for 1.2 s (red-light runner), or not red (turning vehicle)."""
+        """Whether the light was red for the last 1.2 s (red-light runner), or never red in them (turning vehicle)."""
         network = view.roles.network
         if network.signals is None:
             return self.turning
         # On the clock of the lights the recording begins at 0.
         times = (np.arange(view.steps) - view.first_step) * DT_S
         colour, _ = network.signals.colours(times, len(network.lanes))
-        red = colour[entry - 12 : entry + 1, lane] == Colour.RED
-        return not red.any() if self.turning else bool(red.all())
+        is_red = colour[entry - 12 : entry + 1, lane] == Colour.RED
+        return not is_red.any() if self.turning else bool(is_red.all())

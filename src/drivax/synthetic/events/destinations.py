@@ -17,7 +17,7 @@ from drivax.synthetic.traffic.placement import Placement
 _PACE = 0.88
 #: Road behind ego at the beginning of the recording: seconds at its free speed plus metres.
 _BEFORE_S, _BEHIND_M = 6.0, 15.0
-#: Earliest time at which ego's light turns green, and how long a short green lasts, s.
+#: Earliest time at which ego's light turns green, and earliest time at which this green ends, s.
 _GREEN_S = (-5.0, 6.0)
 #: On open roads: distance of the place from the lane's ends, m, and time of ego's arrival, s.
 _BEFORE_M, _AFTER_M, _MIDWAY_S = 30.0, 30.0, (3.0, 6.0)
@@ -85,7 +85,11 @@ def draw_route(
 def route_past(
     network: RoadNetwork, destination: Destination, rng: np.random.Generator
 ) -> DestinationRoute | None:
-    """Draw a route past a destination to the end of the map, or return None if a light or sign delays ego."""
+    """Draw a route past a destination to the end of the map, or return None if this draw fails.
+
+    It fails if a light or sign would delay ego, the roads before the destination are too short for the time of arrival,
+    ego would start on a connector, or the route would repeat lanes.
+    """
     time, position = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
     lane, lanes = destination.lane, [destination.lane]
     while position < time * _pace(network, lane):
@@ -144,6 +148,6 @@ def _pace(network: RoadNetwork, lane: int) -> float:
 
 
 def _feeding_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
-    """Predecessors of the first lane that are not part of the route."""
+    """Predecessors of the first lane that are for cars and not part of the route."""
     before = network.lanes[lanes[0]].predecessors
     return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

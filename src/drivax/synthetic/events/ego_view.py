@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from drivax.geometry.polylines import left_normals
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, normals
+from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate
 from drivax.synthetic.traffic.roles import Motion, Roles
 
 #: Earliest and latest first step of an event, and the step before which its actor blocks ego's path.
@@ -50,7 +51,7 @@ class Track:
         share = sample - index
         heading = self.heading[index] + share * (self.heading[index + 1] - self.heading[index])
         xy = self.xy[index] + share[..., None] * (self.xy[index + 1] - self.xy[index])
-        return xy + np.asarray(left_m)[..., None] * normals(heading), heading
+        return xy + np.asarray(left_m)[..., None] * left_normals(heading), heading
 
     def place(self, station: float) -> tuple[Float64[np.ndarray, " 2"], float]:
         """Position and heading at one station."""
@@ -86,7 +87,7 @@ def ego_track(motion: Motion) -> Track:
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
     ahead = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
     points = np.concatenate([points, [points[-1] + 300.0 * ahead]])
-    headings, along = (np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0))
+    headings, along = np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0)
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
     return Track(interpolate(station, along, points), np.interp(station, along, headings), arc)
 
@@ -144,12 +145,12 @@ class EgoView:
         xy, heading = self.track.place(station)
         points, headings, lane = self._lane_points
         gap = np.hypot(*(points - xy).T)
-        near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
-        if not near.any():
+        is_near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
+        if not is_near.any():
             return -1
-        on_route = near & np.isin(lane, self.roles.route)
-        candidates = on_route if on_route.any() else near
-        return int(lane[candidates][np.argmin(gap[candidates])])
+        is_on_route = is_near & np.isin(lane, self.roles.route)
+        is_candidate = is_on_route if is_on_route.any() else is_near
+        return int(lane[is_candidate][np.argmin(gap[is_candidate])])
 
     def neighbour(self, station: float, side: int) -> int:
         """Return the neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
@@ -188,7 +189,7 @@ class EgoView:
         return best
 
     def plain_road(self, station: float) -> bool:
-        """Whether a station is on an ordinary lane, away from junctions and crosswalks."""
+        """Whether a station is on a lane outside of junctions, more than 14 m from crossings."""
         lane, network = self.lane_at(station), self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
@@ -197,7 +198,7 @@ class EgoView:
 
     @cached_property
     def connectors(self) -> list[int]:
-        """Connectors on ego's path during the recording and right after it."""
+        """Connectors on ego's path from the earliest event to 30 m beyond the recording."""
         begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
         return self._connectors_between(begin, end, 3.0)
 
@@ -214,20 +215,20 @@ class EgoView:
         count = self.motion.vehicles
         station, lateral = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
-        same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
-        on = self.motion.valid[:count, step] & (np.abs(lateral) < 1.0) & same
-        on[0] = False
-        return station, on
+        is_parallel = np.cos(self.motion.heading[:count, step] - heading) > 0.8
+        is_on_path = self.motion.valid[:count, step] & (np.abs(lateral) < 1.0) & is_parallel
+        is_on_path[0] = False
+        return station, is_on_path
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """Return the scenario with a new leader, whose rear bumper is at stations from a step on; IDM slows ego."""
         law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
-        ahead = np.gradient(rear_m, DT_S)
+        leader_speed, fastest = np.gradient(rear_m, DT_S), np.maximum(speed.max(keepdims=True), 1.0)
         stations, speeds = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):
             v = speeds[t : t + 1]
             gap = rear_m[t : t + 1] - stations[t] - self.ego_size_m[0] / 2
-            a = idm_acceleration(v, np.maximum(speed.max(keepdims=True), 1.0), gap, ahead[t : t + 1], law)
+            a = idm_acceleration(v, fastest, gap, leader_speed[t : t + 1], law)
             after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
             distance = (float(v[0]) + after) / 2 * DT_S
             # Ego never overtakes its motion without the leader, since bends, lights and other agents still hold it.

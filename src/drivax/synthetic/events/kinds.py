@@ -41,7 +41,7 @@ class StagedEvent:
 
     Attributes:
         staging: Changes to the traffic.
-        actors: Rows of the actors in the simulated motion; extras come last.
+        actors: Rows of the actors in the simulated motion, whose last rows are the staging's extras.
         first_step, last_step: Steps of the misbehaviour, both included.
         severity_mps2: Constant deceleration with which ego just avoids the actor if it brakes 0.4 s after the first
             step, when the actor's behaviour is visible, and keeps its speed until then.

@@ -37,23 +37,26 @@ def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, brakin
     Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
     the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
     """
-    severity = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
-    if speed_mps / severity >= leader_mps / braking_mps2:
-        return severity
+    required = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
+    if speed_mps / required >= leader_mps / braking_mps2:
+        return required
     return braking_mps2 + max(speed_mps - leader_mps, 0.0) ** 2 / (2 * gap_m)
 
 
 def draw_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Draw the leader's deceleration and the severity, uniform over what hard braking requires; None if too little."""
+    """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
+
+    Return None if hard braking requires too little.
+    """
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
         return None
-    severity = float(rng.uniform(low, high))
-    room = speed_mps**2 / (2 * severity) - gap_m
-    return (leader_mps**2 / (2 * room), severity) if room > 0 else None
+    required = float(rng.uniform(low, high))
+    room = speed_mps**2 / (2 * required) - gap_m
+    return (leader_mps**2 / (2 * room), required) if room > 0 else None
 
 
 def cut_in_gap(
@@ -86,11 +89,9 @@ class LeadBrakes(EventScript):
     tailgating_s: tuple[float, float] = (0.4, 0.7)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: fast roads only."""
+        """See :class:`EventScript`: roads with a limit of at least 10 m/s."""
         places = open_road(network, _LEAST_MPS)
-        return (
-            tuple(replace(destination, followed=True) for destination in places) if self.tailgater else places
-        )
+        return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; the severity is drawn from the possible range instead."""
@@ -115,11 +116,14 @@ class LeadBrakes(EventScript):
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
         draft = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = view.last_step if draft is None else step + _stop_steps(speed, draft[1])
-        if draft is None or last > view.last_step:
+        if draft is None:
             return None
-        staging = Staging(overrides=(Override(leader, step, last, -draft[0]),), tailgates=tailgates)
-        adversary = brake_to_halt(motion, leader, step, draft[0])
+        braking, requested = draft
+        last = step + _stop_steps(speed, requested)
+        if last > view.last_step:
+            return None
+        staging = Staging(overrides=(Override(leader, step, last, -braking),), tailgates=tailgates)
+        adversary = brake_to_halt(motion, leader, step, braking)
         required = severity(view, adversary, step + NOTICED)
         return Proposal(staging, required, adversary, step, last, leader, followers)
 
@@ -131,7 +135,7 @@ class StalledVehicle(EventScript):
     headway_s: tuple[float, float] = (0.9, 1.4)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: fast roads only."""
+        """See :class:`EventScript`: roads with a limit of at least 10 m/s."""
         return open_road(network, _LEAST_MPS)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
@@ -141,7 +145,7 @@ class StalledVehicle(EventScript):
 
 
 def _stop_steps(speed_mps: float, severity_mps2: float) -> int:
-    """Return the steps that a leader stands: ego's time to reach it at constant speed, v / (2 a), and a margin."""
+    """Return the steps until a leader drives on: ego's time to reach it at constant speed, v / (2 a), and a margin."""
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
@@ -155,7 +159,8 @@ def _propose_leader(
     it stays.
 
     Returns:
-        The proposal; None near junctions, or if even hard braking would require too little of ego.
+        The proposal; None near junctions, if even hard braking would require too little of ego, or if the leader would
+        drive on only after the recording.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -164,10 +169,8 @@ def _propose_leader(
         return None
     first_valid = view.first_step - _BEFORE
     behind = view.behind(cruising - CAR_M[0] / 2, first_valid)
-    speed, gap = (
-        float(behind.motion.speed[0, step]),
-        float(cruising[step] - behind.track.at[step]) - lengths,
-    )
+    speed = float(behind.motion.speed[0, step])
+    gap = float(cruising[step] - behind.track.at[step]) - lengths
     draft = draw_braking(speed, gap, ego_mps, rng)
     if draft is None:
         return None
@@ -265,9 +268,10 @@ class CutIn(EventScript):
         speed = view.motion.speed[0]
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST + 1)
         # The merge and its gap take about three seconds, and it ends within the last metres of the lane.
-        left = station - view.track.at[steps] - 3.0 * speed[steps]
-        fits = steps[(left > 0.0) & (left < self.before_end_m) & (speed[steps] > 4.0)]
-        return (int(rng.choice(fits)) if len(fits) else None), side
+        remaining_m = station - view.track.at[steps] - 3.0 * speed[steps]
+        is_timely = (remaining_m > 0.0) & (remaining_m < self.before_end_m)
+        candidates = steps[is_timely & (speed[steps] > 4.0)]
+        return (int(rng.choice(candidates)) if len(candidates) else None), side
 
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int

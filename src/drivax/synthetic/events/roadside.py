@@ -138,8 +138,8 @@ class Jaywalker(_StreetScript):
         station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
         speed = view.motion.speed[0, steps]
-        near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
-        order = rng.permutation(np.flatnonzero(near & (station < view.track.at[steps[-1]] + 40.0)))
+        is_near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
+        order = rng.permutation(np.flatnonzero(is_near & (station < view.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
             line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])

@@ -1,1 +1,1 @@
-"""The expert that drives ego: plan, reservations, smoothing and checks."""
+"""The expert that drives ego: candidate paths, speed search, smoothing and checks."""

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import corners, overlap
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
+from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
@@ -96,10 +98,10 @@ def shift_path(
     out_m, back_m = shift.out_end_m - shift.begin_m, shift.end_m - shift.back_begin_m
     lateral += shift.aside_m * quintic_step(ahead, (shift.back_begin_m, 1.0, 0.0), back_m)
     lateral -= shift.aside_m * quintic_step(ahead, (shift.begin_m, 1.0, 0.0), out_m)
-    normal = np.stack([-np.sin(base.heading), np.cos(base.heading)], axis=-1)
     stretch = np.maximum(1.0 - lateral * np.interp(begin + ahead, grid, path.curvature), 0.2)
     relative_heading = np.arctan2(np.gradient(lateral, SPACING_M), stretch)
-    curve = Curve(base.xy + lateral[:, None] * normal, base.heading + relative_heading)
+    xy = base.xy + lateral[:, None] * left_normals(base.heading)
+    curve = Curve(xy, base.heading + relative_heading)
     arc = curve.arc_m
     position = np.arange(0.0, float(arc[-1]), SPACING_M)
     curve, base = interpolate_curve(curve, arc, position), np.interp(position, arc, ahead)
@@ -164,11 +166,11 @@ def find_conflicts(
 ) -> Conflicts:  # fmt: skip
     """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
     margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
-    still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
+    is_static = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
-    moving = _box_conflicts(ego, others, valid & ~still[:, None], margin)
+    moving = _box_conflicts(ego, others, valid & ~is_static[:, None], margin)
     # Static users are tested at one step only.
-    once = _box_conflicts(ego, others[:, :1], still[:, None], margin)
+    once = _box_conflicts(ego, others[:, :1], is_static[:, None], margin)
     steps = others.shape[1]
     user, point, hard = (np.repeat(values, steps) for values in (once.user, once.point, once.hard))
     return Conflicts(
@@ -192,11 +194,11 @@ def _box_conflicts(
     row, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     row = np.repeat(row, _STRIDE)
-    inside = (point >= 0) & (point < len(ego))
-    row, point = row[inside], point[inside]
+    is_inside = (point >= 0) & (point < len(ego))
+    row, point = row[is_inside], point[is_inside]
     other, ego_box = others[user[row], step[row]], ego[point]
-    close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
-    row, point, other, ego_box = row[close], point[close], other[close], ego_box[close]
+    is_close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
+    row, point, other, ego_box = row[is_close], point[is_close], other[is_close], ego_box[is_close]
     hard = overlap(_grow_boxes(ego_box, np.array(HARD_M)), other)
     return Conflicts(user[row], step[row], point, hard)
 
@@ -218,15 +220,17 @@ def _is_near_path(others: _Boxes, ego: _PathBoxes, reach: Float64[np.ndarray, " 
 
 def stop_lines(
     network: RoadNetwork, path: Path, ego_m: tuple[float, float], times_s: _Series, passed: _Series,
-    arrivals: dict[int, _Steps],
+    coming: dict[int, _Steps],
 ) -> list[StopLine]:  # fmt: skip
-    """Return the stop lines ahead of ego (path position of its centre, half length).
+    """Return the lines ahead of ego that it must not or should not pass at some time.
 
-    ``passed`` is the path position of ego's centre at each time (on the clock of the lights) in the last run.
+    ``ego_m`` is the path position of ego's centre and half its length, ``passed`` the position at each time in the last
+    run, and ``coming`` the result of :func:`arrivals`. Times are on the clock of the lights.
     """
     from_m, half_m = ego_m
     result = []
-    colour, to_red = None, None
+    shape = (len(times_s), len(network.lanes))
+    colour, to_red = np.zeros(shape, np.int8), np.zeros(shape)
     if network.signals is not None:
         colour, to_red = network.signals.colours(times_s, len(network.lanes))
     for span in path.spans:
@@ -234,15 +238,13 @@ def stop_lines(
         line = span.begin_m - half_m
         if not lane.connector or line <= from_m:
             continue
-        closed = np.zeros(len(times_s), bool)
-        late = closed.copy()
-        if colour is not None and to_red is not None:
-            closed |= colour[:, span.lane] == Colour.RED
-            late |= (colour[:, span.lane] == Colour.YELLOW) & (to_red[:, span.lane] < _LATE_YELLOW_S)
+        closed = colour[:, span.lane] == Colour.RED
+        late = (colour[:, span.lane] == Colour.YELLOW) & (to_red[:, span.lane] < _LATE_YELLOW_S)
         if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             closed |= passed <= line
         for rival in lane.yields_to:
-            late |= arrivals.get(rival, np.zeros(len(times_s), bool))
+            if rival in coming:
+                late |= coming[rival]
         if closed.any() or late.any():
             result.append(StopLine(line - _SHORT_M - from_m, closed, late))
     return result
@@ -260,8 +262,8 @@ def arrivals(
             if span.lane in watched:
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
-                on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
-                window = np.ones(round(_YIELD_S / 0.1) + 1)
-                coming = np.convolve(on_lane[::-1], window, mode="full")[: len(on_lane)][::-1] > 0
-                result[span.lane] = result.get(span.lane, np.zeros(len(on_lane), bool)) | coming
+                is_on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]
+                window = np.ones(round(_YIELD_S / DT_S) + 1)
+                is_coming = np.convolve(is_on_lane[::-1], window, mode="full")[: len(is_on_lane)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(is_on_lane), bool)) | is_coming
     return result

@@ -15,7 +15,7 @@ from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, ra
 from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Run, Traffic
 
-#: Hardest braking of an accepted expert, m/s2: nuPlan's comfort limit, and the IDM's limit in events.
+#: Hardest braking of an accepted expert, m/s2: just within nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
 #: Causes that no plan can fix, and a cause that a plan rarely fixes unless an event is staged.
 _UNFIXABLE, _HARDLY_MOVES = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
@@ -61,11 +61,11 @@ def expert_lanes(
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Adjacent lanes of a lane that is long enough for a change."""
+    """Adjacent lanes of a lane that is long enough for a planned change and shorter than 100 m."""
     current = network.lanes[lane]
     if current.connector or not 70.0 < current.length_m < 100.0:
         return []
-    return [lane for lane in (current.left, current.right) if lane >= 0]
+    return [neighbour for neighbour in (current.left, current.right) if neighbour >= 0]
 
 
 def expert_path(
@@ -90,7 +90,7 @@ def drive_ego(
         unplanned: The motion without a plan, if known.
 
     Yields:
-        Runs of the traffic, whose motion to send.
+        Runs of the traffic; the caller sends back their motion.
 
     Returns:
         The motion, and the cause of its rejection (empty: accepted).
@@ -128,10 +128,13 @@ def drive_ego(
 def _first_steps(
     roles: Roles, motion: Motion, violation: Violation, first_step: int, aware_step: int
 ) -> tuple[int, int, int]:
-    """Return the first steps of three plans, each earlier; only the last may precede ego's last stop at a sign."""
+    """Return the first steps of three plans, none later than the one before.
+
+    The first two do not precede ego's last stop at a sign, unless ego collides before it stops.
+    """
     late = max(first_step, aware_step)
-    stood = last_stop(roles, motion, first_step)
+    stop_step = last_stop(roles, motion, first_step)
     if violation.cause == "ego_collides":
         late = late if late < violation.step else first_step
-        stood = stood if stood < violation.step else first_step
-    return max(late, stood), max((first_step + late) // 2, stood), first_step
+        stop_step = stop_step if stop_step < violation.step else first_step
+    return max(late, stop_step), max((first_step + late) // 2, stop_step), first_step

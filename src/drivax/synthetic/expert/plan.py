@@ -47,8 +47,8 @@ _EXTRA_STEPS = 20
 _PASSING_GAPS_M, _SHIFT_MPS2 = (0.8, 0.4), (1.6, 3.8)
 #: Distance over which the remaining offset between ego and its path fades, m.
 _FADE_M = 10.0
-#: Largest shift, m.
-_MAX_SHIFT_M = 4.5
+#: Largest shift, m, and largest second derivative of the quintic step from 0 to 1, 10 / sqrt(3).
+_MAX_SHIFT_M, _STEP_CURVATURE = 4.5, 5.77
 #: Excess over a bound that counts as rounding, m, m/s or m/s2.
 _TOLERANCE = 0.03
 
@@ -189,7 +189,7 @@ def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
     roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
     coming = arrivals(roles.network, motion.paths or roles.paths, distance, valid, half)
-    coming = {lane: _repeat_last_step(steps) for lane, steps in coming.items()}
+    coming = {lane: _repeat_last_step(is_coming) for lane, is_coming in coming.items()}
     clock = np.append(times_s, times_s[-1] + DT_S * np.arange(1, _EXTRA_STEPS + 1))
     ego, passed = (state.from_m, float(half[0])), state.from_m + state.passed_m
     return stop_lines(roles.network, state.path, ego, clock, passed, coming)
@@ -218,15 +218,15 @@ def _best_candidate(state: _State) -> tuple[CandidatePath, SpeedProfile]:
 def _conflicts(state: _State, candidate: CandidatePath) -> Conflicts:
     """Return conflicts along a candidate, without those of vehicles that follow ego and will react."""
     conflicts = find_conflicts(candidate, state.size_m, state.others, state.valid, state.vulnerable)
-    follows = np.zeros(len(state.others), bool)
+    is_follower = np.zeros(len(state.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
     users, first = np.unique(conflicts.user[order], return_index=True)
     step, point = conflicts.step[order][first], conflicts.point[order][first]
     box = state.others[users, step]
     along = box[:, 2] * np.cos(candidate.heading[point]) + box[:, 3] * np.sin(candidate.heading[point])
-    behind = candidate.base_m[point] < state.passed_m[step]
-    follows[users] = behind & (along > 0.7) & ~state.unreactive[users]
-    return conflicts.select(~follows[conflicts.user])
+    is_behind = candidate.base_m[point] < state.passed_m[step]
+    is_follower[users] = is_behind & (along > 0.7) & ~state.unreactive[users]
+    return conflicts.select(~is_follower[conflicts.user])
 
 
 def _option(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Option:
@@ -260,7 +260,7 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _smooth(state: _State, option: _Option) -> SpeedProfile:
-    """Smooth an option's speeds within the tightest feasible bounds."""
+    """Smooth an option's speeds within the most comfortable feasible bounds, else within the widest ones."""
     position, speed = option.speeds.resample(state.others.shape[1])
     speed[0] = state.speed
     hard = option.occupancy.hard[1:]
@@ -308,17 +308,17 @@ def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflic
 
 def _first_hit(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> _Hit | None:
     """Return the first collision at the preferred speeds, if there is one."""
-    position, speed, places = 0.0, state.speed, []
+    position, speed, positions = 0.0, state.speed, []
     for _ in range(state.others.shape[1]):
-        places.append(position)
+        positions.append(position)
         index = min(int(position / SPACING_M), len(candidate.xy) - 1)
         speed = min(speed + 1.5 * DT_S, max(float(candidate.preferred_mps[index]), speed - 2.0 * DT_S))
         position += speed * DT_S
-    separation = np.abs(conflicts.point * SPACING_M - np.array(places)[conflicts.step])
-    touch = conflicts.hard & (separation < 0.3 + 0.05 * state.speed)
-    if not touch.any():
+    separation = np.abs(conflicts.point * SPACING_M - np.array(positions)[conflicts.step])
+    is_contact = conflicts.hard & (separation < 0.3 + 0.05 * state.speed)
+    if not is_contact.any():
         return None
-    first = int(np.flatnonzero(touch)[np.argmin(conflicts.step[touch])])
+    first = int(np.flatnonzero(is_contact)[np.argmin(conflicts.step[is_contact])])
     return _Hit(int(conflicts.user[first]), int(conflicts.step[first]), int(conflicts.point[first]))
 
 
@@ -326,7 +326,10 @@ def _shift(
     state: _State, candidate: CandidatePath, conflicts: Conflicts, hit: _Hit, side: float,
     margins: tuple[float, float],
 ) -> Shift | None:  # fmt: skip
-    """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right)."""
+    """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right).
+
+    Return None if the shift would be too small or too large.
+    """
     room_m, step_mps2 = margins
     begin, end, lateral = _extent(state, candidate, hit, side)
     half_l, half_w = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
@@ -348,8 +351,8 @@ def _shift(
     if not 0.15 < lateral < _MAX_SHIFT_M:
         return None
     speed = max(state.speed, float(candidate.preferred_mps[hit.point]) * 0.7)
-    length = max(speed * float(np.sqrt(5.77 * lateral / step_mps2)), 3.0 * lateral, 8.0)
-    gentle = max(length, speed * float(np.sqrt(5.77 * lateral / _SHIFT_MPS2[0])))
+    length = max(speed * float(np.sqrt(_STEP_CURVATURE * lateral / step_mps2)), 3.0 * lateral, 8.0)
+    gentle = max(length, speed * float(np.sqrt(_STEP_CURVATURE * lateral / _SHIFT_MPS2[0])))
     out_begin = max(0.0, begin - half_l - length)
     out_end = out_begin + length
     back_begin = max(end + half_l, out_end)
@@ -367,7 +370,7 @@ def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> 
     later = min(step + 10, len(state.others[user]) - 1)
     moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
     position = point * SPACING_M
-    ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), max(0.7 * abs(moved), 0.0)
+    ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), 0.7 * abs(moved)
     return _Extent(
         begin=position + float(along.min()) - behind,
         end=position + float(along.max()) + ahead,

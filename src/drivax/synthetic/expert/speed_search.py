@@ -16,7 +16,7 @@ from drivax.scenario.schema import DT_S
 #: Steps of the recording in one step of the search.
 COARSE = 5
 _STEP_S = COARSE * DT_S
-#: Largest spacing of speeds, m/s: accelerations are at most 1.5 m/s2 apart.
+#: Approximate spacing of speeds, m/s, at most 30 % more: accelerations are about 1.5 m/s2 apart.
 _SPEED_STEP_MPS = 0.75
 #: Lowest and highest acceleration, and the one below which braking costs more, m/s2.
 _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
@@ -24,7 +24,7 @@ _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
 _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
 #: Costs of hard braking, of a short time gap, and of a small distance at 5 m/s.
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
-#: Preferred time gap to users ahead, added to 1 m, s.
+#: Preferred time gap to users ahead, added to 1.5 m, s.
 _HEADWAY_S = 1.1
 #: Cost of contact; even 0.02 of it exceeds any sum of other costs.
 TOUCH = 1e5
@@ -80,9 +80,9 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     v, s = np.arange(speeds), np.arange(places)
     before = v - change[:, None]
     source = s - (before + v)[..., None]
-    possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
+    is_possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
     # Impossible transitions come from an extra state with infinite cost.
-    source = np.where(possible, before[..., None] * places + source, speeds * places)
+    source = np.where(is_possible, before[..., None] * places + source, speeds * places)
     a = change * unit
     effort = _ACCELERATION * a**2 + _HARD_BRAKING * np.maximum(_COMFORT_MPS2 - a, 0.0) ** 2
     effort = (effort * _STEP_S).astype(np.float32)

@@ -1,6 +1,6 @@
 """Checks of a generated motion: violations that reject it, and nuPlan's comfort limits.
 
-The quantities of comfort are those of :mod:`drivax.metrics.comfort`, over a whole recording at once, without JAX.
+The limits of comfort are those of :mod:`drivax.metrics.comfort`; the filters are the world's own (decision 0011).
 """
 
 from __future__ import annotations
@@ -76,8 +76,9 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
 def find_violation(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, staging: Staging, hardest_mps2: float
 ) -> Violation:
-    """Find the first violation of a motion from a given step on; a staged event excuses driving against traffic.
+    """Find the first violation of a motion from a given step on.
 
+    Ego may drive against traffic in a staged event, or where cars are parked, which it may have to pass.
     ``times_s`` are on the clock of the lights.
     """
     window = slice(first_step, None)
@@ -160,8 +161,8 @@ def inside(
 
 def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
     """Whether a corner of the box leaves the road at any step."""
-    moved = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
-    points = corners(box[moved]).reshape(-1, 2)
+    is_new = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
+    points = corners(box[is_new]).reshape(-1, 2)
     return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
 
 
@@ -228,8 +229,8 @@ def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
         lane = roles.network.lanes[span.lane]
         if lane.connector and lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             for step in np.flatnonzero(passes(lane, front, motion.heading[0])):
-                standing = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)
-                result = max([result, *(first_step + standing[-1:]).tolist()])
+                stops = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)
+                result = max(result, first_step + int(stops[-1])) if len(stops) else result
     return result
 
 
@@ -249,9 +250,9 @@ def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Po
 def against_traffic(
     network: RoadNetwork, xy: Float64[np.ndarray, "place 2"], heading: Float64[np.ndarray, " place"]
 ) -> Bool[np.ndarray, " place"]:
-    """Mask of poses whose nearest lane leads the other way (135 degrees or more apart).
+    """Mask of poses whose nearest lane leads the other way (more than 135 degrees apart).
 
-    Where lanes cross, a lane that is hardly further away and not against the heading decides.
+    Where lanes cross, a lane that is at most 0.5 m further away and not against the heading decides.
     """
     points = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
@@ -300,13 +301,13 @@ def quantities(heading: _Series, speed: _Series) -> dict[str, Float64[np.ndarray
     relative_heading = wrap(np.diff(heading))
     along, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * relative_heading / DT_S
     course = np.cumsum(relative_heading)
-    jerk = {"window": 15, "order": 2, "derivative": 1}
+    slope = {"window": 15, "order": 2, "derivative": 1}
     return {
         "longitudinal_mps2": _savgol_filter(along, 8, 2),
         "lateral_mps2": _savgol_filter(lateral, 8, 2),
-        "jerk_mps3": _savgol_filter(along, **jerk),
-        "jerk_magnitude_mps3": _savgol_filter(np.hypot(along, lateral), **jerk),
-        "yaw_rate_rps": _savgol_filter(course, **jerk),
+        "jerk_mps3": _savgol_filter(along, **slope),
+        "jerk_magnitude_mps3": _savgol_filter(np.hypot(along, lateral), **slope),
+        "yaw_rate_rps": _savgol_filter(course, **slope),
         "yaw_acceleration_rps2": _savgol_filter(course, 15, 3, 2),
     }
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float64
 
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 
 #: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
@@ -60,7 +61,7 @@ class Curve:
     @cached_property
     def normal(self) -> Float64[np.ndarray, "point 2"]:
         """Unit vectors to the left."""
-        return normals(self.heading)
+        return left_normals(self.heading)
 
     @cached_property
     def bend(self) -> Float64[np.ndarray, " point"]:
@@ -89,7 +90,7 @@ class Curve:
 
     def parallel(self, left_m: float) -> Curve:
         """Parallel curve at a distance to the left (negative: right)."""
-        return Curve(self.xy + left_m * normals(self.heading), self.heading)
+        return Curve(self.xy + left_m * self.normal, self.heading)
 
     def offset_by(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
         """Curve at a distance to the left that varies along it, with its own tangent headings.
@@ -98,7 +99,7 @@ class Curve:
         """
         stretch = 1.0 - left_m * np.gradient(self.heading, self.arc_m)
         slope = np.gradient(left_m, self.arc_m)
-        xy = self.xy + left_m[:, None] * normals(self.heading)
+        xy = self.xy + left_m[:, None] * self.normal
         return Curve(xy, self.heading + np.arctan2(slope, stretch))
 
     def reversed(self) -> Curve:
@@ -108,14 +109,6 @@ class Curve:
     def piece(self, first: int, last: int) -> Curve:
         """Samples ``first`` to ``last``, both included."""
         return Curve(self.xy[first : last + 1], self.heading[first : last + 1])
-
-
-def normals(heading: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n 2"]:
-    """Unit vectors to the left of headings."""
-    result = np.empty((*np.shape(heading), 2))
-    np.negative(np.sin(heading), out=result[..., 0])
-    np.cos(heading, out=result[..., 1])
-    return result
 
 
 def interpolate(
@@ -226,7 +219,7 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
     """Connect poses by a smooth curve: a fillet of the two tangents, or a quintic for small changes of heading.
 
     Raises:
-        ValueError: When the tangents do not meet ahead of the start and behind the end.
+        ValueError: The tangents do not meet at least 1 m ahead of the start and behind the end.
     """
     angle = float(wrap(end.heading - start.heading))
     if abs(angle) < _FILLET_ANGLE:
@@ -254,7 +247,7 @@ def draw_winding_curve(
     knots, values = [0.0], [0.0]
     while knots[-1] < length_m:
         knots.append(knots[-1] + rng.uniform(35.0, 90.0))
-        # Two of three knots reverse the curvature: S-curves are common.
+        # Five of six knots reverse the curvature: S-curves are common.
         sign = -np.sign(values[-1]) if rng.random() < 2 / 3 and values[-1] else rng.choice([-1.0, 1.0])
         values.append(float(sign) * max_curvature * float(rng.uniform(0.15, 1.0)))
     count = math.ceil(length_m / STEP_M) + 1

@@ -56,8 +56,7 @@ class Lane:
         left, right: Neighbours of the same direction.
         connector: Whether the lane leads across a junction; connectors may cross, and have rules at the entry.
         control: Rule at the entry of a connector; the stop line is where it begins.
-        yields_to: Connectors with right of way: the priority road at a yield or stop sign, oncoming traffic of a
-            left turn, traffic in a roundabout; empty at all-way stops.
+        yields_to: Conflicting connectors with right of way; empty at all-way stops.
         ends: Whether the lane ends without a successor while the road continues (lane drops, acceleration lanes).
         exit_only: Whether the lane leads off the road (deceleration lanes).
         kind: Type of the lane: for cars, or for bicycles only.
@@ -133,7 +132,7 @@ class RoadNetwork:
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
         sidewalks: Sidewalks outside the edges.
         busy: Lanes with denser traffic.
-        derived: What :func:`per_roads` caches.
+        derived: Results that :func:`per_roads` caches.
     """
 
     family: str
@@ -150,7 +149,7 @@ class RoadNetwork:
     derived: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def with_signals(self, signals: SignalPlan | None) -> RoadNetwork:
-        """Return the same roads with another clock of their lights."""
+        """Return the same roads with other times of their lights; groups of lights must stay, cached results do."""
         result = replace(self, signals=signals)
         result.__dict__["derived"] = self.derived
         return result
@@ -174,7 +173,7 @@ class RoadNetwork:
     @property
     @per_roads
     def shared_m(self) -> dict[tuple[int, int], float]:
-        """Distance along one of two successors of a lane over which they share space, m."""
+        """Distance along the first of two successors of a lane over which it shares space with the second, m."""
         pairs = (pair for lane in self.lanes for pair in permutations(lane.successors, 2))
         return {(a, b): _shared_length(self.lanes[a].curve, self.lanes[b].curve) for a, b in pairs}
 
@@ -186,11 +185,10 @@ def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
     high = np.array([lanes[i].curve.xy.max(axis=0) for i in connectors]).reshape(-1, 2)
     # Bounding boxes exclude most pairs of a network with several junctions.
-    separation = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
+    is_apart = (low[:, None] - high).max(axis=-1) > CLEARANCE_M
+    is_apart = is_apart | is_apart.T
     for (i, a), (k, b) in combinations(enumerate(connectors), 2):
-        if not (
-            separation[i, k] or separation[k, i] or set(lanes[a].predecessors) & set(lanes[b].predecessors)
-        ):
+        if not is_apart[i, k] and set(lanes[a].predecessors).isdisjoint(lanes[b].predecessors):
             gaps = _distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
             result[a, b] = result[b, a] = gaps.min() < CLEARANCE_M
     return result
@@ -262,8 +260,8 @@ def points(*poses: Pose) -> Float64[np.ndarray, "pose 2"]:
 def ring(*curves: Curve) -> Float64[np.ndarray, "point 2"]:
     """Closed ring of successive curves, sampled at about 1 m without repeated points."""
     xy = np.concatenate([np.concatenate([curve.xy[:-1:2], curve.xy[-1:]]) for curve in curves])
-    far = np.hypot(*(xy - np.roll(xy, 1, axis=0)).T) > 1e-6
-    return xy[far]
+    is_new = np.hypot(*(xy - np.roll(xy, 1, axis=0)).T) > 1e-6
+    return xy[is_new]
 
 
 def feature_id(lane: int) -> int:

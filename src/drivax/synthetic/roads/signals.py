@@ -92,7 +92,7 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """Return the colour of each of ``lanes`` lanes (NONE without a light), and the time until yellow ends, s."""
+        """Return the colours of ``lanes`` lanes (NONE without a light), and the time until yellow ends, s (else 0)."""
         colour = np.zeros((len(times_s), lanes), np.int8)
         remaining_s = np.zeros((len(times_s), lanes))
         for group in self.groups:
@@ -101,7 +101,7 @@ class SignalPlan:
         for program in self._programs:
             cycle = self._duration_s(program)
             for phase in program:
-                # Slightly late: rounding must not shift changes that fall on a step.
+                # The offset keeps rounding from delaying a change that falls on a step.
                 since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
                 green = since < self.green_s[phase]
                 to_red = self.green_s[phase] + self.yellow_s - since

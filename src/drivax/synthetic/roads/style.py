@@ -17,8 +17,8 @@ class RoadStyle:
     Attributes:
         width_m, shoulder_m: Width of lanes, and drivable width beyond the outer ones, low and high.
         limits_mps, fast_limits_mps: Speed limits of streets and of highways.
-        curvature: Factor on the curvature of bends.
-        walk_share, parking_share: Shares of streets with sidewalks, and of those of some families with bays.
+        curvature: Factor on the curvature of streets without junctions.
+        sidewalk_share, parking_share: Shares of roads with sidewalks and with bays, in families where they vary.
     """
 
     width_m: tuple[float, float] = (3.35, 3.75)

@@ -1,1 +1,1 @@
-"""Everything that moves on the roads, and the roles that it is given."""
+"""Road users of the procedural world: their roles, and the simulation of their motion."""

@@ -278,17 +278,17 @@ class LaneChanges:
         o, vehicles = options, options.vehicles
         speed = now.speed[vehicles]
         leader, follower = self._neighbours(now, vehicles, o.new, occupancy)
-        own = self._follow(vehicles, speed, o.limit_mps, leader.gap_m, leader.speed)
+        own_after = self._follow(vehicles, speed, o.limit_mps, leader.gap_m, leader.speed)
         # After the change the new follower follows the vehicle, and the old follower the vehicle's old leader.
         new_after, new_before = self._follower_accelerations(now, vehicles, follower, leader)
         old_leader, old_follower = self._neighbours(now, vehicles, o.own, occupancy)
         old_before, old_after = self._follower_accelerations(now, vehicles, old_follower, old_leader)
         others = new_after - new_before + old_after - old_before
-        gain = own - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
+        gain = own_after - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
         urgency = np.where(o.mandatory, 1.0 - np.clip(o.remaining_m / _MANDATORY_M, 0.0, 1.0), 0.0)
         safe = _SAFE_BRAKING_MPS2 + urgency * (_URGENT_BRAKING_MPS2 - _SAFE_BRAKING_MPS2)
         follower_speed = np.where(follower.row >= 0, now.speed[np.maximum(follower.row, 0)], 0.0)
-        accepted = o.possible & (new_after > -safe) & (own > -safe)
+        accepted = o.possible & (new_after > -safe) & (own_after > -safe)
         accepted &= leader.gap_m > _GAP_M + _GAP_S * np.maximum(speed - leader.speed, 0.0) * 4
         accepted &= follower.gap_m > _GAP_M + _GAP_S * follower_speed * (1 - 0.6 * urgency)
         accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
@@ -321,12 +321,12 @@ class LaneChanges:
         pair, world = np.arange(len(vehicles)), self._worlds.world[vehicles]
         rows = self._worlds.rows[world]
         separation = occupancy.position_m.take(rows, axis=0) - position[:, None, None]
-        seen = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
-        seen[rows == vehicles[:, None]] = False
+        is_candidate = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
+        is_candidate[rows == vehicles[:, None]] = False
         half_of_column = self._half_of_column[world]
         neighbours = []
         for distance in (separation, -separation):
-            slots = np.where(seen & (distance >= 0), distance, np.inf)
+            slots = np.where(is_candidate & (distance >= 0), distance, np.inf)
             # NumPy would reduce so short a last axis several times more slowly.
             gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - half_of_column
             column = gap.argmin(axis=1)

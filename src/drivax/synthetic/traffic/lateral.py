@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve
 from drivax.synthetic.roads.network import RoadNetwork
@@ -46,16 +47,18 @@ def displace_path(
 ) -> tuple[Path, _Samples]:
     """Displace a path to the left by a smooth offset at each sample.
 
-    ``occupied`` are further lanes that the vehicle occupies, in positions of the old path. Returns the new path, and
-    the position on it of each sample of the old one, m.
+    ``occupied`` are further lanes that the vehicle occupies, in positions of the old path.
+
+    Returns:
+        The new path, and the position on it of each sample of the old one, m.
     """
     curve, step = path.curve, path.step_m
-    normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
     slope = np.gradient(aside_m, step)
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
-    moved_curve = Curve(curve.xy + aside_m[:, None] * normal, curve.heading + np.arctan2(slope, stretch))
-    old = step * np.arange(len(moved_curve.xy))
-    new = moved_curve.arc_m
+    xy = curve.xy + aside_m[:, None] * left_normals(curve.heading)
+    new_curve = Curve(xy, curve.heading + np.arctan2(slope, stretch))
+    old = step * np.arange(len(xy))
+    new = new_curve.arc_m
     count = max(2, round(float(new[-1]) / STEP_M) + 1)
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
@@ -64,10 +67,10 @@ def displace_path(
     lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _enter_span(span, source, lane, lane_m)
-    moved, step = interpolate_curve(moved_curve, new, position), float(new[-1]) / (count - 1)
+    new_curve, step = interpolate_curve(new_curve, new, position), float(new[-1]) / (count - 1)
     spans = _moved_spans(path, occupied, old, new)
-    curvature = mean_curvature(moved, step)
-    return Path(moved, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
+    curvature = mean_curvature(new_curve, step)
+    return Path(new_curve, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
 
 
 def _moved_spans(
@@ -98,12 +101,12 @@ def _enter_span(
     span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied."""
-    occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
+    is_occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
     for slot in range(SLOTS):
-        free = occupied & (lane[:, slot] < 0)
-        lane[free, slot] = span.lane
-        lane_m[free, slot] = (at[free] - span.begin_m) / span.scale
-        occupied &= ~free
+        is_free = is_occupied & (lane[:, slot] < 0)
+        lane[is_free, slot] = span.lane
+        lane_m[is_free, slot] = (at[is_free] - span.begin_m) / span.scale
+        is_occupied &= ~is_free
 
 
 def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: float) -> _Samples:
@@ -165,10 +168,10 @@ def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) 
     old = target.step_m * np.arange(len(target.curve.xy))
     offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
     own = {span.lane for span in target.spans}
-    left = along + _EXIT_SHARE * length_m
+    exit_m = along + _EXIT_SHARE * length_m
     occupied = tuple(
         LaneSpan(
-            s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(left, along + s.end_m - at_m + 2.0)
+            s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(exit_m, along + s.end_m - at_m + 2.0)
         )
         for s in present.spans
         if s.lane not in own and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
@@ -192,9 +195,9 @@ def detour_path(
     """Build a detour to the left by ``aside_m``; ``adjacent`` are the lanes that it may enter."""
     begin, out_end, back_begin, end = positions
     old = path.step_m * np.arange(len(path.curve.xy))
-    out_end = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
+    out = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
     back = quintic_step(old, (back_begin, 1.0, 0.0), end - back_begin)
-    return displace_path(path, aside_m * out_end * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
+    return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
 
 
 @dataclass(frozen=True)
@@ -209,10 +212,10 @@ class DetourRequest:
 
 
 def detour_request(
-    tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
+    tables: PathTables, row: int, position: float, speed: float, size_m: tuple[float, float]
 ) -> DetourRequest:
     """Build the request of a vehicle at a path position and speed."""
-    position, adjacent, world = float(now[0]), [], tables.worlds.world[row]
+    adjacent, world = [], tables.worlds.world[row]
     network = tables.worlds.networks[world]
     lane, along = tables.lanes_at(np.array([position]), slice(row, row + 1))
     if lane[0, 0] >= 0:
@@ -223,7 +226,7 @@ def detour_request(
                 adjacent.append(
                     LaneSpan(other, position - float(along[0, 0]), scale, position, position + _ADJACENT_M)
                 )
-    return DetourRequest(tables.paths[row], position, float(now[1]), size_m, tuple(adjacent))
+    return DetourRequest(tables.paths[row], position, speed, size_m, tuple(adjacent))
 
 
 class Detours:
@@ -238,17 +241,18 @@ class Detours:
         half_width, half_length = request.size_m[1] / 2, request.size_m[0] / 2
         obstacles, _ = _extents(request, standing, request.at_m, LOOK_M + 40.0)
         front, side = request.at_m + half_length, half_width + DETOUR_MARGIN_M
-        blocks = (obstacles.right_m < side) & (obstacles.left_m > -side) & (obstacles.near_m > front - 0.5)
-        if not blocks.any():
+        is_blocking = (obstacles.right_m < side) & (obstacles.left_m > -side)
+        is_blocking &= obstacles.near_m > front - 0.5
+        if not is_blocking.any():
             return None
-        first = float(obstacles.near_m[blocks].min())
+        first = float(obstacles.near_m[is_blocking].min())
         if not 2.0 < first - front < LOOK_M:
             return None
         last = first
         for k in np.argsort(obstacles.near_m, kind="stable"):
-            if blocks[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
+            if is_blocking[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
                 last = max(last, float(obstacles.far_m[k]))
-        group = blocks & (obstacles.near_m <= last)
+        group = is_blocking & (obstacles.near_m <= last)
         left = float(obstacles.left_m[group].max()) + half_width + _PASSING_GAP_M
         right = float(obstacles.right_m[group].min()) - half_width - _PASSING_GAP_M
         for lateral in sorted([left, right], key=abs):
@@ -269,12 +273,12 @@ class Detours:
         begin, out_end, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
-        blocks = (obstacles.near_m < back) & (obstacles.far_m > out_end)
-        blocks &= (obstacles.right_m < high) & (obstacles.left_m > low)
+        is_blocking = (obstacles.near_m < back) & (obstacles.far_m > out_end)
+        is_blocking &= (obstacles.right_m < high) & (obstacles.left_m > low)
         edges, _ = _extents(request, self._edge, (out_end + back) / 2, (end - begin) / 2 + 15.0)
-        sweep = (edges.near_m > out_end) & (edges.near_m < back)
-        sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
-        if blocks.any() or sweep.any():
+        is_edge_near = (edges.near_m > out_end) & (edges.near_m < back)
+        is_edge_near &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
+        if is_blocking.any() or is_edge_near.any():
             return False
         path, position = request.path, request.at_m
         duration_s = (end - position) / max(request.speed, _PASS_MPS) + 1.0
@@ -282,12 +286,13 @@ class Detours:
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
         relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
         speed = near.speed * np.cos(relative_heading)
-        meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
-        ahead = (others.far_m > position) & (others.near_m + np.minimum(speed, 0.0) * duration_s < end + 5.0)
-        behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
+        is_in_corridor = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
+        nearest_m = others.near_m + np.minimum(speed, 0.0) * duration_s
+        is_ahead = (others.far_m > position) & (nearest_m < end + 5.0)
+        is_behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
-        ahead &= ~((speed > 1.0) & (others.near_m > back))
-        return not bool(np.any(meets & (ahead | behind)))
+        is_ahead &= ~((speed > 1.0) & (others.near_m > back))
+        return not bool(np.any(is_in_corridor & (is_ahead | is_behind)))
 
 
 def _detour_positions(

@@ -53,13 +53,13 @@ class Leaders:
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         position += tables.present_begin(at_m).take(index)
         vehicle_ahead = vehicle[k]
-        seen = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
+        is_ahead = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
         if self._any_cyclist:
             # Cyclists are overtaken within lanes that are wide enough.
             limit_m = np.where(self._cyclist[vehicle_ahead], self._passing_half_m[lanes], -np.inf)
-            seen &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
+            is_ahead &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
         position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
-        gap = np.where(seen, position, np.inf)
+        gap = np.where(is_ahead, position, np.inf)
         gap -= own
         gap -= self._half_m[:, None]
         nearest = gap.argmin(axis=1)

@@ -162,9 +162,9 @@ class StaticObstacles:
     def is_blocked(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
         """Whether an obstacle lies within a distance ahead of a vehicle's front, in a band of this half width."""
         path_extents = self._extents[row]
-        blocks = (path_extents.right_m < half_m) & (path_extents.left_m > -half_m)
-        blocks &= (path_extents.near_m > front_m - 0.5) & (path_extents.near_m < front_m + within_m)
-        return bool(blocks.any())
+        is_blocking = (path_extents.right_m < half_m) & (path_extents.left_m > -half_m)
+        is_blocking &= (path_extents.near_m > front_m - 0.5) & (path_extents.near_m < front_m + within_m)
+        return bool(is_blocking.any())
 
     def gap(self, front_m: PerVehicle) -> PerVehicle:
         """Distance from the front bumper to the next obstacle in the corridor (infinite: none)."""
@@ -198,19 +198,17 @@ def nearest_obstacles(
     left_soon = left + drift * _DRIFT_S
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLE_MARGIN_M, _SIDE_MARGIN_M)
-    inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
-    inside &= position > at_m[viewer] + 0.3 * size[:, 0]
-    k = inside.nonzero()[0]
+    is_inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
+    is_inside &= position > at_m[viewer] + 0.3 * size[:, 0]
+    k = is_inside.nonzero()[0]
     if not len(k):
         return gap, speed
     viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
     room = position[k] - length[k] - at_m[viewer] - size[k, 0] / 2
-    remaining = ~_leaves_corridor(
-        left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0)
-    )
+    stays = ~_leaves_corridor(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
     # The nearest of several obstacles of a vehicle is entered last.
     order = np.argsort(-room, kind="stable")
-    order = order[remaining[order]]
+    order = order[stays[order]]
     gap[viewer[order]] = room[order]
     speed[viewer[order]] = np.maximum(users.speed[user] * np.cos(relative_heading[k]), 0.0)[order]
     return gap, speed
@@ -239,13 +237,13 @@ def _nearby_pairs(
     dy -= dx
     # Somewhat more than the comfortable stopping distance; less for vehicles, which follow each other and the rules.
     reach = np.where(active, np.minimum(_RANGE_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
-    near = ahead > 0.5
-    near[:, :count] &= ahead[:, :count] < np.minimum(reach, _VEHICLE_RANGE_M)
-    near[:, count:] &= ahead[:, count:] < reach
+    is_near = ahead > 0.5
+    is_near[:, :count] &= ahead[:, :count] < np.minimum(reach, _VEHICLE_RANGE_M)
+    is_near[:, count:] &= ahead[:, count:] < reach
     ahead *= 0.5
     ahead += 3.0
-    near &= np.abs(dy, out=dy) < np.minimum(ahead, _MAX_LATERAL_M, out=ahead)
-    viewer, column = np.divmod(near.ravel().nonzero()[0], near.shape[1])
+    is_near &= np.abs(dy, out=dy) < np.minimum(ahead, _MAX_LATERAL_M, out=ahead)
+    viewer, column = np.divmod(is_near.ravel().nonzero()[0], is_near.shape[1])
     return viewer, columns[worlds.world[viewer], column]
 
 

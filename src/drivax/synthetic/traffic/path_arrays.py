@@ -27,7 +27,8 @@ def speed_profile(
 ) -> Float64[np.ndarray, " p"]:
     """Highest speed at each sample that respects limits and bends, and brakes in time for those ahead.
 
-    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with ``vmax = min(factor x limit, sqrt(a_lat / |k|))``.
+    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with
+    ``vmax = min(factor x limit, sqrt(a_lat / |k|), top)``.
     """
     cap = np.minimum((factor * path.limit_mps) ** 2, lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-6))
     cap = np.minimum(cap, top_mps**2)
@@ -75,7 +76,7 @@ class Worlds:
 
     def __init__(self, networks: Sequence[RoadNetwork], vehicles: Sequence[int]) -> None:
         self.networks = tuple(networks)
-        lanes, crossings = ([len(n.lanes) for n in networks], [len(n.crossings) for n in networks])
+        lanes, crossings = [len(n.lanes) for n in networks], [len(n.crossings) for n in networks]
         self.first_row, self.first_lane, self.first_crossing = (
             np.concatenate(([0], np.cumsum(count))) for count in (vehicles, lanes, crossings)
         )
@@ -116,14 +117,14 @@ class PathTables:
         self.worlds, self.paths, self._drivers = worlds, list(paths), drivers
         count, lanes = len(paths), int(np.diff(worlds.first_lane).max())
         self.crossings = np.full(len(worlds), _CROSSING_COLUMNS)
-        self._first, self._used = np.zeros(count, int), 0
+        self._first, self._sample_count = np.zeros(count, int), 0
         samples = int(_CAPACITY * sum(len(path.curve.xy) for path in paths))
         self.table, self.lane_m = np.empty((samples, 4)), np.empty((samples, SLOTS))
         self.lane = np.empty((samples, SLOTS), np.int32)
         self.step_m, self.last, self.length_m = np.ones(count), np.ones(count, int), np.ones(count)
         self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
         self.from_m, self.until_m = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
-        self._present, self._limited = self.begin.copy(), np.zeros(count, bool)
+        self._present, self._is_limited = self.begin.copy(), np.zeros(count, bool)
         self.column = lanes * np.arange(count) - worlds.first_lane[worlds.world]
         self.connector, self.crossing = np.full((count, 0), -1), np.full((count, _CROSSING_COLUMNS), -1)
         self.connector_begin, self.connector_end = np.zeros((2, count, 0))
@@ -136,9 +137,9 @@ class PathTables:
         """Enter the path of one vehicle."""
         self.paths[row] = path
         n, world = len(path.curve.xy), self.worlds.world[row]
-        self._grow(self._used + n)
-        samples = slice(self._used, self._used + n)
-        self._first[row], self._used = self._used, self._used + n
+        self._grow(self._sample_count + n)
+        samples = slice(self._sample_count, self._sample_count + n)
+        self._first[row], self._sample_count = self._sample_count, self._sample_count + n
         self.table[samples, :2], self.table[samples, 2] = path.curve.xy, path.curve.heading
         self.table[samples, 3] = driver_profile(path, self._drivers, row)
         self.lane[samples], self.lane_m[samples] = path.lane, path.lane_m
@@ -166,7 +167,7 @@ class PathTables:
                     (span.begin_m + span.scale * along, number + self.worlds.first_crossing[world])
                 )
         self._present[row] = self.begin[row]
-        self._limited[row] = any(span.from_m > -np.inf or span.until_m < np.inf for span in path.spans)
+        self._is_limited[row] = any(span.from_m > -np.inf or span.until_m < np.inf for span in path.spans)
         self.crossings[world] = max(self.crossings[world], len(crossings))
         if len(connectors) >= self.connector.shape[1]:
             self._widen("connector", len(connectors) + _SPARE_COLUMNS, "_begin", "_end")
@@ -199,10 +200,10 @@ class PathTables:
 
     def present_begin(self, at_m: PerVehicle) -> Float64[np.ndarray, "v lane"]:
         """``begin`` of the spans that vehicles occupy at their positions, nan elsewhere."""
-        rows = self._limited.nonzero()[0]
+        rows = self._is_limited.nonzero()[0]
         own = at_m[rows, None]
-        occupied = (self.from_m[rows] <= own) & (own <= self.until_m[rows])
-        self._present[rows] = np.where(occupied, self.begin[rows], np.nan)
+        is_occupied = (self.from_m[rows] <= own) & (own <= self.until_m[rows])
+        self._present[rows] = np.where(is_occupied, self.begin[rows], np.nan)
         return self._present
 
     def interpolate(

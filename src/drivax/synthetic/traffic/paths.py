@@ -10,6 +10,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, join_curves, resample, smooth_step
 from drivax.synthetic.roads.network import RoadNetwork, per_roads
 
@@ -168,8 +169,7 @@ def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, t
     weight = smooth_step((arc - change.begin_m) / change.length_m)[:, None]
     xy = a.xy + weight * (b.xy - a.xy)
     rate = np.gradient(xy, axis=0)
-    relative_heading = np.arctan2(rate[:, 1], rate[:, 0]) - a.heading
-    heading = a.heading + ((relative_heading + math.pi) % (2 * math.pi) - math.pi)
+    heading = a.heading + wrap(np.arctan2(rate[:, 1], rate[:, 0]) - a.heading)
     # The ends are exactly those of the lanes: a one-sided difference would bend the joint.
     whole_turns = round((a.heading[-1] - b.heading[-1]) / (2 * math.pi))
     heading[0], heading[-1] = a.heading[0], b.heading[-1] + 2 * math.pi * whole_turns
@@ -188,10 +188,10 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
     occupied, limit = np.zeros(len(position), int), np.full(len(position), math.inf)
     begin = np.array([span.begin_m for span in spans])
     size = np.array([span.scale * network.lanes[span.lane].length_m for span in spans])
-    bounds = np.searchsorted(position, np.concatenate((begin - 1e-6, begin + size - 1e-6))).tolist()
+    bounds = np.searchsorted(position, np.stack((begin - 1e-6, begin + size - 1e-6), axis=-1))
     # Samples beyond the last lane's end by rounding still belong to it.
-    bounds[-1] = len(position)
-    for span, first, last in zip(spans, bounds, bounds[len(spans) :], strict=False):
+    bounds[-1, 1] = len(position)
+    for span, (first, last) in zip(spans, bounds.tolist(), strict=True):
         samples = slice(first, last)
         np.minimum(limit[samples], network.lanes[span.lane].limit_mps, out=limit[samples])
         current, slots = position[samples], occupied[samples]

@@ -90,7 +90,7 @@ def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """Mask of signalised connectors over a crossing, except turns into the crossed road, which yield."""
+    """Mask of signalised connectors over a crossing, except turns into its road without an arrow, which yield."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
@@ -150,16 +150,16 @@ class Pedestrians:
         self._size_m = np.array([pedestrian.size_m[:2] for pedestrian in pedestrians], float).reshape(-1, 2)
         self._speed = self._free_speed.copy()
         self._crossing = np.array([pedestrian.crossing for pedestrian in pedestrians], int)
-        self._crosses = self._crossing >= 0
+        self._has_crossing = self._crossing >= 0
         self._crossing += worlds.first_crossing[self.world]
-        self._any_crosses = bool(self._crosses.any())
+        self._any_crosses = bool(self._has_crossing.any())
         # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
         marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
         lights = np.concatenate([conflicts.red.any(axis=1) for conflicts in self._conflicts])
-        self._yielding = marked | lights
+        self._has_yielding_drivers = marked | lights
         self._has_priority = np.zeros(len(curves), bool)
-        self._has_priority[self._crosses] = (marked & ~lights)[self._crossing[self._crosses]]
-        self._released, self._is_blocked = np.zeros((2, len(curves)), bool)
+        self._has_priority[self._has_crossing] = (marked & ~lights)[self._crossing[self._has_crossing]]
+        self._is_released, self._is_blocked = np.zeros((2, len(curves)), bool)
 
     def step(
         self, t: int, vehicles: Boxes, active: VehicleMask
@@ -178,10 +178,10 @@ class Pedestrians:
             self._is_blocked = self._blocked_by_vehicles(pose, vehicles, active)
             self._release(t, vehicles, active)
         if self._any_crosses:
-            users = self._crosses & (self._position_m < self._across)
-            users &= self._position_m > self._kerb - _OCCUPY_M
-            users &= self._released | self._has_priority | (self._position_m > self._kerb)
-            occupied[self._crossing[users]] = True
+            is_on = self._has_crossing & (self._position_m < self._across)
+            is_on &= self._position_m > self._kerb - _OCCUPY_M
+            is_on &= self._is_released | self._has_priority | (self._position_m > self._kerb)
+            occupied[self._crossing[is_on]] = True
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
         return result, occupied
@@ -203,21 +203,21 @@ class Pedestrians:
     def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
         to_kerb = self._kerb - self._position_m
-        waiting = self._crosses & ~self._released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
-        waiting = waiting.nonzero()[0]
+        is_waiting = self._has_crossing & ~self._is_released & (to_kerb >= 0) & (to_kerb < _GAP_SEARCH_M)
+        waiting = is_waiting.nonzero()[0]
         if not len(waiting):
             return
         crossing_s = (self._across[waiting] - self._position_m[waiting]) / self._free_speed[waiting]
         # Starting from standstill takes v / (2 a) longer.
         crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
         # Traffic matters only to those whose conflicting lights stay red.
-        red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
-        waiting, crossing_s = waiting[red], crossing_s[red]
+        stays_red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
+        waiting, crossing_s = waiting[stays_red], crossing_s[stays_red]
         for world in np.unique(self.world[waiting]).tolist():
-            among = self.world[waiting] == world
+            is_local = self.world[waiting] == world
             rows = self._worlds.vehicles(world)
             rows = np.flatnonzero(active[rows]) + rows.start
-            self._release_in(world, waiting[among], crossing_s[among], vehicles.select(rows))
+            self._release_in(world, waiting[is_local], crossing_s[is_local], vehicles.select(rows))
 
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of a world if its active vehicles leave them a gap."""
@@ -225,20 +225,19 @@ class Pedestrians:
         local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
         any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
-        gap = np.where(
-            self._yielding[crossing], hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
-        ).nonzero()[0]
+        has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
+        safe = np.where(self._has_yielding_drivers[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
-        if len(gap):
-            blocked = overlap(conflicts.strip[local[place[gap]], None], boxes[None]).any(axis=1)
-            self._released[waiting[gap]] = ~blocked
+        if len(safe):
+            is_blocked = overlap(conflicts.strip[local[place[safe]], None], boxes[None]).any(axis=1)
+            self._is_released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:
         """Advance by one step; pedestrians stop before vehicles, and at the kerb unless released."""
         room = self._last * self._step_m - self._position_m
         if self._any_crosses:
-            waits = self._crosses & ~self._released & (self._position_m <= self._kerb)
-            kerb = np.where(waits, self._kerb - _WAIT_M - self._position_m, math.inf)
+            is_waiting = self._has_crossing & ~self._is_released & (self._position_m <= self._kerb)
+            kerb = np.where(is_waiting, self._kerb - _WAIT_M - self._position_m, math.inf)
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # The stopping distance is v^2 / (2 a), counted from the end of the step.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
@@ -295,15 +294,15 @@ def _arrivals(
 
 
 def _is_in_box(x: _Values, y: _Values, boxes: Float64[np.ndarray, "6 w v"]) -> _Mask:
-    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length and the width."""
+    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length, half the width."""
     box_x, box_y, cos, sin, half_length, half_width = boxes
     dx, dy = x[:, None] - box_x, y[:, None] - box_y
     along = np.abs(dx * cos + dy * sin)
     dy *= cos
     dx *= sin
     dy -= dx
-    inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
-    return np.logical_or.reduce(inside, axis=1)
+    is_inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
+    return np.logical_or.reduce(is_inside, axis=1)
 
 
 def place_pedestrians(
@@ -311,7 +310,7 @@ def place_pedestrians(
 ) -> tuple[Pedestrian, ...]:
     """Draw pedestrians along sidewalks, in both directions, and at crossings, ``per_100m / 2`` on average at each.
 
-    They reach the kerbs between 4 s before and 8 s after time 0.
+    Those at crossings reach the kerb between 4 s before and 8 s after time 0 if nothing stops them.
     """
     pedestrians = []
     for sidewalk in network.sidewalks:
@@ -341,7 +340,8 @@ def _draw_crossing_pedestrian(
     ahead = (far - near) / np.hypot(*(far - near))
     shift = lateral * np.array([-ahead[1], ahead[0]])
     near, far = near + shift, far + shift
-    before, after = (_along_sidewalk(network, near, -ahead, rng), _along_sidewalk(network, far, ahead, rng))
+    before = _along_sidewalk(network, near, -ahead, rng)
+    after = _along_sidewalk(network, far, ahead, rng)
     points = np.concatenate([before[::-1], [near, far], after])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     kerb_m, across_m = float(arc[len(before)]), float(arc[len(before) + 1])

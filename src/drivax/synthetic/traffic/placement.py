@@ -82,7 +82,7 @@ def parked_cars(
 
 
 def _draw_size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
-    """Draw the size of a car or, in one case of eight, a van that fits a bay."""
+    """Draw the size of a car or, in one of eight bays longer than 6.2 m, a van that fits the bay."""
     length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
     if rng.random() < 0.125 and room_m > 6.2:
         return min(length + 0.8, room_m - _MANOEUVRING_ROOM_M), 2.0, 2.3
@@ -245,7 +245,7 @@ def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) 
 
 
 def _point_on_lane(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
-    """Return the sample of a lane nearest to a distance along it."""
+    """Return the sample of a lane at about a distance along it."""
     curve = network.lanes[lane].curve
     return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
 
@@ -255,7 +255,7 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    With the first lane of each, fast roads have no cyclists, and bicycle lanes only cyclists.
+    If ``lanes`` has the first lane of each, fast roads get no cyclists, and bicycle lanes only cyclists.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     # Types in the order of the shares; the rest are cars.

@@ -53,7 +53,7 @@ class TrafficState:
     """State of all vehicles when drivers decide.
 
     Attributes:
-        colour, to_red: Colour of each lane's light, and time until it turns red, s.
+        colour, to_red: Colour of each lane's light, and time until a yellow one turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         committed: Number of connectors that each planned vehicle (by row) enters without yielding.
@@ -93,8 +93,8 @@ def conflict_zones(
             if np.any(box[a][0] > box[b][1] + CLEARANCE_M) or np.any(box[b][0] > box[a][1] + CLEARANCE_M):
                 continue
             dx, dy = (np.subtract.outer(xy_a[:, k], other[:, k]) for k in (0, 1))
-            near = dx * dx + dy * dy < CLEARANCE_M**2
-            for i, j, hit in ((a, b, near.any(axis=1)), (b, a, near.any(axis=0))):
+            is_near = dx * dx + dy * dy < CLEARANCE_M**2
+            for i, j, hit in ((a, b, is_near.any(axis=1)), (b, a, is_near.any(axis=0))):
                 if hit.any():
                     step = network.lanes[i].length_m / (hit.size - 1)
                     places = np.flatnonzero(hit)
@@ -172,34 +172,34 @@ class RightOfWay:
         self._length = drivers.size_m[:, 0]
         count = len(self._length)
         self._rows = np.arange(count)
-        self._granted = np.zeros(count, int)  # number of connectors on the path
+        self._grants = np.zeros(count, int)  # number of connectors granted on the path
         self._stopped_at_s = np.full(count, np.inf)  # time of the stop at the requested connector, s
-        self._requested = np.full(count, -1)
-        self._denied = np.zeros(count, bool)
+        self._connector = np.full(count, -1)  # of the last request
+        self._is_denied = np.zeros(count, bool)
 
     def reset_vehicle(self, row: int, tables: PathTables, front_m: float) -> None:
         """Reset a vehicle that has changed to another path: it keeps only the connectors that it has entered."""
-        self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
-        self._stopped_at_s[row], self._requested[row] = np.inf, -1
+        self._grants[row] = int(np.sum(tables.connector_begin[row] < front_m))
+        self._stopped_at_s[row], self._connector[row] = np.inf, -1
 
     def stop_line_m(self, state: TrafficState) -> PerVehicle:
         """Decide all requests and return the distance to the next line at which to stop (infinite: none)."""
         begin = state.tables.connector_begin
         connectors = begin.shape[1]
         entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
-        self._granted = np.maximum(self._granted, entered)
-        stop, halts = self._closed_lines(state)
-        self._granted = np.maximum(np.minimum(self._granted, halts), entered)
+        self._grants = np.maximum(self._grants, entered)
+        stop, closed_slot = self._closed_lines(state)
+        self._grants = np.maximum(np.minimum(self._grants, closed_slot), entered)
         for row, count in state.committed.items():
-            self._granted[row] = max(count, entered[row])
+            self._grants[row] = max(count, entered[row])
         near = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
-        index = np.minimum(self._granted, connectors - 1)
+        index = np.minimum(self._grants, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
-        requests = (distance >= 0) & (distance <= near) & state.active & (halts > index)
+        requests = (distance >= 0) & (distance <= near) & state.active & (closed_slot > index)
         for row in state.committed:
             requests[row], stop[row] = False, np.inf
-        self._denied &= requests
+        self._is_denied &= requests
         rows = requests.nonzero()[0]
         if len(rows):
             holders = self._holders(state)
@@ -221,7 +221,7 @@ class RightOfWay:
     def _holders(self, state: TrafficState) -> list[_Holders]:
         """List the vehicles of each world that hold a connector."""
         tables = state.tables
-        is_held = np.arange(tables.connector.shape[1]) < self._granted[:, None]
+        is_held = np.arange(tables.connector.shape[1]) < self._grants[:, None]
         is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
         row, slot = np.nonzero(is_held & (tables.connector >= 0))
         world = self._worlds.world[row]
@@ -243,13 +243,13 @@ class RightOfWay:
         speed = state.speed[:, None]
         to_stop = speed**2 / (2 * np.maximum(distance, 0.05))
         colour = state.colour.take(connector)
-        late = distance > speed * state.to_red.take(connector)
-        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (late & (to_stop <= 5.0))
-        halt = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
-        halt &= distance < np.inf
-        first = halt.argmax(axis=1)
+        is_late = distance > speed * state.to_red.take(connector)
+        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (is_late & (to_stop <= 5.0))
+        is_closed = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
+        is_closed &= distance < np.inf
+        first = is_closed.argmax(axis=1)
         flat = first + count * self._rows
-        has_line = halt.ravel().take(flat)
+        has_line = is_closed.ravel().take(flat)
         return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
     def _grant(
@@ -259,8 +259,8 @@ class RightOfWay:
         rules = self._rules[world]
         for request in requests:
             i = request.row
-            if self._requested[i] != request.connector:
-                self._requested[i], self._stopped_at_s[i] = request.connector, np.inf
+            if self._connector[i] != request.connector:
+                self._connector[i], self._stopped_at_s[i] = request.connector, np.inf
             has_stopped = request.speed < _STOPPED_MPS and request.distance_m < _STOPPED_M
             if has_stopped and self._stopped_at_s[i] == np.inf:
                 self._stopped_at_s[i] = state.step * DT_S
@@ -272,9 +272,9 @@ class RightOfWay:
             granted = granted or self._may_enter(state, rules, request, holders, waiting)
             if not granted and self._clears_in_time(state, rules, request, holders):
                 continue
-            self._denied[i] = not granted
+            self._is_denied[i] = not granted
             if granted:
-                self._granted[i] = request.slot + 1
+                self._grants[i] = request.slot + 1
                 self._stopped_at_s[i] = np.inf
                 holders.append((i, connector))
             else:
@@ -307,13 +307,13 @@ class RightOfWay:
         if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
             return False
         tail = float(state.front_m[i] + state.room_m[i])
-        if tail < line and self._denied[state.leader[i]]:
+        if tail < line and self._is_denied[state.leader[i]]:
             return False
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
         exit_m = state.tables.connector_end[i, request.slot]
-        full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
-        if full and tail >= line - 1.0 and control != _NONE:
+        is_full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
+        if is_full and tail >= line - 1.0 and control != _NONE:
             return False
         return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)
 
@@ -338,8 +338,8 @@ class RightOfWay:
         if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
         blockers = self._blockers(state, rules, request, holders)
-        has_priority = {blocker.connector for blocker in blockers} & set(rules.yields_to[connector].tolist())
-        if not blockers or has_priority:
+        prior = set(rules.yields_to[connector].tolist())
+        if not blockers or any(blocker.connector in prior for blocker in blockers):
             return False
         for blocker in blockers:
             speed = float(state.speed[blocker.row])
@@ -357,24 +357,24 @@ class RightOfWay:
         begin, scale = tables.begin[vehicles][:, others], tables.scale[vehicles][:, others]
         reach = begin + scale * rules.zone_begin[others, connector] - state.front_m[vehicles, None]
         clear = begin + scale * rules.zone_end[others, connector] - state.rear_m[vehicles, None]
-        coming = (clear > 0) & state.active[vehicles, None]
-        coming[i - vehicles.start] = False
+        is_coming = (clear > 0) & state.active[vehicles, None]
+        is_coming[i - vehicles.start] = False
         # Vehicles at a red light or with a denied request are not coming.
         is_red = state.colour[self._worlds.first_lane[world] + others] == _RED
-        waits = is_red | (self._denied & (state.speed < 0.5))[vehicles, None]
-        coming &= ~(waits & (reach > 0))
-        if not coming.any():
+        is_waiting = is_red | (self._is_denied & (state.speed < 0.5))[vehicles, None]
+        is_coming &= ~(is_waiting & (reach > 0))
+        if not is_coming.any():
             return True
-        rows, columns = np.nonzero(coming)
+        rows, columns = np.nonzero(is_coming)
         speed, own = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
-        own_speed, push = request.speed, float(self._drivers.acceleration_mps2[i])
+        own_speed, acceleration = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + rules.zone_begin[connector, own]
         through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]
-        enter = time_to_cover(to_zone, own_speed, push, top)
-        leave = time_to_cover(through_zone, own_speed, push, top)
+        enter = time_to_cover(to_zone, own_speed, acceleration, top)
+        leave = time_to_cover(through_zone, own_speed, acceleration, top)
         wait_s = state.step * DT_S - self._stopped_at_s[i] if self._stopped_at_s[i] < np.inf else 0.0
         patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
         least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)

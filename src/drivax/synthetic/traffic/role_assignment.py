@@ -47,7 +47,7 @@ _Values = Float64[np.ndarray, " n"]
 
 
 def yielding_destinations(network: RoadNetwork) -> tuple[Destination, ...]:
-    """Return destinations on connectors that yield to users with priority."""
+    """Return destinations on connectors at all-way stops, and on those that yield to connectors which never yield."""
     return tuple(
         Destination(index, (0.0, min(3.0, lane.length_m)), _ARRIVAL_S)
         for index, lane in enumerate(network.lanes)
@@ -56,7 +56,11 @@ def yielding_destinations(network: RoadNetwork) -> tuple[Destination, ...]:
 
 
 def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
-    """Return the connectors to which a path yields, unless these yield too, and the lanes to which it changes."""
+    """Return the lanes whose traffic ego must let pass on a path.
+
+    These are the connectors to which it yields, unless these yield too, the conflicting connectors at all-way stops,
+    and the lanes to which it changes.
+    """
     result: set[int] = set()
     for before, span in pairwise((path.spans[0], *path.spans)):
         lane, previous = network.lanes[span.lane], network.lanes[before.lane]
@@ -99,9 +103,9 @@ def assign_roles(
     """
     driver = expert.draw_expert(rng)
     destination_route = draw_route(network, yielding_destinations(network) if critical else destinations, rng)
-    first_s, attempts = float(times_s[0]), _EXTRA_ROUTES if critical and destination_route is None else 0
+    attempts = _EXTRA_ROUTES if critical and destination_route is None else 0
     lanes, path, position = _draw_route(
-        network, driver, first_s, lane_change_share, rng, destination_route, attempts
+        network, driver, float(times_s[0]), lane_change_share, rng, destination_route, attempts
     )
     rivals = add_feeders(network, conflicts_on(network, path)) if critical else frozenset()
     network = network.with_signals(_shift_lights(network, lanes, timing, destination_route, rng))
@@ -154,7 +158,7 @@ def _shift_lights(
     network: RoadNetwork, lanes: tuple[int, ...], timing: SignalTiming,
     destination_route: DestinationRoute | None, rng: np.random.Generator,
 ) -> SignalPlan | None:  # fmt: skip
-    """Shift the plan: ego's next light is green, turns green or turns yellow when the recording begins."""
+    """Shift the plan: ego's next light is green when the recording begins, or turns green or yellow within 5 s."""
     plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
     signalised = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not signalised:

@@ -58,15 +58,17 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, ScriptedUser,
 
 #: Distance between the front bumper and a stop line at standstill, m.
 _LINE_GAP_M = 1.0
-#: Distance kept to an obstacle in the lane, which leaves room for passing it, and to the end of a lane, m.
-_OBSTACLE_GAP_M, _LANE_END_GAP_M = 5.0, 10.0
+#: Distance kept to an obstacle in the lane, which leaves room for passing it, m.
+_OBSTACLE_GAP_M = 5.0
+#: Distance kept to the end of a lane in addition to the IDM's gap of 2 m, m.
+_LANE_END_GAP_M = 10.0
 #: Time constant with which a driver follows the speed profile, s.
 _SPEED_TIME_S = 0.6
 #: Deceleration beyond which a driver's own jerk limit is replaced, m/s2, and the limit that replaces it, m/s3.
 _EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
 #: Steps between decisions about lane changes and detours.
 _DECISION_STEPS = 5
-#: Steps between the end of a decision to leave the lane and the next one.
+#: Least number of steps from the start of a lane change or detour to that of the next one.
 _REST_STEPS = round(4.0 / DT_S)
 #: Braking that drivers accept for pedestrians, m/s2: to start to brake, and once they brake.
 _COMFORTABLE_MPS2, _HARDEST_MPS2 = 3.0, 8.0
@@ -415,7 +417,7 @@ class _Simulation:
         return preferred
 
     def _stop_gap(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
-        """Return the gap to the next place to stop (line, crossing, obstacle, lane end), plus the IDM's gap of 2 m."""
+        """Return the gap for the IDM, which keeps 2 m, to the next line, crossing, obstacle or lane end to stop at."""
         tables, front = self._tables, self._position_m + self._half_m
         committed = {}
         for row, plan, at in self._plans:
@@ -522,44 +524,44 @@ class _Simulation:
 
     def _start_detours(self, t: int, may_decide: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle."""
-        stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
+        is_stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
         for row, override in self._overrides:
             is_overridden = override.first_step <= t <= override.last_step
-            stuck[row] |= is_overridden and self._speed[row] < 0.05
-        halts = np.abs(self._moving_users.speed) < 0.05
-        large = halts & (self._moving_users.size_m[:, 0] > 1.2)
-        has_stuck = worlds.mask(worlds.world[stuck])
-        has_halted = has_stuck | worlds.mask(self._user_world[large])
+            is_stuck[row] |= is_overridden and self._speed[row] < 0.05
+        is_halted = np.abs(self._moving_users.speed) < 0.05
+        is_large = is_halted & (self._moving_users.size_m[:, 0] > 1.2)
+        has_stuck = worlds.mask(worlds.world[is_stuck])
+        has_halted = has_stuck | worlds.mask(self._user_world[is_large])
         considered = has_halted | self._has_standing
         if not considered.any():
             return
         front = self._position_m + self._half_m
-        slow_only = (has_stuck | worlds.mask(self._user_world[halts]))[worlds.world]
-        near = np.where(slow_only, self._speed < 3.0, self._standing.gap(front) < 45.0)
-        near &= may_decide & considered[worlds.world] & (self._speed < 9.0)
+        slow_only = (has_stuck | worlds.mask(self._user_world[is_halted]))[worlds.world]
+        is_near = np.where(slow_only, self._speed < 3.0, self._standing.gap(front) < 45.0)
+        is_near &= may_decide & considered[worlds.world] & (self._speed < 9.0)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
-        for row in near.nonzero()[0].tolist():
+        for row in is_near.nonzero()[0].tolist():
             if has_halted[worlds.world[row]] or self._standing.is_blocked(
                 row, front[row], half_m[row], LOOK_M
             ):
-                self._start_detour(t, row, stuck, large)
+                self._start_detour(t, row, is_stuck, is_large)
 
-    def _start_detour(self, t: int, row: int, stuck: VehicleMask, large: Bool[np.ndarray, " user"]) -> None:
-        """Start a detour around an obstacle ahead, if there is one; ``large`` are halted users."""
+    def _start_detour(
+        self, t: int, row: int, is_stuck: VehicleMask, is_large: Bool[np.ndarray, " user"]
+    ) -> None:
+        """Start a detour around an obstacle ahead, if there is one; ``is_large`` are halted users."""
         world, worlds = int(self._worlds.world[row]), self._worlds
-        own_users, moves = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
-        other = (self._position_m > 0.0) & ~stuck & (worlds.world == world)
-        other[row] = False
+        own_users, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
+        is_other = (self._position_m > 0.0) & ~is_stuck & (worlds.world == world)
+        is_other[row] = False
         standing = self._standing.boxes[world].concatenate(
-            self._vehicles.select(stuck & (worlds.world == world))
+            self._vehicles.select(is_stuck & (worlds.world == world))
         )
-        standing = standing.concatenate(self._moving_users.select(large & own_users))
-        moving = self._vehicles.select(other).concatenate(self._moving_users.select(own_users & moves))
-        position, size = (
-            float(self._position_m[row]),
-            (2 * float(self._half_m[row]), float(self._width_m[row])),
-        )
-        request = detour_request(self._tables, row, (position, self._speed[row]), size)
+        standing = standing.concatenate(self._moving_users.select(is_large & own_users))
+        moving = self._vehicles.select(is_other).concatenate(self._moving_users.select(own_users & is_moving))
+        position, speed = float(self._position_m[row]), float(self._speed[row])
+        size = 2 * float(self._half_m[row]), float(self._width_m[row])
+        request = detour_request(self._tables, row, position, speed, size)
         detour = self._runs[world].traffic.detours.find(request, standing, moving)
         if detour is not None:
             self._switch_path(t, row, detour[0], position, detour[1])

@@ -153,9 +153,12 @@ class Reach:
 
     def draw(self, rng: np.random.Generator, start: Pose) -> Curve:
         """Draw the middle line of an arm."""
-        near, bends = straight(start, self.straight_m), self.arm_m - self.straight_m
-        shape = {"max_curvature": 1.0 / self.tightest_m, "max_turn": self.widest_turn}
-        return join_curves(near, draw_winding_curve(rng, bends, start=near.end, **shape))
+        near = straight(start, self.straight_m)
+        length, curvature = self.arm_m - self.straight_m, 1.0 / self.tightest_m
+        bent = draw_winding_curve(
+            rng, length, max_curvature=curvature, max_turn=self.widest_turn, start=near.end
+        )
+        return join_curves(near, bent)
 
 
 @dataclass(frozen=True)
@@ -266,7 +269,7 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
 
     Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
     outside. The innermost lane is for turning only where fewer lanes leave than arrive, and on ``left_only`` approaches
-    with several lanes.
+    with several lanes and a left turn.
     """
     moves = []
     for i, approach in enumerate(site.approaches):
@@ -339,13 +342,17 @@ def finish_sites(
         draft.sidewalks += [kerb.parallel(-sidewalk_m) for kerb in kerbs]
     for number, site in enumerate(sites):
         for i, approach in enumerate(site.approaches):
+            # A street between two sites is marked once.
             if links.get((number, i), (number, i)) >= (number, i):
                 _add_markings(draft, approach.arm.street, approach.middle)
         _add_crossings(draft, site)
 
 
 def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: Place) -> tuple[Curve, Place]:
-    """Return the edge from one end of the map to the next: left of an arm inwards, round corners, right of an arm."""
+    """Return the edge from one end of the map to the next, and that end.
+
+    The edge leads inwards on the left of an arm, round the corners, and outwards on the right of another arm.
+    """
 
     def approach(place: Place) -> Approach:
         return sites[place[0]].approaches[place[1]]

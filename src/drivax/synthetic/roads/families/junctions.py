@@ -2,7 +2,7 @@
 
 Lights serve left turns in a phase of their own (protected, with arrows), together with oncoming traffic that has right
 of way (permissive), or serve one approach after the other (split phases). Other conflicting movements are never green
-at the same time. Ego starts on any approach, 12 to 85 m (6 s) before the junction.
+at the same time. Ego starts 12 to 85 m before a stop line, and at most 6 s at the speed limit.
 """
 
 from __future__ import annotations
@@ -88,28 +88,26 @@ def set_lights(
     groups: list[LightGroup] = []
     phases: list[tuple[int, ...]] = []
 
-    def phase(*approaches: list[Move], arrow: bool = False) -> None:
+    def add_phase(*approaches: list[Move], arrow: bool = False) -> None:
         phases.append(tuple(range(len(groups), len(groups) + len(approaches))))
-        for approach in approaches:
-            groups.append(LightGroup(tuple(move.lane for move in approach), arrow))
-            for move in approach:
-                yields_to = _yields_to(move, [m for other in approaches for m in other], conflicts, ())
-                draft.change(move.lane, control=Control.SIGNAL, yields_to=yields_to)
+        groups.extend(LightGroup(tuple(move.lane for move in approach), arrow) for approach in approaches)
+        moves = [move for approach in approaches for move in approach]
+        for move in moves:
+            yields_to = _yields_to(move, moves, conflicts, ())
+            draft.change(move.lane, control=Control.SIGNAL, yields_to=yields_to)
 
     for axis, turns in enumerate(lefts):
         approaches = [[move for move in site.moves if move.arm == arm] for arm in (axis, axis + 2)]
-        left, other = (
-            [[m for m in approach if (m.turn == Turn.LEFT) is turning] for approach in approaches]
-            for turning in (True, False)
-        )
+        left = [[move for move in approach if move.turn == Turn.LEFT] for approach in approaches]
+        other = [[move for move in approach if move.turn != Turn.LEFT] for approach in approaches]
         if turns.protected and _are_separate(left, conflicts) and _are_separate(other, conflicts):
-            phase(*left, arrow=True)
-            phase(*other)
+            add_phase(*left, arrow=True)
+            add_phase(*other)
         elif turns.permissive and _are_separate(other, conflicts):
-            phase(*approaches)
+            add_phase(*approaches)
         else:
             for approach in approaches:
-                phase(approach)
+                add_phase(approach)
     yellow = yellow_time_s(max(draft.lanes[move.lane].limit_mps for move in site.moves))
     return SignalPlan(tuple(groups), tuple(phases), tuple(green[: len(phases)]), yellow_s=yellow)
 
@@ -137,7 +135,7 @@ class SignalisedJunction:
 
     Attributes:
         cross_skew: Largest deviation of the two streets from a right angle, rad.
-        left_lane_share: Share of left-turn lanes on streets with as many lanes inward as outward.
+        left_lane_share: Share of left-turn lanes on streets with two lanes in each direction.
         protected_share: Share of streets with left-turn lanes whose left turns are protected.
         permissive_share: Share of the other streets whose left turns are permissive.
     """
@@ -344,9 +342,8 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        first = self._draw_plot(rng, style, main).move_to(
-            Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
-        )
+        plot = self._draw_plot(rng, style, main)
+        first = plot.move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._draw_middle(rng, first.gate)
         second = self._draw_plot(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
@@ -380,9 +377,12 @@ class Corridor:
 
     def _draw_middle(self, rng: np.random.Generator, gate: Pose) -> Curve:
         """Draw the middle line between the junctions: bent, with straight ends."""
-        near, length = straight(gate, _STRAIGHT_M), float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
-        shape = {"max_curvature": 1.0 / self.geometry.reach.tightest_m, "max_turn": math.radians(8.0)}
-        bent = draw_winding_curve(rng, length, start=near.end, **shape)
+        near = straight(gate, _STRAIGHT_M)
+        length = float(rng.uniform(*self.between_m)) - 2 * _STRAIGHT_M
+        curvature = 1.0 / self.geometry.reach.tightest_m
+        bent = draw_winding_curve(
+            rng, length, max_curvature=curvature, max_turn=math.radians(8.0), start=near.end
+        )
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _add_sites(

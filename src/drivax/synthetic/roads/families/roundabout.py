@@ -181,8 +181,8 @@ def _solve_join(radius: float, lateral: float) -> tuple[float, float]:
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
     tangents = (radius * np.sin(angles) - lateral) / np.cos(angles)
-    wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
-    index = int(np.argmax(wide)) if wide.any() else -1
+    is_wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
+    index = int(np.argmax(is_wide)) if is_wide.any() else -1
     angle, tangent = float(angles[index]), float(tangents[index])
     return angle, (radius - lateral * math.sin(angle)) / math.cos(angle) + tangent
 
@@ -209,10 +209,13 @@ def _add_circles(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> l
         junctions: list[list[int]] = []
         for arm in arms:
             low, high = arm.heading - join, arm.heading + join
-            entry = connect_poses(draft.lanes[arm.inward[j]].curve.end, _on_circle(radius, high))
-            leave = connect_poses(_on_circle(radius, low), draft.lanes[arm.outward[j]].curve.start)
-            curves = ((entry, plan.width_m), (leave, plan.width_m), (_arc(radius, low, high), plan.circle_m))
-            junctions.append([draft.lane(curve, width, limit, connector=True) for curve, width in curves])
+            curves = (
+                connect_poses(draft.lanes[arm.inward[j]].curve.end, _on_circle(radius, high)),
+                connect_poses(_on_circle(radius, low), draft.lanes[arm.outward[j]].curve.start),
+                _arc(radius, low, high),
+            )
+            pairs = zip(curves, (plan.width_m, plan.width_m, plan.circle_m), strict=True)
+            junctions.append([draft.lane(curve, width, limit, connector=True) for curve, width in pairs])
             draft.link(arm.inward[j], junctions[-1][0])
             draft.link(junctions[-1][1], arm.outward[j])
         for i, arm in enumerate(arms):
@@ -220,11 +223,11 @@ def _add_circles(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> l
             ahead = (arms[k].heading - arm.heading) % (2 * math.pi)
             curve = _arc(radius, arm.heading + join, arm.heading + ahead - join)
             arc = draft.lane(curve, plan.circle_m, limit)
-            (entry, _, before), (_, leave, after) = junctions[i], junctions[k]
-            for pair in ((entry, arc), (before, arc), (arc, leave), (arc, after)):
+            (entry, _, before), (_, departure, after) = junctions[i], junctions[k]
+            for pair in ((entry, arc), (before, arc), (arc, departure), (arc, after)):
                 draft.link(*pair)
             if j == len(plan.radius_m) - 1:
-                lanes = (arm.inward[j], entry, arc, leave, arms[k].outward[j])
+                lanes = (arm.inward[j], entry, arc, departure, arms[k].outward[j])
                 chains.append([draft.lanes[lane].curve for lane in lanes])
     return chains
 

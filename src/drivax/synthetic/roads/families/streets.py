@@ -14,7 +14,7 @@ from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, 
 from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
 from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Highest limit of curved roads with bays, m/s, and of streets with crosswalks, m/s.
+#: Limits below which curved roads may have bays and streets crosswalks away from junctions, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
 _CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
 #: Length over which a ramp's curvature rises and falls, m.
@@ -76,8 +76,8 @@ class LaneDrop(StreetFamily):
     """Settings of the family ``lane_drop``: a road that loses a lane, right or left, or gains one.
 
     Attributes:
-        left_share: Share of one-way roads on which the left lane ends.
         gain_share: Share of roads that gain a lane instead of losing one.
+        left_share: Share of the one-way roads that lose a lane on which this is the left one.
         taper_m: Length over which the road narrows beyond the lane's end, low and high.
     """
 
@@ -89,7 +89,7 @@ class LaneDrop(StreetFamily):
     name: str = "lane_drop"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a road with two or three lanes ahead; the change lies 100 to 200 m ahead of ego."""
+        """Draw a road with two or three lanes; one ends, or has its full width, 85 to 200 m ahead of ego."""
         street = Street(
             middle=self.draw_middle(rng, style.curvature),
             cuts=self.cuts,
@@ -152,12 +152,9 @@ class MidblockCrosswalk(StreetFamily):
         )
         street.build()
         street.add_sidewalks(rng)
-        position = float(rng.uniform(*self.crossing_m))
-        stations = (
-            [position, position + float(rng.uniform(*self.apart_m))]
-            if rng.random() < self.second_share
-            else [position]
-        )
+        stations = [float(rng.uniform(*self.crossing_m))]
+        if rng.random() < self.second_share:
+            stations.append(stations[0] + float(rng.uniform(*self.apart_m)))
         for station in stations:
             street.add_crossing(round(station / STEP_M), marked=bool(rng.random() < self.marked_share))
         street.add_bays(20.0, rng)
@@ -246,7 +243,7 @@ class Highway(StreetFamily):
     name: str = "highway"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a highway; ego starts 25 to 70 m before the section with a ramp, or on the on-ramp."""
+        """Draw a highway; ego starts 25 to 70 m before the auxiliary lane begins, or on the on-ramp."""
         middle = self.draw_middle(rng)
         lanes = int(rng.integers(2, 5))
         # At most five lanes in total fit the map of a stored scenario.
@@ -276,12 +273,12 @@ class Highway(StreetFamily):
     def _draw_auxiliary_lane(self, rng: np.random.Generator, lanes: int) -> Strip:
         """Draw the auxiliary lane: for entering, for leaving, or for both."""
         purpose = rng.choice(3, p=self.shares)
-        index, length = -lanes - 1, int(rng.integers(2, 4))
+        place, length = -lanes - 1, int(rng.integers(2, 4))
         if purpose == 0:
-            return Strip(index, True, 3, 3 + length, ends=True)
+            return Strip(place, True, 3, 3 + length, ends=True)
         if purpose == 1:
-            return Strip(index, True, 4, 3 + length, fork=True, exit_only=True)
-        return Strip(index, True, 3, 3 + length, exit_only=True)
+            return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
+        return Strip(place, True, 3, 3 + length, exit_only=True)
 
     def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, direction: int) -> _Ramp:
         """Add a ramp at the beginning of the auxiliary lane (``direction`` -1) or at its end (1)."""
@@ -308,7 +305,7 @@ class Highway(StreetFamily):
 
 
 def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray, " point"]:
-    """Return the curvature of a bend by an angle: it rises to 1 / radius, is constant, and falls."""
+    """Return the curvature of a bend by an angle: it rises to 1 / radius (less for small angles), holds and falls."""
     hold = max(0.0, angle * radius_m - _EASING_M)
     knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
     position = STEP_M * np.arange(round(length_m / STEP_M) + 1)
