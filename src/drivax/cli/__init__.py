@@ -146,8 +146,8 @@ def _stop_at_signals() -> Iterator[None]:
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
-    found = {number: signal.getsignal(number) for number in signals}
-    handled = [n for n in signals if found[n] in (signal.SIG_DFL, signal.default_int_handler)]
+    previous = {number: signal.getsignal(number) for number in signals}
+    handled = [n for n in signals if previous[n] in (signal.SIG_DFL, signal.default_int_handler)]
     report_unraisable = sys.unraisablehook
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -161,7 +161,7 @@ def _stop_at_signals() -> Iterator[None]:
             raise Stopped(signal.Signals(number))
 
     def stop_later(lost: sys.UnraisableHookArgs) -> None:
-        # Python drops what is raised in a callback, such as JAX's of the garbage collector.
+        # Python drops an exception that a signal raises in a callback, such as JAX's in garbage collection.
         if not isinstance(error := lost.exc_value, KeyboardInterrupt):
             report_unraisable(lost)
             return
@@ -178,7 +178,7 @@ def _stop_at_signals() -> Iterator[None]:
         if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
             sys.unraisablehook = report_unraisable
         for number in handled:
-            signal.signal(number, found[number])
+            signal.signal(number, previous[number])
 
 
 def _is_bad_moment(frame: FrameType | None) -> bool:

@@ -52,8 +52,8 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
 
     Under the null hypothesis, either planner is equally likely to fail alone in each of the ``n`` discordant pairs:
     ``p = 2 P(X <= k)``, at most 1, where ``X ~ Binomial(n, 1/2)`` and ``k`` is the smaller of the two counts (McNemar,
-    Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and nearly always keeps its level
-    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
+    Psychometrika 12, 1947). The mid-p value, ``2 P(X <= k) - P(X = k)``, is less conservative and nearly always keeps
+    its level (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013). Both are 1 for equal counts.
     """
     for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():

@@ -394,7 +394,7 @@ def _results(
     study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
     usable: Bool[np.ndarray, "N T"],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the contents of ``results.json``, except the conditions and the detectable differences."""
+    """Return the contents of ``results.json``, except ``conditions``, ``detectable`` and ``edited``."""
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
     episodes = {}
     for name in definition.planners:
