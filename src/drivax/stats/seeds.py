@@ -139,7 +139,7 @@ class CrossedEffect:
         def detects(number: int) -> bool:
             return abs(self.difference) >= extrapolate(number).detectable(power, confidence)
 
-        # Detection is not monotonic: with more seeds, the degrees of freedom approach those of the clusters.
+        # Detection is not monotonic: as one number grows, the degrees of freedom approach those of the other.
         candidates = np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)
         numbers = np.unique(np.round(candidates)).astype(int).tolist()
         first = next((index for index, number in enumerate(numbers) if detects(number)), None)
@@ -174,15 +174,16 @@ def seeds_interval(
 ) -> Interval:  # fmt: skip
     """Return the mean of one policy with the interval of :func:`crossed_mean`.
 
-    The interval has no bounds with fewer than two clusters. That of a ``share`` lies within 0 and 1. If all values are
-    0, or all are 1, it is Wilson's interval with one trial per cluster (with weights, their effective sample size,
+    The interval has no bounds with fewer than two clusters. That of a ``share`` lies within 0 and 1; if all its values
+    are 0, or all are 1, it is Wilson's interval with one trial per cluster (with weights, their effective sample size,
     Kish 1965).
     """
     weight, keep = _weights_and_mask(values, values, weights)
     n = int(keep.sum())
     labels = dense_labels(clusters, values.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
-        return Interval(float(values[:, keep].mean()) if n else None, None, None, n)
+        mean = float(np.average(values[:, keep].mean(axis=0), weights=weight[keep])) if n else None
+        return Interval(mean, None, None, n)
     effect = crossed_mean(values, labels, weights)
     low, high = effect.interval(confidence)
     distinct = np.unique(values[:, keep])
@@ -256,7 +257,7 @@ def difference_interval(
 def log_ratio(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
-    """Return ``ln(mean(a) / mean(b))`` of non-negative values, with its error (delta method); None if a mean is 0."""
+    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means are positive."""
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None

@@ -64,7 +64,7 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A training run of a study, with a mask of the logged steps to draw from; ``edited``: edited files are used."""
+    """A training run of a study, with a mask of the logged steps to draw from; ``edited`` allows edited files."""
 
     study: Study
     arm: str
@@ -98,8 +98,8 @@ def run_study(
         The contents of ``results.json``.
 
     Raises:
-        UsageError: The baselines do not drive well enough, or the folder holds another study or runs with other
-            settings.
+        UsageError: The baselines do not drive well enough, events are not labelled where arms or strata need them, or
+            the folder holds another study, runs with other settings, or evaluations of other runs.
     """
     _open_folder(study)
     tables = _score(study, log)
@@ -362,7 +362,7 @@ def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
 
 
 def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
-    """Return ``score``, ``progress`` and, if logged, ``rule`` (``checkpoints_by``) at each seed's validations."""
+    """Return ``score``, ``progress`` and the logged ``rule`` (``checkpoints_by``) at each seed's validations."""
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
         run = RunFolder(study.run(arm, seed), {})
