@@ -55,8 +55,8 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
-#: Until a signal that came at a bad moment is sent again (s).
-_LATER_S = 0.01
+#: Delay until a signal that came at a bad moment is sent again, s.
+_RESEND_S = 0.01
 COMMANDS = {
     "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
     "doctor": Command("what is installed, or what a file or folder contains"),
@@ -175,7 +175,8 @@ def _stop_at_signals() -> Iterator[None]:
             signal.signal(number, stop)
         yield
     finally:
-        if sys.unraisablehook is stop_later:  # Orbax's late errors stay silent.
+        # Else it is the hook of ``tracking.checkpoints``, which keeps late errors of Orbax silent.
+        if sys.unraisablehook is stop_later:
             sys.unraisablehook = report_unraisable
         for number in handled:
             signal.signal(number, previous[number])
@@ -192,7 +193,7 @@ def _is_bad_moment(frame: FrameType | None) -> bool:
 
 def _send_later(number: int) -> None:
     """Send a signal to this process again, from a thread."""
-    timer = threading.Timer(_LATER_S, os.kill, (os.getpid(), number))
+    timer = threading.Timer(_RESEND_S, os.kill, (os.getpid(), number))
     timer.daemon = True
     timer.start()
 
