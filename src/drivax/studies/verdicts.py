@@ -102,7 +102,7 @@ class Condition:
         for curve in curves:
             scores = np.asarray(curve["score"])
             quarter = max(len(scores) // 4, 1)
-            progress.append(curve["progress"][int(scores.argmax())])
+            progress.append(curve["progress"][best_validation(scores)])
             changes.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
         mean_change, absolute_change = float(np.mean(changes)), float(np.abs(changes).mean())
         met = bool(min(progress) >= min_progress and absolute_change <= max_change)
@@ -113,6 +113,11 @@ class Condition:
             f"{self.arm}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score changes by "
             f"{self.change:+.3f} (absolute {self.moved:.3f}): {'good enough' if self.met else 'NOT good enough'}"
         )
+
+
+def best_validation(scores: Sequence[float] | Float[np.ndarray, " validation"]) -> int:
+    """Return the index of the highest score, the latest if several are equal: that of the best checkpoint."""
+    return len(scores) - 1 - int(np.argmax(scores[::-1]))
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]
 def overlapping(
     motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float = 0.0
 ) -> Bool[Array, "T K"]:
-    """Mask agents that ego overlaps within a horizon from each step of a motion, at constant velocities."""
+    """Return the mask of agents that ego overlaps within a horizon of each step of a motion, at constant velocities."""
     ego_box = boxes_of(motion, size)[:, None]
     velocity = ego_box[..., COS : SIN + 1] * motion[:, None, MOTION_SPEED, None]
     boxes = others.at(jnp.arange(motion.shape[0]) * DT_S)
@@ -111,7 +111,7 @@ class Contacts:
         return cls(touches, step, *faults)
 
     def needs_lanes(self, steps: int) -> Bool[Array, " T"]:
-        """Mask the steps at which a fault depends on lanes and road."""
+        """Return the mask of steps at which a fault depends on lanes and road."""
         depends = self.touches & (self.lawful_fault != self.unlawful_fault)
         return ((self.step == jnp.arange(steps)[:, None]) & depends).any(axis=1)
 

@@ -135,13 +135,13 @@ class PdmPlanner:
         best = jnp.argmax(proposals.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
         is_braking = is_emergency(proposals.metrics.fault_s[best], speed, brake)
-        deceleration = braking(speed, carry.acceleration, brake)
-        acceleration = jnp.where(is_braking, deceleration, proposals.cars.acceleration[best, 1])
+        brake_acceleration = braking(speed, carry.acceleration, brake)
+        acceleration = jnp.where(is_braking, brake_acceleration, proposals.cars.acceleration[best, 1])
         steering = jnp.where(is_braking, 0.0, proposals.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = action_of(self.actions, bank, context, acceleration, curvature)
         if space:
-            stop_plan = stop(space, motion, deceleration, length, brake)
+            stop_plan = stop(space, motion, brake_acceleration, length, brake)
             action = jnp.where(is_braking, stop_plan, space.plan(proposals.plans[best]))
         return action, Memory(touched, acceleration, steering)
 
@@ -154,7 +154,7 @@ class PdmPlanner:
         lines = Lines.along_route(bank, context.row, surroundings.route.along_m, config.offsets_m, box)
         path = lines.points[0, ::_STRIDE, :2]
         others = Forecast.of(frame, context.slot, carry.touched, path, config.agents, config.radius_m)
-        # Each stage is written out: XLA would compute it again in every operation that uses it.
+        # Without barriers, XLA would compute a stage again in every operation that uses it.
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
         desired = jnp.where(lines.remaining_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
