@@ -111,7 +111,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 show(f"drivax: made with edited files: {', '.join(files)}", sys.stderr)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
-        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+        if stop.code is None:
+            return 0
+        return stop.code if isinstance(stop.code, int) else 1
     except BrokenPipeError:
         # The reader (head, less) has exited; avoid an error when the interpreter flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

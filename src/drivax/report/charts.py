@@ -240,8 +240,9 @@ def bins(values: Values, maximum: int = BINS) -> Values:
 def short(value: Any) -> str:
     """Return a number with about three figures."""
     value = float(value)
-    digits = 0 if abs(value) >= 100 or value == round(value) else 1 if abs(value) >= 10 else 2
-    return f"{value:,.{digits}f}"
+    if abs(value) >= 100 or value == round(value):
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
 def _shares(values: Values, edges: Values) -> Values:

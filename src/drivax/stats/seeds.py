@@ -213,19 +213,18 @@ def crossed_difference(
         cure = "train two seeds or more of each, and evaluate on two recordings or more"
         raise UsageError("too few seeds or recordings to estimate a variance", cure=cure)
     share, cluster_count = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
-    correction, policies = cluster_count / (cluster_count - 1), (a[:, keep], b[:, keep])
-    difference = policies[0].mean(axis=0) - policies[1].mean(axis=0)
+    correction, a, b = cluster_count / (cluster_count - 1), a[:, keep], b[:, keep]
+    difference = a.mean(axis=0) - b.mean(axis=0)
     # Remove the rounding errors of sums.
-    rounding = ROUNDING * max(float(np.abs(policy).max()) for policy in policies)
+    rounding = ROUNDING * max(float(np.abs(a).max()), float(np.abs(b).max()))
     difference = np.where(np.abs(difference) <= rounding, 0.0, difference)
     mean = float(difference @ share)
     totals = np.bincount(labels, share * (difference - mean), cluster_count)
     scenarios = correction * float(np.square(totals).sum())
-    (seeds_a, e_a), (seeds_b, e_b) = (
-        _seed_variances(policy, share, labels, correction) for policy in policies
-    )
-    counts = len(a), len(b)
-    return CrossedEffect(mean, (seeds_a, seeds_b), scenarios, counts, cluster_count, (e_a, e_b))
+    seeds_a, interaction_a = _seed_variances(a, share, labels, correction)
+    seeds_b, interaction_b = _seed_variances(b, share, labels, correction)
+    seeds, interaction = (seeds_a, seeds_b), (interaction_a, interaction_b)
+    return CrossedEffect(mean, seeds, scenarios, (len(a), len(b)), cluster_count, interaction)
 
 
 def _seed_variances(policy: Values, share: Weights, labels: Labels, correction: float) -> tuple[float, float]:

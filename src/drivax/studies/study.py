@@ -174,16 +174,21 @@ def _open_folder(study: Study) -> None:
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
-    if not study.folder.exists() or not any(study.folder.iterdir()):
-        other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
-        if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
-            raise UsageError(
-                "has no labelled events, which the oracle and its control need",
-                file=sets.train,
-                cure=f"pass --arms [{','.join(other_arms)}]",
-            )
-        RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
+    if study.folder.exists() and any(study.folder.iterdir()):
+        _check_folder(study, data, definition)
         return
+    other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
+    if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
+        raise UsageError(
+            "has no labelled events, which the oracle and its control need",
+            file=sets.train,
+            cure=f"pass --arms [{','.join(other_arms)}]",
+        )
+    RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
+
+
+def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) -> None:
+    """Check that a folder contains this study of these sets; ``definition`` is the hash of arms and claims."""
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
     config = folder.config(StudyConfig, trust=settings.modules_of(study.config))

@@ -193,11 +193,10 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
 def _decide(result: ClaimResult, claims: int) -> ClaimResult:
     """Return the result with its verdict; ``claims`` claims are adjusted together."""
     if result.effect is None or result.adjusted_p is None:
-        has_difference = result.difference is not None
-        reason = (
-            "the mean of an arm is 0: no ratio" if has_difference else "fewer than two recordings define it"
-        )
-        return replace(result, needed=reason)
+        needed = "fewer than two recordings define it"
+        if result.difference is not None:
+            needed = "the mean of an arm is 0: no ratio"
+        return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
         return replace(result, needed=describe_sample_size(result.effect, claims))
     lower_is_better = METRICS[result.claim.metric].better == "low"
