@@ -110,13 +110,8 @@ def _is_installed(module: str) -> bool:
 def devices(timeout_s: float = 60.0) -> str:
     """Return the devices of JAX, or its error."""
     try:
-        result = subprocess.run(
-            [sys.executable, "-c", _LIST_DEVICES],
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-        )
+        command = [sys.executable, "-c", _LIST_DEVICES]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])
             return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)

@@ -79,15 +79,12 @@ class Demo:
         lines = [format_summary(self.summaries), ""]
         for planner, metrics in self.differences.items():
             for name, difference in metrics.items():
-                mean, low, high = (_signed(difference[key]) for key in ("mean", "low", "high"))
+                numbers = (difference[key] for key in ("mean", "low", "high"))
+                mean, low, high = (MISSING if number is None else f"{number:+.3f}" for number in numbers)
                 count = f"over {difference['n']} scenarios"
                 lines.append(f"policy - {planner}: {name} {mean} [{low}, {high}] {count}")
         lines += ["", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.stages_s.items())]
         return "\n".join(lines)
-
-
-def _signed(value: float | None) -> str:
-    return MISSING if value is None else f"{value:+.3f}"
 
 
 class _Stages:

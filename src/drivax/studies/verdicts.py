@@ -91,11 +91,7 @@ class Condition:
 
     @classmethod
     def of(
-        cls,
-        arm: str,
-        curves: Sequence[Mapping[str, Sequence[float]]],
-        min_progress: float,
-        max_change: float,
+        cls, arm: str, curves: Sequence[Mapping[str, Sequence[float]]], min_progress: float, max_change: float
     ) -> Condition:
         """Return the condition of an arm from ``score`` and ``progress`` at the validations of every seed."""
         progress, changes = [], []

@@ -97,11 +97,9 @@ def _moments(bank: ScenarioBank) -> Moments:
     offset = jnp.asarray(_OFFSETS)[changes.ravel()]
     # Measure the previous and the current step in one program.
     measure_all = jax.vmap(partial(_measure_offset, bank))
-    situations = measure_all(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(offset, (2, 1)))
-    previous, current = (
-        jax.tree.map(lambda leaf, half=half: jnp.split(leaf, 2)[half], situations) for half in (0, 1)
-    )
-    return Moments(previous.facts, current, step - 20)
+    pairs = measure_all(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(offset, (2, 1)))
+    before, now = (jax.tree.map(lambda leaf, half=half: jnp.split(leaf, 2)[half], pairs) for half in (0, 1))
+    return Moments(before.facts, now, step - 20)
 
 
 def _measure_offset(bank: ScenarioBank, index: Array, step: Array, offset: Array) -> Situation:

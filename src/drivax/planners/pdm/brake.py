@@ -53,10 +53,7 @@ class BrakeConfig:
 
 
 def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
-    """Return whether to brake.
-
-    ``fault_s`` is the time to an at-fault collision (infinite for none), ``speed`` in m/s.
-    """
+    """Return whether to brake at a time to an at-fault collision (infinite for none) and a speed (m/s)."""
     # Times are multiples of a step in float32.
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 

@@ -50,11 +50,7 @@ class Ground:
 
 
 def ground_at(
-    bank: ScenarioBank,
-    row: Integer,
-    box: Float[Array, " 6"],
-    z: Scalar,
-    on_route: Bool[Array, ""],
+    bank: ScenarioBank, row: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
     """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
@@ -94,11 +90,7 @@ def ground_along(
 
 
 def _look_up_sorted(
-    bank: ScenarioBank,
-    row: Integer,
-    box: Float[Array, "P 6"],
-    z: Float[Array, " P"],
-    group: int,
+    bank: ScenarioBank, row: Integer, box: Float[Array, "P 6"], z: Float[Array, " P"], group: int
 ) -> tuple[Ground, Bool[Array, " P"]]:
     """Return the position of poses on a route, taken to be in a single lane, and the mask of poses where it is exact.
 

@@ -137,13 +137,8 @@ def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
     if config.road:
         _draw_reach(axes, config)
-    layers = (
-        ("road", _draw_road),
-        ("route", _draw_route),
-        ("lights", _draw_lights),
-        ("agents", _draw_agents),
-    )
-    for group, draw in layers:
+    layers = {"road": _draw_road, "route": _draw_route, "lights": _draw_lights, "agents": _draw_agents}
+    for group, draw in layers.items():
         if groups.has(group, "position"):
             draw(axes, groups)
     _draw_ego(axes, groups)

@@ -47,8 +47,9 @@ def draw_scenario(
     except ImportError as error:
         raise missing_package(error) or error from error
     path = None if ego is None else np.asarray(ego, dtype=np.float64)
-    has_path = path is not None and np.isfinite(path[step]).all()
-    centre = path[step, :2] if has_path else scenario.agent_xy[step, 0]
+    centre = scenario.agent_xy[step, 0]
+    if path is not None and np.isfinite(path[step]).all():
+        centre = path[step, :2]
     colours, legend_in = THEMES[theme], _LEGEND_IN if legend else 0.0
     height_in = 7 + legend_in
     figure = Figure(figsize=(7, height_in), dpi=110, facecolor=colours["ground"])
