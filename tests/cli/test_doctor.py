@@ -16,7 +16,8 @@ import pytest
 from datasets.samples import womd_scenario as wire
 from drivax.cli import doctor, main
 from drivax.datasets.conversion import convert
-from drivax.datasets.doctor import diagnose, gaps
+from drivax.datasets.doctor import Part, diagnose, gaps
+from drivax.datasets.reader import Description
 from drivax.errors import UsageError
 
 FORMATS = {
@@ -208,6 +209,11 @@ def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
     status, out = asked(tmp_path, capsys)
     assert status == 0 and "8 files (4 of them inspected), 4 recordings in those" in out
     assert "about 8 scenarios" in out
+
+
+def test_unknown_number_of_recordings_is_not_mentioned():
+    part = Part("nuplan", Description("nuPlan", "log"), 4, whole=False)
+    assert ("format", "nuplan: 8 files (4 of them inspected)") in doctor._part_rows(part, 8)
 
 
 # --- Shards.

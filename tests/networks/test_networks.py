@@ -231,6 +231,11 @@ def test_policy_explores_by_action_and_never_less_than_a_share():
         Policy(replace(config, first_scale=(0.1, 0.1, 0.1)), spec, nnx.Rngs(0))({"ego": jnp.zeros(3)})
 
 
+def test_mlp_without_hidden_layers_returns_the_features():
+    encoder, ego = MlpConfig(hidden=()).build({"ego": (3,)}, nnx.Rngs(0)), jnp.array([1.0, 2.0, 3.0])
+    assert encoder.width == 3 and encoder({"ego": ego}).tolist() == ego.tolist()
+
+
 def test_flat_groups_keep_the_order_of_their_rows():
     """A pooled group is the same in any order of its rows, a flat one is not."""
     spec = {"agents": (4, 3), "agents_mask": (4,), "route": (4, 3), "route_mask": (4,)}

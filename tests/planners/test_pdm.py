@@ -17,7 +17,7 @@ from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_e
 from drivax.planners.pdm.forecast import Forecast, boxes_of
 from drivax.planners.pdm.ground import ground_at
 from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
-from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unroll_idm
+from drivax.planners.pdm.proposals import LINE_ALONG, LINE_CURVATURE, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ScoringConfig
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -88,15 +88,15 @@ def test_lines_keep_their_offset_from_the_route_and_even_spacing():
         return Lines.along_route(bank, jnp.asarray(0), jnp.asarray(7.0), (0.0, -1.0, 1.0), me)
 
     found = quick(lines, bank)
-    assert found.left_m == pytest.approx(112.0) and found.limit == pytest.approx(10.0)
+    assert found.remaining_m == pytest.approx(112.0) and found.limit == pytest.approx(10.0)
     for points, offset in zip(found.points, (0.0, -1.0, 1.0), strict=True):
         own = radius - offset
         angle = 7.0 / radius + np.arange(90) / own
         right = np.stack([own * np.sin(angle), radius - own * np.cos(angle)], 1)
         np.testing.assert_allclose(points[:90, :2], right, atol=0.03)
         np.testing.assert_allclose(points[:90, 2], np.cos(angle), atol=0.01)
-        np.testing.assert_allclose(points[4:86, LINE_BEND], 1 / own, rtol=0.02)
-        np.testing.assert_allclose(points[:90, LINE_PLACE], np.arange(90) * radius / own, atol=0.02)
+        np.testing.assert_allclose(points[4:86, LINE_CURVATURE], 1 / own, rtol=0.02)
+        np.testing.assert_allclose(points[:90, LINE_ALONG], np.arange(90) * radius / own, atol=0.02)
     # Beyond the end of the route they go straight on.
     steps = np.diff(found.points[0, 115:, :2], axis=0)
     np.testing.assert_allclose(steps, steps[:1].repeat(len(steps), 0), atol=1e-3)
@@ -110,7 +110,7 @@ def test_lines_lead_straight_ahead_without_a_route():
     way = np.arange(160)[:, None] * np.array([0.6, 0.8])
     np.testing.assert_allclose(found.points[0, :, :2], way + np.array([5.0, 3.0]), atol=1e-3)
     np.testing.assert_allclose(found.points[1, :, :2], way + np.array([4.2, 3.6]), atol=1e-3)
-    assert found.left_m < 0
+    assert found.remaining_m < 0
 
 
 # IDM -------------------------------------------------------------------------------------------------------------
@@ -165,15 +165,15 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
         lines = Lines.along_route(bank, jnp.asarray(0), start, (0.0, -1.0, 1.0), me)
         first = lines.points[0, 0, 0]
         moved = replace(others, box=others.box.at[:, 0].add(first))
-        wanted, driver = jnp.asarray(fractions, jnp.float32), (PUBLISHED_DRIVER, 40, 2)
-        return unroll_idm(lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, driver)
+        wanted = jnp.asarray(fractions, jnp.float32)
+        return unroll_idm(lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, PUBLISHED_DRIVER, 40, 2)
 
     found = quick(proposals, bank, others, jnp.asarray(stop, jnp.float32))
     braked = False
     for line, offset in enumerate((0.0, -1.0, 1.0)):
         for driver, wanted in enumerate(fractions):
             way, speed = idm_oracle(boxes, velocities, 8.0, wanted, stop, offset)
-            np.testing.assert_allclose(found.way[line, driver], way, atol=5e-3)
+            np.testing.assert_allclose(found.arc_m[line, driver], way, atol=5e-3)
             np.testing.assert_allclose(found.speed[line, driver], speed, atol=5e-3)
             braked |= speed.min() < 5.0 and wanted > 8.0
     assert braked
@@ -261,7 +261,7 @@ def test_tracked_proposals_are_looked_up_at_every_pose():
         def look(box):
             return ground_at(bank, index, box, jnp.zeros(()), jnp.asarray(True))
 
-        return scored.metrics.road, jax.vmap(jax.vmap(look))(boxes).off
+        return scored.metrics.road, jax.vmap(jax.vmap(look))(boxes).is_offroad
 
     road, off = quick(gate_and_look_ups, bank_of(straight_road([car(0, 0, -0.2, 9)])))
     assert (1.0 - road).tolist() == off.any(axis=1).tolist()

@@ -176,10 +176,10 @@ def test_ground_at_marks_several_lanes_off_road_and_wrong_way():
 
     y = jnp.asarray([0.0, 1.3, -1.3, 3.7, 7.5, 1.85])
     found = quick(jax.vmap(look, (None, 0, 0)), bank, y, jnp.zeros(6))
-    assert found.several.tolist() == [False, True, True, False, True, True]
+    assert found.is_in_several_lanes.tolist() == [False, True, True, False, True, True]
     # Half a car is 1 m wide, and 0.3 m beyond the edge are tolerated.
-    assert found.off.tolist() == [False, False, True, False, True, False]
-    assert found.astray.tolist() == [False, False, False, False, True, False]
+    assert found.is_offroad.tolist() == [False, False, True, False, True, False]
+    assert found.is_astray.tolist() == [False, False, False, False, True, False]
 
 
 def test_ground_is_looked_up_ahead_of_each_step():
@@ -189,7 +189,7 @@ def test_ground_is_looked_up_ahead_of_each_step():
     z, there = jnp.zeros((2, 41)), jnp.ones((2, 41), bool)
     found = quick(lambda b, m: ground_along(b, jnp.asarray(0), m, SIZE, z, there, there, 5), bank, motion)
     # 1.15 m aside is the limit, after 2.3 s; the look-up at 2.5 s stands for 2.1 s to 2.5 s.
-    assert not found.off[0].any() and found.off[1].tolist() == [False] * 21 + [True] * 20
+    assert not found.is_offroad[0].any() and found.is_offroad[1].tolist() == [False] * 21 + [True] * 20
 
 
 @pytest.mark.parametrize(("most", "every"), [((96, 40), 5), ((96, 40), 1), ((20, 40), 5), ((96, 6), 5)])
@@ -221,10 +221,12 @@ def test_ground_along_equals_a_query_of_the_grid_per_pose(monkeypatch, most, eve
     exact = jax.device_get(jax.jit(jax.vmap(query))(index, *poses))
     # Each step shares the look-up at the end of its interval.
     at = np.ceil(np.arange(41) / every).astype(int) * every
-    np.testing.assert_array_equal(seen.off, exact.off[..., at])
-    np.testing.assert_array_equal(seen.astray, exact.astray[..., at])
-    np.testing.assert_array_equal(seen.several[needs_lanes], exact.several[..., at][needs_lanes])
-    for flags in (exact.off, exact.astray, exact.several[needs_lanes]):
+    np.testing.assert_array_equal(seen.is_offroad, exact.is_offroad[..., at])
+    np.testing.assert_array_equal(seen.is_astray, exact.is_astray[..., at])
+    np.testing.assert_array_equal(
+        seen.is_in_several_lanes[needs_lanes], exact.is_in_several_lanes[..., at][needs_lanes]
+    )
+    for flags in (exact.is_offroad, exact.is_astray, exact.is_in_several_lanes[needs_lanes]):
         assert 0.1 < flags.mean() < 0.9
 
 

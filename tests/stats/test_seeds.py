@@ -231,6 +231,8 @@ def test_seeds_interval():
         assert seeds_interval(np.ones((3, count)), share=True) == replace(wilson(count, count), n=count)
     assert seeds_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
     assert seeds_interval(np.full((2, 3), np.nan)).mean is None
+    weighted = seeds_interval(np.array([[0.0, 1.0]]), [0, 0], np.array([3.0, 1.0]))
+    assert weighted == Interval(0.25, None, None, 2)
 
 
 def test_power_of_the_detectable_difference():

@@ -210,6 +210,9 @@ def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
     assert one.change == pytest.approx(0.2) and one.progress == 0.95 and not one.met
     assert Condition.of("bc", [flat], 0.8, 0.03).met
     assert not Condition.of("bc", [flat], 0.91, 0.03).met
+    # Of equal scores, the latest is that of the best checkpoint.
+    equal = {"score": [0.8] * 8, "progress": [0.0] * 7 + [0.9]}
+    assert Condition.of("bc", [equal], 0.8, 0.03).progress == 0.9
 
 
 def test_seeds_do_not_make_up_for_each_other():

@@ -5,17 +5,25 @@ import re
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import own_terms
 from drivax.simulator.traffic.log import LogTraffic
+from drivax.tasks.features import View
 from drivax.testing import BrokenContract, check_traffic
+from drivax.testing.simulation import _check_rows, _Rollout
 
 count = itertools.count()
 
 
 def test_log_replay_passes():
     check_traffic(LogTraffic())
+
+
+def test_rows_without_agents_pass():
+    rows, view = np.zeros((1, 2, 3, 8), np.float32), View(jnp.zeros(2), jnp.ones(()), jnp.zeros(()))
+    _check_rows("traffic 'empty'", _Rollout(rows, rows, view))
 
 
 @pytest.mark.slow

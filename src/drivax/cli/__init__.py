@@ -56,8 +56,8 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
-#: A signal that comes at a bad moment is sent again after the first time, and has an effect after the second (s).
-_LATER_S, _PATIENCE_S = 0.01, 10.0
+#: Delay until a signal that came at a bad moment is sent again, and time after which it is obeyed at any moment, s.
+_RESEND_S, _PATIENCE_S = 0.01, 10.0
 COMMANDS = {
     "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
     "doctor": Command("what is installed, or what a file or folder contains"),
@@ -112,7 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 show(f"drivax: made with edited files: {', '.join(files)}", sys.stderr)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
-        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+        if stop.code is None:
+            return 0
+        return stop.code if isinstance(stop.code, int) else 1
     except BrokenPipeError:
         # The reader (head, less) has exited; avoid an error when the interpreter flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -189,7 +191,7 @@ class _SignalHandler:
         waited_s = now_s - self._first_s.setdefault(number, now_s)
         if waited_s < _PATIENCE_S and _is_bad_moment(frame):
             # Ever later, because on a busy machine a signal every 10 ms takes all of the time.
-            self._send_later(number, max(_LATER_S, waited_s / 2))
+            self._send_later(number, max(_RESEND_S, waited_s / 2))
             return
         if number == signal.SIGINT:
             raise KeyboardInterrupt
@@ -204,7 +206,7 @@ class _SignalHandler:
             self._report_unraisable(dropped)
             return
         self.install()
-        self._send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _LATER_S)
+        self._send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _RESEND_S)
 
     def _send_later(self, number: int, wait_s: float) -> None:
         """Send a signal to the main thread again, which wakes it if it waits."""

@@ -82,8 +82,8 @@ def _generate_bank(scenarios: int) -> ScenarioBank:
 def _parts_text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']}, "
-        f"{result['devices']} device(s), "
-        f"{result['scenarios']:,} scenarios, {result['traffic']} traffic, with resets, observation, reward, metrics)",
+        f"{result['devices']} device(s), {result['scenarios']:,} scenarios, "
+        f"{result['traffic']} traffic, with resets, observation, reward, metrics)",
         f"state {result['state_bytes']:,} B, scenario {result['bank_bytes_per_scenario']:,} B, "
         f"compiled in {result['compile_seconds']} s",
         f"map queries {result['brute_force_ratio']}x faster than brute force over the same segments",
@@ -101,17 +101,17 @@ def _metric_sets_text(result: dict[str, Any]) -> str:
         "  metrics     batch   steps/s      x",
     ]
     for row in result["rows"]:
-        batch = f"{row['batch']}{' (best)' if row['best'] else ''}"
+        batch = str(row["batch"]) + (" (best)" if row["best"] else "")
         lines.append(f"  {row['metrics']:<9} {batch:>12} {row['steps_per_second']:9,} {row['relative']:6.2f}")
     return "\n".join(lines)
 
 
 def _encoders_text(result: dict[str, Any]) -> str:
-    batches = list(result["rows"][0]["forward_us"])
-    headings = "".join(f" {f'batch {batch}':>10}" for batch in batches)
+    headings = [*(f"batch {batch}" for batch in result["rows"][0]["forward_us"]), "backward"]
+    headings_text = "".join(f" {heading:>10}" for heading in headings)
     lines = [
         f"encoders of an observation on {result['device']}; us per observation: forward, and forward and backward",
-        f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{headings} {'backward':>10}",
+        f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{headings_text}",
     ]
     for row in result["rows"]:
         times = "".join(f" {time_us:10.1f}" for time_us in (*row["forward_us"].values(), row["gradient_us"]))

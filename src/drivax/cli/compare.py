@@ -70,11 +70,10 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
     a, b = EpisodeTable.read_seeds(plan.a), EpisodeTable.read_seeds(plan.b)
     entries = a[0].open_set(args.data).entries if plan.split == "stratified" else ()
     comparison = compare(plan, a, b, entries)
-    show(
-        json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
-        if args.json
-        else comparison_text(comparison)
-    )
+    if args.json:
+        show(json.dumps(comparison.as_dict(), indent=1, allow_nan=False))
+    else:
+        show(comparison_text(comparison))
     if args.html is not None:
         write_comparison(comparison, args.html, args.overwrite)
         if not args.json:

@@ -89,7 +89,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     config = METHODS[args.method].config
     _check_flags(args, overrides, config is not None)
     if config is not None:
-        seed = [] if args.method != "ensemble" or args.seed is None else ["--seed", str(args.seed)]
+        seed = ["--seed", str(args.seed)] if args.method == "ensemble" and args.seed is not None else []
         config = settings.load(type(config), args.config or {}, [*overrides, *seed])
     changes = {"weights": args.weights, "scenario": args.scenario}
     changes = {name: value for name, value in changes.items() if value is not None}

@@ -15,7 +15,7 @@ from drivax.studies.demo import DemoConfig, run_demo
 
 @dataclass(frozen=True)
 class Demo(DemoConfig):
-    """Generate scenarios, train a policy, evaluate it and three reference planners, and write the report.
+    """Generate scenarios, train a policy, evaluate it and four reference planners, and write the report.
 
     Takes a few minutes on two CPU cores; needs no data.
 

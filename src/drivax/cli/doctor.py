@@ -110,13 +110,8 @@ def _is_installed(module: str) -> bool:
 def devices(timeout_s: float = 60.0) -> str:
     """Return the devices of JAX, or its error."""
     try:
-        result = subprocess.run(
-            [sys.executable, "-c", _LIST_DEVICES],
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-        )
+        command = [sys.executable, "-c", _LIST_DEVICES]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])
             return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)
@@ -164,12 +159,13 @@ def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
     description = part.description
     version = "" if description.version is None else f", version {description.version}"
     yield "data set", f"{description.dataset}: {description.flavour}{version}"
-    files_text = count_text(part.sample_size if part.whole else files, "file")
-    sample_text = "" if part.whole else f" ({part.sample_size:,} of them inspected)"
-    recordings = (
-        "" if description.recordings is None else f", {count_text(description.recordings, 'recording')}"
-    )
-    yield "format", f"{part.format}: {files_text}{sample_text}{recordings}{'' if part.whole else ' in those'}"
+    contents = count_text(part.sample_size if part.whole else files, "file")
+    if not part.whole:
+        contents += f" ({part.sample_size:,} of them inspected)"
+    if description.recordings is not None:
+        contents += f", {count_text(description.recordings, 'recording')}"
+        contents += "" if part.whole else " in those"
+    yield "format", f"{part.format}: {contents}"
     yield from (("note", note) for note in description.notes)
     yield from (("missing", name) for name in description.missing)
 

@@ -113,23 +113,28 @@ def _validation(name: str) -> ScenarioSet | Literal["held_out"] | None:
 
 def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
     """Return the training set, weighted if scores or an arm are given."""
-    data, weighting = ScenarioSet.open(args.data), args.weighting
-    if args.arm is None:
-        if args.scores is None:
-            if weighting != WeightConfig():
-                raise UsageError("--weighting without scores to weight", cure="pass --scores or --arm")
-            if args.scale is not None:
-                raise UsageError("--scale without scores to weight", cure="pass --scores")
-            return data
+    data = ScenarioSet.open(args.data)
+    if args.arm is not None:
+        return _arm_data(args, args.arm, config, data)
+    if args.scores is not None:
         table = read_scores(args.scores, data)
         usable = usable_steps(config, data, args.trust_code)
-        return WeightedSet(data, sampling_weights(table, weighting, args.scale or "step", usable))
+        return WeightedSet(data, sampling_weights(table, args.weighting, args.scale or "step", usable))
+    if args.weighting != WeightConfig():
+        raise UsageError("--weighting without scores to weight", cure="pass --scores or --arm")
+    if args.scale is not None:
+        raise UsageError("--scale without scores to weight", cure="pass --scores")
+    return data
+
+
+def _arm_data(args: Train, name: str, config: TrainConfig, data: ScenarioSet) -> WeightedSet:
+    """Return the training set with the weights of an arm of the long-tail study."""
     from drivax.studies.definition import load_study
 
-    arm = load_study("longtail").arms[args.arm]
+    arm = load_study("longtail").arms[name]
     _check_arm(args, arm, config)
-    tables = partial(_table, args, data)
-    return arm.weigh(data, tables, weighting, usable_steps(config, data, args.trust_code), config.seed)
+    usable = usable_steps(config, data, args.trust_code)
+    return arm.weigh(data, partial(_table, args, data), args.weighting, usable, config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:

@@ -54,12 +54,7 @@ def run(args: View) -> int:
         scenarios = select(data, args.limit, ids)
         row_of = {scenario_id: row for row, scenario_id in enumerate(table.scenario_ids)}
         details = [criticality_html(table, row_of[scenario.id]) for scenario in scenarios]
-    path = write_player(
-        scenarios,
-        args.out or folder.with_name(f"{folder.name}.html"),
-        args.overwrite,
-        title=folder.name,
-        details=details,
-    )
+    out = args.out or folder.with_name(f"{folder.name}.html")
+    path = write_player(scenarios, out, args.overwrite, title=folder.name, details=details)
     show(f"{path} ({len(scenarios)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
     return 0

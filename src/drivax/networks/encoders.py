@@ -65,7 +65,7 @@ class MlpConfig:
     Attributes:
         rows: Layers shared by the rows of each masked group, before a maximum over rows; empty: rows are flattened.
         flat: Masked groups whose rows are flattened in any case, because their order counts, as that of route points.
-        hidden: Width of each following layer; the last is the size of the embedding.
+        hidden: Width of each following layer; the last is the size of the embedding. Empty: no layers.
         activation: Activation after each layer.
     """
 
@@ -102,7 +102,7 @@ class MlpEncoder(nnx.Module):
                 width += math.prod(spec[name]) + (0 if mask_shape is None else math.prod(mask_shape))
         self.shared = nnx.Dict(shared)
         self.layers = dense_layers(width, config.hidden, rngs)
-        self.width = config.hidden[-1]
+        self.width = config.hidden[-1] if config.hidden else width
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch."""
@@ -204,7 +204,7 @@ def _dense_and_max_forward(
 def _dense_and_max_backward(
     activation: Activation, residuals: Any, gradient: Array
 ) -> tuple[Any, Array, None]:
-    """Differentiate all rows as one matrix: XLA's gathers and scatters are slower on CPUs than the zeros."""
+    """Differentiate all rows as one matrix: on CPUs, XLA's gathers and scatters are slower than its zeros."""
     layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
     (gradient,) = vjp(jnp.where(is_positive, gradient, 0.0))
     is_largest = (products == largest[:, None]) & valid[..., None]

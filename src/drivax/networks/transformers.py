@@ -133,9 +133,8 @@ class WayformerConfig(LatentConfig):
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
         layers = self.sizes.layers
-        group_layers, joint_layers = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[
-            self.fusion
-        ]
+        depths = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}
+        group_layers, joint_layers = depths[self.fusion]
         fusion = Fusion(group_layers, joint_layers, every_layer=False, factorised=self.factorised)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 

@@ -53,9 +53,8 @@ def as_planner(candidate: Any, name: str) -> Planner:
     Raises:
         UsageError: ``candidate`` is not a planner and does not make one; the message uses ``name``.
     """
-    if not isinstance(candidate, type) and (is_nuplan(candidate) or isinstance(candidate, Planner)):
-        return _adapt(candidate, name)
-    if callable(candidate):
+    is_planner = not isinstance(candidate, type) and (is_nuplan(candidate) or isinstance(candidate, Planner))
+    if callable(candidate) and not is_planner:
         try:
             check_arguments(candidate, name, ())
         except ValueError as error:
@@ -64,7 +63,7 @@ def as_planner(candidate: Any, name: str) -> Planner:
                 cure = f"name a function that makes {name} without arguments"
             raise UsageError(str(error), cure=cure) from None
         if not is_nuplan(candidate) and (is_nuplan(result_class(candidate)) or makes(candidate, Planner)):
-            return _adapt(candidate(), name)
+            candidate = candidate()
     return _adapt(candidate, name)
 
 

@@ -25,8 +25,8 @@ from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traff
 from drivax.tasks.actions import Route
 from drivax.tasks.task import Task
 
-#: Vehicles that travel less than this in the rest of the log are not driven, m.
-_TRAVELS_M = 2.0
+#: Only vehicles that travel more than this in the rest of the log are driven, m.
+_MIN_TRAVEL_M = 2.0
 
 
 @record
@@ -47,7 +47,7 @@ class PlannerTrafficState:
     Attributes:
         begin: First step of the episode; until then all agents moved as logged.
         contexts: One context per agent; a slot equal to the number of agents is empty.
-        carry: Carry of their planners, with the decisions that they hold (``Task.hold``); empty if for a single step.
+        carry: Carry of their planners, with the decisions that they hold; empty if ``Task.hold`` is 1.
         base: State of the traffic around them.
     """
 
@@ -61,10 +61,10 @@ class PlannerTrafficState:
 class PlannerTraffic:
     """Traffic whose vehicles nearest to ego are driven by the planner of :func:`with_driver`, others by ``base``.
 
-    It drives vehicles that the log has when the episode starts and that travel more than 2 m in the rest of it. They
+    It drives vehicles that are logged at the start of the episode and travel more than 2 m in the rest of the log. They
     see all agents, hold each decision for ``task.hold`` steps, and follow the task's dynamics to the end of the
-    episode. Further egos of the set have a route, others have none: train a policy for those to follow lanes. In the
-    action space ``route`` only egos with a route on lanes are driven.
+    episode. Only further egos of the set have a route: for other vehicles, use a policy that can follow lanes without
+    one. In the action space ``route``, only egos with a route on lanes are driven.
 
     Attributes:
         task: Observation and action space of the planner.
@@ -155,7 +155,7 @@ class PlannerTraffic:
         xy, valid = rows[..., AgentColumn.XY], rows[..., AgentColumn.VALID] > 0
         squared_travel = ((xy - xy[step]) ** 2).sum(axis=-1)
         is_later = valid & (jnp.arange(bank.steps) > step)[:, None]
-        travels = (is_later & (squared_travel > _TRAVELS_M**2)).any(axis=0)
+        travels = (is_later & (squared_travel > _MIN_TRAVEL_M**2)).any(axis=0)
         is_vehicle = bank.agent_box[index, :count, SizeColumn.KIND] == int(AgentKind.VEHICLE)
         # Slot 0 is ego.
         is_eligible = valid[step] & (jnp.arange(count) > 0) & travels & is_vehicle

@@ -1,4 +1,4 @@
-"""Reference planners: the expert (replayed or driven), constant velocity, random actions, and IDM along the route."""
+"""Reference planners: the expert, constant velocity, constant speed, random actions, and IDM along the route."""
 
 from __future__ import annotations
 

@@ -234,16 +234,15 @@ def bins(values: Values, maximum: int = BINS) -> Values:
     start = min(low, 0.0) if low < 0.5 * high else low
     edges = ticks(start, high, maximum - 1)
     width = edges[1] - edges[0]
-    if integers and width < 1.0:
-        return np.arange(math.floor(low), math.ceil(high) + 1.5)
     return np.append(edges, edges[-1] + width) if edges[-1] <= high else np.array(edges)
 
 
 def short(value: Any) -> str:
     """Return a number with about three figures."""
     value = float(value)
-    digits = 0 if abs(value) >= 100 or value == round(value) else 1 if abs(value) >= 10 else 2
-    return f"{value:,.{digits}f}"
+    if abs(value) >= 100 or value == round(value):
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
 def _shares(values: Values, edges: Values) -> Values:
@@ -312,9 +311,9 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
 
     The path has position [m], heading [rad] and speed [m/s], NaN where the agent is absent. Filters are nuPlan's
     Savitzky-Golay windows and orders: 8/2 for accelerations, 15/2 for the jerk of the filtered acceleration, 5/2 for
-    the yaw rate (``metrics.comfort``). Curvature is yaw rate over speed. Steps near the ends take values of the first
-    or last window's polynomial. Values are NaN outside the last contiguous stretch of the path and at its first step;
-    except for speed, all are NaN if it has fewer than 16 steps.
+    the yaw rate (``metrics.comfort``). Curvature is yaw rate over speed, NaN below 0.5 m/s. Steps near the ends take
+    values of the first or last window's polynomial. Except for speed, values are NaN outside the last contiguous
+    stretch of the path, at its first step, and everywhere if it has fewer than 16 steps.
     """
     present = np.asarray(np.isfinite(ego).all(axis=1))
     values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}

@@ -59,7 +59,8 @@ class Inspection:
         if not rows:
             text = " and ".join(condition.text for condition in selection.filters)
             missing = ", ".join(f"{count:,} lack the value of {name!r}" for name, count in unknown.items())
-            problem = f"none of {len(scenarios):,} scenarios has {text}{f' ({missing})' if missing else ''}"
+            suffix = f" ({missing})" if missing else ""
+            problem = f"none of {len(scenarios):,} scenarios has {text}{suffix}"
             cure = "list the values with drivax inspect without --filter"
             raise DataError(problem, file=path, cure=cure)
         return cls(path.resolve().name, scenarios, rows, unknown, check)

@@ -84,9 +84,9 @@ def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
 
 def _unique_name(name: str, folder: Path, names: set[str]) -> str:
     """Return a name that is not yet in ``names``, and add it."""
-    candidate, number = name, 2
+    candidate, number = name, 1
     while candidate in names:
-        candidate = f"{name} ({folder.name})" if number == 2 else f"{name} ({folder.name} {number - 1})"
+        candidate = f"{name} ({folder.name})" if number == 1 else f"{name} ({folder.name} {number})"
         number += 1
     names.add(candidate)
     return candidate

@@ -66,7 +66,7 @@ def n_step_returns(
     reward_t: Float[Array, "time *batch"], terminated_t: Bool[Array, "time *batch"],
     follows_t: Bool[Array, "time *batch"], gamma: float, hold: int = 1,
 ) -> NStepReturns:  # fmt: skip
-    """``sum_k gamma^k r_{t+k}`` over the leading steps of which all ``follows_t`` hold (Sutton 1988).
+    """Return ``sum_k gamma^k r_{t+k}`` over the steps before the first false ``follows_t`` (Sutton 1988).
 
     ``hold`` steps of time make one decision; their rewards share a discount. Nothing corrects for the later actions,
     which another policy may have chosen.
@@ -139,8 +139,8 @@ def log_mass(
     """``tau log int exp(Q(s, a) / tau) da``, a soft maximum over all actions, from K sampled ones.
 
     By importance sampling: ``tau log 1/K sum_k exp(Q(s, a_k) / tau) / p(a_k)`` (Kumar et al. 2020, arXiv 2006.04779,
-    appendix F). ``log_density`` is that of the distribution that each action was drawn from; zeros give the mean of
-    ``exp(Q / tau)``. A ``temperature`` near 0 gives the maximum.
+    appendix F). ``log_density`` is that of the distribution that each action was drawn from; zeros weigh all
+    actions equally. A ``temperature`` near 0 gives the maximum.
     """
     return temperature * (jax.nn.logsumexp(q / temperature - log_density, axis=0) - jnp.log(len(q)))
 

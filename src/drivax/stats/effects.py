@@ -98,14 +98,14 @@ def scenarios_needed(
 ) -> int:
     """Return the smallest number of independent scenarios that detects an effect with power ``target``.
 
-    It counts pairs, or the scenarios of both arms. Clustered scenarios need ``deff`` times as many. Arguments are
-    those of :func:`power`.
+    It counts pairs, or the scenarios of both arms, up to about 1e12. Clustered scenarios need ``deff`` times as many.
+    Arguments are those of :func:`power`.
     """
     if effect == 0 or not 0 < target < 1:
         problem = f"no number of scenarios detects an effect of {effect} with power {target}"
         raise UsageError(problem, cure="give an effect, and a power between 0 and 1")
     low, high = 1, 2
-    while not power(effect, high, confidence, share) >= target and high < _MAX_SCENARIOS:
+    while power(effect, high, confidence, share) < target and high < _MAX_SCENARIOS:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2

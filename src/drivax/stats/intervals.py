@@ -103,7 +103,7 @@ def per_event(events: int, exposure: float, confidence: float = 0.95) -> Interva
     """Return the exposure per event, such as kilometres per collision, with the exact interval of a Poisson process.
 
     The rate lies between the quantiles of gamma distributions of ``events`` and ``events + 1`` (Garwood, Biometrika
-    28, 1936). Without events only the lower bound is known.
+    28, 1936). ``n`` counts events; without events only the lower bound is known.
     """
     if events < 0 or not exposure > 0.0:
         raise UsageError(f"{events} events in {exposure} of exposure", cure="use positive exposure")
@@ -144,10 +144,10 @@ def split_bootstrap(
     values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, confidence: float = 0.95,
     resamples: int = RESAMPLES, *, strata: Any = None, seed: int,
 ) -> Interval:  # fmt: skip
-    """Return the percentile bootstrap interval of ``mean(first arm) - mean(second arm)``; the arms share no cluster.
+    """Return the percentile bootstrap interval of ``mean(first arm) - mean(second arm)``.
 
-    The arms are resampled separately, as in :func:`bootstrap_mean` (Efron and Tibshirani 1993, section 8.3). ``first``
-    masks the episodes of the first arm.
+    The arms, which must not share a cluster, are resampled separately, as in :func:`bootstrap_mean` (Efron and
+    Tibshirani 1993, section 8.3). ``first`` masks the episodes of the first arm.
     """
     check_draws(confidence, resamples)
     x = as_values(values)
@@ -161,12 +161,13 @@ def split_bootstrap(
             return UNDEFINED
         arm_strata = None if stratum_labels is None else cluster_strata(stratum_labels[included], labels)
         arms.append((arm_values, labels, arm_strata))
-    difference = float(arms[0][0].mean() - arms[1][0].mean())
-    n = sum(arm_values.size for arm_values, _, _ in arms)
-    if min(labels.max() for _, labels, _ in arms) == 0:
+    (a, a_labels, a_strata), (b, b_labels, b_strata) = arms
+    difference, n = float(a.mean() - b.mean()), a.size + b.size
+    if a_labels.max() == 0 or b_labels.max() == 0:
         return Interval(difference, None, None, n)
-    first_means, second_means = (_resample_means(x, labels, h, resamples, rng) for x, labels, h in arms)
-    return Interval(difference, *percentiles(first_means - second_means, confidence), n)
+    differences = _resample_means(a, a_labels, a_strata, resamples, rng)
+    differences -= _resample_means(b, b_labels, b_strata, resamples, rng)
+    return Interval(difference, *percentiles(differences, confidence), n)
 
 
 def paired_bootstrap(

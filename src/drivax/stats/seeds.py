@@ -139,7 +139,7 @@ class CrossedEffect:
         def detects(number: int) -> bool:
             return abs(self.difference) >= extrapolate(number).detectable(power, confidence)
 
-        # Detection is not monotonic: with more seeds, the degrees of freedom approach those of the clusters.
+        # Detection is not monotonic: as one number grows, the degrees of freedom approach those of the other.
         candidates = np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)
         numbers = np.unique(np.round(candidates)).astype(int).tolist()
         first = next((index for index, number in enumerate(numbers) if detects(number)), None)
@@ -174,15 +174,16 @@ def seeds_interval(
 ) -> Interval:  # fmt: skip
     """Return the mean of one policy with the interval of :func:`crossed_mean`.
 
-    The interval has no bounds with fewer than two clusters. That of a ``share`` lies within 0 and 1. If all values are
-    0, or all are 1, it is Wilson's interval with one trial per cluster (with weights, their effective sample size,
+    The interval has no bounds with fewer than two clusters. That of a ``share`` lies within 0 and 1; if all its values
+    are 0, or all are 1, it is Wilson's interval with one trial per cluster (with weights, their effective sample size,
     Kish 1965).
     """
     weight, keep = _weights_and_mask(values, values, weights)
     n = int(keep.sum())
     labels = dense_labels(clusters, values.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
-        return Interval(float(values[:, keep].mean()) if n else None, None, None, n)
+        mean = float(np.average(values[:, keep].mean(axis=0), weights=weight[keep])) if n else None
+        return Interval(mean, None, None, n)
     effect = crossed_mean(values, labels, weights)
     low, high = effect.interval(confidence)
     distinct = np.unique(values[:, keep])
@@ -212,19 +213,18 @@ def crossed_difference(
         cure = "train two seeds or more of each, and evaluate on two recordings or more"
         raise UsageError("too few seeds or recordings to estimate a variance", cure=cure)
     share, cluster_count = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
-    correction, policies = cluster_count / (cluster_count - 1), (a[:, keep], b[:, keep])
-    difference = policies[0].mean(axis=0) - policies[1].mean(axis=0)
+    correction, a, b = cluster_count / (cluster_count - 1), a[:, keep], b[:, keep]
+    difference = a.mean(axis=0) - b.mean(axis=0)
     # Remove the rounding errors of sums.
-    rounding = ROUNDING * max(float(np.abs(policy).max()) for policy in policies)
+    rounding = ROUNDING * max(float(np.abs(a).max()), float(np.abs(b).max()))
     difference = np.where(np.abs(difference) <= rounding, 0.0, difference)
     mean = float(difference @ share)
     totals = np.bincount(labels, share * (difference - mean), cluster_count)
     scenarios = correction * float(np.square(totals).sum())
-    (seeds_a, e_a), (seeds_b, e_b) = (
-        _seed_variances(policy, share, labels, correction) for policy in policies
-    )
-    counts = len(a), len(b)
-    return CrossedEffect(mean, (seeds_a, seeds_b), scenarios, counts, cluster_count, (e_a, e_b))
+    seeds_a, interaction_a = _seed_variances(a, share, labels, correction)
+    seeds_b, interaction_b = _seed_variances(b, share, labels, correction)
+    seeds, interaction = (seeds_a, seeds_b), (interaction_a, interaction_b)
+    return CrossedEffect(mean, seeds, scenarios, (len(a), len(b)), cluster_count, interaction)
 
 
 def _seed_variances(policy: Values, share: Weights, labels: Labels, correction: float) -> tuple[float, float]:
@@ -256,7 +256,7 @@ def difference_interval(
 def log_ratio(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
-    """Return ``ln(mean(a) / mean(b))`` of non-negative values, with its error (delta method); None if a mean is 0."""
+    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means are positive."""
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None

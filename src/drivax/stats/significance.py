@@ -36,8 +36,9 @@ class SignificanceResult:
 
     Attributes:
         name: Name of the test.
-        p: Two-sided p-value; None if no value is defined.
-        units: Number of exchangeable units: discordant pairs, or clusters whose values differ.
+        p: Two-sided p-value; None if no value is defined, an arm is empty, or the bootstrap has only one cluster.
+        units: Number of units: discordant pairs (McNemar), clusters with a difference (permutation of pairs), or
+            clusters (others).
         exact: Whether the p-value is exact (closed form, or all permutations) rather than sampled.
     """
 
@@ -52,8 +53,8 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
 
     Under the null hypothesis, either planner is equally likely to fail alone in each of the ``n`` discordant pairs:
     ``p = 2 P(X <= k)``, at most 1, where ``X ~ Binomial(n, 1/2)`` and ``k`` is the smaller of the two counts (McNemar,
-    Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and nearly always keeps its level
-    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
+    Psychometrika 12, 1947). The mid-p value, ``2 P(X <= k) - P(X = k)``, is less conservative and nearly always keeps
+    its level (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013). Both are 1 for equal counts.
     """
     for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
@@ -77,9 +78,9 @@ def paired_permutation(
 
     If the planners are interchangeable, the difference of each cluster has either sign with equal probability (Fisher,
     The Design of Experiments, 1935, section 21; Good, Permutation, Parametric and Bootstrap Tests, 2005, section 3.2).
-    Up to ``resamples`` sign patterns are enumerated (``2^C`` of ``C`` clusters). Otherwise ``resamples`` random
-    patterns are drawn, and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol.
-    Biol. 9, 2010). For 0/1 values in clusters of size one this is McNemar's exact test.
+    All ``2^C`` sign patterns of ``C`` clusters with a difference are enumerated if there are at most ``resamples``; for
+    0/1 values in clusters of size one, this is McNemar's exact test. Otherwise ``resamples`` random patterns are drawn,
+    and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010).
     """
     check_draws(0.95, resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
@@ -126,7 +127,7 @@ def paired_bootstrap_test(
     for count in chunk_sizes(resamples, sums.size):
         draws = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
         means, errors = _mean_and_error(draws @ moments, sums.size)
-        # A resample without variance supports the null hypothesis, unless its mean is the observed one.
+        # |t*| >= |t|, multiplied by se*: a resample without variance counts as extreme.
         deviations = np.abs(means - mean)
         extreme += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
     return SignificanceResult("bootstrap", (1 + extreme) / (1 + resamples), sums.size, exact=False)
@@ -146,10 +147,10 @@ def split_permutation(
     values: Any, first: Bool[np.ndarray, " n"], clusters: Any = None, strata: Any = None,
     resamples: int = RESAMPLES, *, seed: int,
 ) -> SignificanceResult:  # fmt: skip
-    """Apply a permutation test to the means of two arms, reassigning whole clusters within strata of fixed arm sizes.
+    """Apply a permutation test to the means of two arms, permuting the arms of whole clusters within strata.
 
-    Under the null hypothesis all assignments are equally likely, and the test is exact (Fisher 1935; Good 2005,
-    section 3.3). ``first`` masks the scenarios of the first arm.
+    Under the null hypothesis all assignments are equally likely, and the test keeps its level (Fisher 1935; Good 2005,
+    section 3.3). Random assignments are drawn. ``first`` masks the scenarios of the first arm.
 
     Raises:
         UsageError: A cluster is in both arms or in two strata.

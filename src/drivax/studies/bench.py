@@ -186,17 +186,17 @@ def compile_program(bank: ScenarioBank, config: BenchConfig) -> Program:
 
 
 def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
-    """Return the environment steps per second of each program: medians of alternating runs."""
-    times: list[list[float]] = [[] for _ in programs]
-    for repeat in range(repeats + 1):
-        for program, seconds in zip(programs, times, strict=True):
-            start = time.perf_counter()
-            jax.block_until_ready(program.run())
-            if repeat:
-                seconds.append(time.perf_counter() - start)
-    return [
-        program.steps / statistics.median(seconds) for program, seconds in zip(programs, times, strict=True)
-    ]
+    """Return the environment steps per second of each program: medians of alternating runs, after one that warms up."""
+    rounds_s = [[_seconds(program.run) for program in programs] for _ in range(repeats + 1)]
+    medians_s = map(statistics.median, zip(*rounds_s[1:], strict=True))
+    return [program.steps / median_s for program, median_s in zip(programs, medians_s, strict=True)]
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    """Return the duration of a call that computes JAX arrays."""
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start
 
 
 def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
@@ -411,10 +411,5 @@ def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
 
 def _median_seconds(call: Callable[[], Any], repeats: int) -> float:
     """Return the median duration of a call in seconds, after one call that warms up."""
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    _seconds(call)
+    return statistics.median(_seconds(call) for _ in range(repeats))

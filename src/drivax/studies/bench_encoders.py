@@ -1,4 +1,4 @@
-"""Size and speed of encoders: parameters, time of a forward and of a backward pass per observation."""
+"""Size and speed of encoders: parameters, and time of forward and backward passes per observation."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class EncoderBench:
         for name in self.only:
             if name not in ENCODERS and name not in VARIANTS:
                 raise UsageError(f"unknown encoder {name!r}", cure=did_you_mean(name, [*ENCODERS, *VARIANTS]))
-        if not self.batches or min(*self.batches, self.repeats, 1) < 1:
+        if not self.batches or min(*self.batches, self.repeats) < 1:
             raise UsageError(
                 f"invalid batches {self.batches} or repeats {self.repeats}",
                 cure="use at least one batch size, and numbers of 1 or more",
@@ -136,7 +136,7 @@ def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
 
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
-    """Return the times of the forward pass by batch size, and of the backward pass, microseconds per observation."""
+    """Return the times of a forward pass by batch size, and of a forward and backward pass, in µs per observation."""
     graph, shapes = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
     # Times do not depend on the values of parameters.
     rng = np.random.default_rng(0)

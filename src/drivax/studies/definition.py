@@ -171,12 +171,12 @@ class StudyConfig:
         seeds: Number of training runs of each arm.
         total_steps: Number of logged steps to draw in each training; null for that of the preset.
         training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``.
-        validations: Number of closed-loop validations; the test evaluates the best checkpoint.
+        validations: Approximate number of closed-loop validations; the test evaluates the best checkpoint.
         weights: Settings of the sampling weights, the same for all methods.
         ensemble: The ensemble.
         progress: Minimum share of the expert's progress on the validation set, for every seed of a baseline.
-        flat: Maximum change of a baseline's score from the third to the last quarter of its validations, mean over
-            seeds.
+        flat: Maximum absolute change of a baseline's score from the third to the last quarter of its validations,
+            mean over seeds.
         rare: Share of test scenarios that count as rare by the kinematic heuristic, if there are no labels.
     """
 
@@ -278,7 +278,7 @@ class Study:
         return self.folder / "runs" / arm / f"seed-{seed}"
 
     def evaluation(self, name: str, seed: int | None = None) -> Path:
-        """Return the evaluation of an arm with one seed, or of a planner."""
+        """Return the evaluation folder of an arm with one seed, or of a planner."""
         folder = self.folder / "drives" / name
         return folder if seed is None else folder / f"seed-{seed}"
 

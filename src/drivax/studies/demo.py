@@ -24,6 +24,7 @@ from drivax.report.pages.report import write_report
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
+from drivax.table import MISSING
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import describe_run
@@ -78,11 +79,10 @@ class Demo:
         lines = [format_summary(self.summaries), ""]
         for planner, metrics in self.differences.items():
             for name, difference in metrics.items():
-                low, high = difference["low"], difference["high"]
-                lines.append(
-                    f"policy - {planner}: {name} {difference['mean']:+.3f} [{low:+.3f}, {high:+.3f}] "
-                    f"over {difference['n']} scenarios"
-                )
+                numbers = (difference[key] for key in ("mean", "low", "high"))
+                mean, low, high = (MISSING if number is None else f"{number:+.3f}" for number in numbers)
+                count = f"over {difference['n']} scenarios"
+                lines.append(f"policy - {planner}: {name} {mean} [{low}, {high}] {count}")
         lines += ["", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.stages_s.items())]
         return "\n".join(lines)
 
@@ -119,7 +119,7 @@ def run_demo(
         overwrite: Replace the output of an earlier demo in ``out``.
 
     Raises:
-        UsageError: ``out`` exists and ``overwrite`` is not given.
+        UsageError: ``out`` is not empty, and ``overwrite`` is false.
     """
     config = config or DemoConfig()
     if out.exists() and any(out.iterdir()) and not overwrite:

@@ -16,7 +16,7 @@ from drivax.metrics.catalogue import METRICS
 from drivax.report.charts import histogram
 from drivax.report.pages.page import page
 from drivax.studies.definition import Stratum, StudyDefinition
-from drivax.studies.verdicts import RELATED, UNRELATED
+from drivax.studies.verdicts import RELATED, UNRELATED, best_validation
 from drivax.table import Cell, Column, Table
 
 _STRATA: Mapping[Stratum, str] = {
@@ -254,7 +254,7 @@ def _rankings(results: Results) -> str:
 
 def _rule_cost(results: Results, rule: str) -> str:
     seeds = results["validations"]
-    agreements = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
+    agreements = sum(int(np.argmax(seed["rule"])) == best_validation(seed["score"]) for seed in seeds)
     return (
         f"{rule_cost_table(results, rule).html()}<p><small>Test results of the baseline's checkpoints with the highest "
         f"{escape(rule)} on held-out steps, minus those of the checkpoints with the best validation score, paired by "

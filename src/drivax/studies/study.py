@@ -64,7 +64,7 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A training run of a study, with a mask of the logged steps to draw from; ``edited``: edited files are used."""
+    """A training run of a study, with a mask of the logged steps to draw from; ``edited`` allows edited files."""
 
     study: Study
     arm: str
@@ -98,8 +98,8 @@ def run_study(
         The contents of ``results.json``.
 
     Raises:
-        UsageError: The baselines do not drive well enough, or the folder holds another study or runs with other
-            settings.
+        UsageError: The baselines do not drive well enough, events are not labelled where arms or strata need them, or
+            the folder holds another study, runs with other settings, or evaluations of other runs.
     """
     _open_folder(study)
     tables = _score(study, log)
@@ -174,16 +174,21 @@ def _open_folder(study: Study) -> None:
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
-    if not study.folder.exists() or not any(study.folder.iterdir()):
-        other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
-        if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
-            raise UsageError(
-                "has no labelled events, which the oracle and its control need",
-                file=sets.train,
-                cure=f"pass --arms [{','.join(other_arms)}]",
-            )
-        RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
+    if study.folder.exists() and any(study.folder.iterdir()):
+        _check_folder(study, data, definition)
         return
+    other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
+    if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
+        raise UsageError(
+            "has no labelled events, which the oracle and its control need",
+            file=sets.train,
+            cure=f"pass --arms [{','.join(other_arms)}]",
+        )
+    RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
+
+
+def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) -> None:
+    """Check that a folder contains this study of these sets; ``definition`` is the hash of arms and claims."""
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
     config = folder.config(StudyConfig, trust=settings.modules_of(study.config))
@@ -362,7 +367,7 @@ def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
 
 
 def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
-    """Return ``score``, ``progress`` and, if logged, ``rule`` (``checkpoints_by``) at each seed's validations."""
+    """Return ``score``, ``progress`` and the logged ``rule`` (``checkpoints_by``) at each seed's validations."""
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
         run = RunFolder(study.run(arm, seed), {})
@@ -394,7 +399,7 @@ def _results(
     study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
     usable: Bool[np.ndarray, "N T"],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the contents of ``results.json``, except the conditions and the detectable differences."""
+    """Return the contents of ``results.json``, except ``conditions``, ``detectable`` and ``edited``."""
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
     episodes = {}
     for name in definition.planners:

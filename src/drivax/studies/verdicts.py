@@ -91,18 +91,14 @@ class Condition:
 
     @classmethod
     def of(
-        cls,
-        arm: str,
-        curves: Sequence[Mapping[str, Sequence[float]]],
-        min_progress: float,
-        max_change: float,
+        cls, arm: str, curves: Sequence[Mapping[str, Sequence[float]]], min_progress: float, max_change: float
     ) -> Condition:
         """Return the condition of an arm from ``score`` and ``progress`` at the validations of every seed."""
         progress, changes = [], []
         for curve in curves:
             scores = np.asarray(curve["score"])
             quarter = max(len(scores) // 4, 1)
-            progress.append(curve["progress"][int(scores.argmax())])
+            progress.append(curve["progress"][best_validation(scores)])
             changes.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
         mean_change, absolute_change = float(np.mean(changes)), float(np.abs(changes).mean())
         met = bool(min(progress) >= min_progress and absolute_change <= max_change)
@@ -113,6 +109,11 @@ class Condition:
             f"{self.arm}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score changes by "
             f"{self.change:+.3f} (absolute {self.moved:.3f}): {'good enough' if self.met else 'NOT good enough'}"
         )
+
+
+def best_validation(scores: Sequence[float] | Float[np.ndarray, " validation"]) -> int:
+    """Return the index of the highest score, the latest if several are equal: that of the best checkpoint."""
+    return len(scores) - 1 - int(np.argmax(scores[::-1]))
 
 
 @dataclass(frozen=True)
@@ -188,11 +189,10 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
 def _decide(result: ClaimResult, claims: int) -> ClaimResult:
     """Return the result with its verdict; ``claims`` claims are adjusted together."""
     if result.effect is None or result.adjusted_p is None:
-        has_difference = result.difference is not None
-        reason = (
-            "the mean of an arm is 0: no ratio" if has_difference else "fewer than two recordings define it"
-        )
-        return replace(result, needed=reason)
+        needed = "fewer than two recordings define it"
+        if result.difference is not None:
+            needed = "the mean of an arm is 0: no ratio"
+        return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
         return replace(result, needed=describe_sample_size(result.effect, claims))
     lower_is_better = METRICS[result.claim.metric].better == "low"

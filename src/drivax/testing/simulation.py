@@ -43,7 +43,7 @@ from drivax.testing.worlds import ANGLE
 
 #: Start steps of the planner.
 _STARTS = (12, 20, 28, 36, 45, 52, 60, 70)
-#: Start step with a changed log after the next step.
+#: Start step of the check that changes the log after the second action.
 _CHANGE_START = 45
 #: Start step and number of steps of a traffic model.
 _START, _STEPS = 20, 12
@@ -217,9 +217,10 @@ def _check_rows(what: str, rollout: _Rollout) -> None:
     valid = rows[..., AgentColumn.VALID]
     expect(np.isin(valid, (0.0, 1.0)).all(), f"{what} has fractional valid", "let valid be 0 or 1")
     present = valid > 0
-    length = np.hypot(rows[..., 3], rows[..., 4])
-    is_unit = np.allclose(length[present], 1.0, atol=1e-3)
-    problem = f"{what} has directions of length {length[present].min():.3g} to {length[present].max():.3g}"
+    lengths = np.hypot(rows[..., AgentColumn.COS], rows[..., AgentColumn.SIN])[present]
+    low, high = lengths.min(initial=np.inf), lengths.max(initial=0.0)
+    problem = f"{what} has directions of length {low:.3g} to {high:.3g}"
+    is_unit = np.allclose(lengths, 1.0, atol=1e-3)
     expect(is_unit, problem, "columns 3 and 4 are cosine and sine of the heading")
     is_unchanged = (past_rows[..., AgentColumn.VALID] == valid).all()
     is_unchanged = is_unchanged and np.allclose(past_rows[present], rows[present], rtol=TOLERANCE, atol=1e-2)

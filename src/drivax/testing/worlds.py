@@ -97,8 +97,8 @@ def _moments(bank: ScenarioBank) -> Moments:
     offset = jnp.asarray(_OFFSETS)[changes.ravel()]
     # Measure the previous and the current step in one program.
     measure_all = jax.vmap(partial(_measure_offset, bank))
-    both = measure_all(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(offset, (2, 1)))
-    before, now = (jax.tree.map(lambda leaf, half=half: jnp.split(leaf, 2)[half], both) for half in (0, 1))
+    pairs = measure_all(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(offset, (2, 1)))
+    before, now = (jax.tree.map(lambda leaf, half=half: jnp.split(leaf, 2)[half], pairs) for half in (0, 1))
     return Moments(before.facts, now, step - 20)
 
 
@@ -162,7 +162,7 @@ def with_frame(moments: Moments, frame: Frame) -> Moments:
 
 
 def extremes(moments: Moments) -> Moments:
-    """Set all facts to zero: standstill, unknown speed limit, no route."""
+    """Set all facts to zero, and the speed limit to unknown."""
 
     def zero(facts: Facts) -> Facts:
         zeros = jax.tree.map(jnp.zeros_like, facts)

@@ -307,7 +307,7 @@ class MapApi(DevkitObject):
         return [layer for layer in SemanticMapLayer if self._objects(layer)]
 
     def get_all_map_objects(self, point: Any, layer: Any) -> list[Any]:
-        """Return the objects of a layer that contain a point, the nearest centre line first."""
+        """Return the objects of a layer that contain a point, the one whose border is farthest from it first."""
         distances = [(item.distance_m(point), item) for item in self._objects(layer)]
         inside = [pair for pair in distances if pair[0] <= 0.0]
         return [item for _, item in sorted(inside, key=lambda pair: pair[0])]

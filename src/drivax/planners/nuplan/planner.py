@@ -246,9 +246,9 @@ class View:
     ) -> nuplan.EgoState:
         """Return ego at a step, computed from its motions until then.
 
-        ``history`` holds the motions up to the step. ``actuators``, what they did in the last step, determine
-        acceleration and steering; if None or not finite, the motions do. With the ``last`` simulated state, speed and
-        steering determine the yaw rate, as in nuPlan's vehicle model.
+        ``history`` holds the motions up to the step. ``actuators`` (acceleration, steering angle and steering rate of
+        the last step) determine acceleration and steering; if None or not finite, the motions do. With the ``last``
+        simulated state, speed and steering determine the yaw rate, as in nuPlan's vehicle model.
         """
         now, before, earlier = (np.asarray(history[-k], np.float64) for k in (1, 2, 3))
         x, y, heading, speed = now.tolist()

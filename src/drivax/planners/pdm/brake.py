@@ -23,9 +23,11 @@ from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
-#: Number of agents considered, those nearest to the path within this radius, m.
+#: Number of agents to consider, those nearest to the path within this radius, m.
 _OTHERS, _RADIUS_M = 24, 50.0
-#: Factor on the speed of the poses that a controller brakes by.
+#: Stride of the forecast motions that form the path.
+_STRIDE = 5
+#: Factor on the speed of the plan that a controller brakes by.
 _OVERSHOOT = 1.1
 
 
@@ -51,18 +53,16 @@ class BrakeConfig:
 
 
 def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
-    """Whether to brake; ``fault_s`` is the time to an at-fault collision (infinite for none), ``speed`` in m/s."""
+    """Return whether to brake at a time to an at-fault collision (infinite for none) and a speed (m/s)."""
     # Times are multiples of a step in float32.
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 
 
 def braking(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConfig()) -> Scalar:
-    """Acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped."""
+    """Return the acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped."""
     (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
-    unclipped = jnp.where(
-        speed > config.slow_mps, -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
-    )
-    return jnp.clip(unclipped, config.least_mps2, config.most_mps2)
+    fast, slow = -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
+    return jnp.clip(jnp.where(speed > config.slow_mps, fast, slow), config.least_mps2, config.most_mps2)
 
 
 def stop(
@@ -71,24 +71,23 @@ def stop(
 ) -> Float[Array, " D"]:  # fmt: skip
     """Return the action that brakes straight ahead.
 
-    A controller gets poses at the constant speed ``1.1 (v + a)``, at low speed ``a``, as published: they may lead
-    backwards, so the car stops before them.
+    In the action space ``trajectory``, the plan has the constant speed ``1.1 (v + a)``, or ``a`` up to ``slow_mps``, as
+    published. The plan leads backwards if this is negative; the car, which cannot reverse, then stops.
     """
     if not isinstance(actions, Trajectory):
         return actions.action(motion, acceleration, jnp.zeros(()), length_m)
     speed, heading = motion[MOTION_SPEED], motion[MOTION_HEADING]
-    pace = jnp.where(speed > config.slow_mps, _OVERSHOOT * (speed + acceleration), acceleration)
-    ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros(())]) * pace * DT_S
-    return actions.plan(jnp.stack([motion[:3], motion[:3] + ahead]))
+    plan_speed = jnp.where(speed > config.slow_mps, _OVERSHOOT * (speed + acceleration), acceleration)
+    step = jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros(())]) * plan_speed * DT_S
+    return actions.plan(jnp.stack([motion[:3], motion[:3] + step]))
 
 
 @record
 class EmergencyBrake:
-    """Wrap a planner: brake if its action, held constant, leads to an at-fault collision.
+    """Wrap a planner: brake if its action leads to an at-fault collision.
 
-    Planned poses are taken as driven.
-
-    Other agents keep their velocities; agents that already touch ego are ignored.
+    The action is held constant; in the space ``trajectory``, ego follows the plan exactly. Other agents keep their
+    velocities; agents that already touch ego are ignored.
 
     Attributes:
         planner: The wrapped planner.
@@ -116,35 +115,33 @@ class EmergencyBrake:
     ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
         """Return the planner's action, or brake straight ahead."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
-        context, around = situation.context, situation.surroundings
-        motion, me = context.history[-1], around.frame.box[context.slot]
+        context, frame = situation.context, situation.surroundings.frame
+        motion, box = context.history[-1], frame.box[context.slot]
 
-        drive = self._forecast(motion, action, context.action, me[LENGTH])
-        touched = overlaps(around.frame, context.slot)
-        others = Forecast.of(around.frame, context.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
-        size = me[LENGTH : WIDTH + 1]
-        unlawful = jnp.broadcast_to(around.lanes.leaving_lane, drive.shape[:1])
-        fault_s = jnp.min(Contacts.along(drive, size, others).fault_times(unlawful))
+        path = self._forecast(motion, action, context.action, box[LENGTH])
+        is_touching = overlaps(frame, context.slot)
+        others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _OTHERS, _RADIUS_M)
+        is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
+        fault_s = jnp.min(Contacts.along(path, box[LENGTH : WIDTH + 1], others).fault_times(is_unlawful))
         speed = motion[MOTION_SPEED]
-        unclipped = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
-        brake = stop(self.actions, motion, unclipped, me[LENGTH], self.config)
-        chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
-        return chosen, carry
+        acceleration = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
+        brake_action = stop(self.actions, motion, acceleration, box[LENGTH], self.config)
+        return jnp.where(is_emergency(fault_s, speed, self.config), brake_action, action), carry
 
     def _forecast(
-        self, motion: Motion, action: Float[Array, " D"], last: Float[Array, " D"], length_m: Scalar
+        self, motion: Motion, action: Float[Array, " D"], last_action: Float[Array, " D"], length_m: Scalar
     ) -> Float[Array, "n 4"]:
-        """Motions from now on while the action is held, or along planned poses."""
+        """Return the motions from now on, with the action held constant or along the planned poses."""
         steps = round(self.config.within_s / DT_S)
         if isinstance(self.actions, Trajectory):
             poses = replace(self.actions, steps=steps).plan(action.reshape(-1, 3)).reshape(-1, 3)
             speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
             return jnp.column_stack([poses, jnp.concatenate([motion[MOTION_SPEED:], speeds])])
 
-        def on(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
-            motion, last = now
-            executed = self.actions.actuate(motion, action, last, length_m)
-            return (self.actions.move(motion, executed, length_m), executed), motion
+        def step(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+            motion, last_action = state
+            executed_action = self.actions.actuate(motion, action, last_action, length_m)
+            return (self.actions.move(motion, executed_action, length_m), executed_action), motion
 
-        (end, _), drive = jax.lax.scan(on, (motion, last), None, steps)
-        return jnp.concatenate([drive, end[None]])
+        (end, _), motions = jax.lax.scan(step, (motion, last_action), None, steps)
+        return jnp.concatenate([motions, end[None]])

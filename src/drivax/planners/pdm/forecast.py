@@ -16,10 +16,10 @@ from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import classify_contacts, others_on_level
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
 
-#: Samples of the next five seconds.
-_LOOKS, _LOOK_S = 11, 0.5
-#: Weight of the present distance relative to the distance from the path.
-_FURTHER = 0.02
+#: Number and interval of the samples of the next five seconds.
+_SAMPLES, _SAMPLE_S = 11, 0.5
+#: Weight of the present distance from ego relative to the distance from the path.
+_DISTANCE_WEIGHT = 0.02
 
 
 @record
@@ -33,53 +33,53 @@ class Forecast:
 
     @classmethod
     def of(
-        cls, frame: Frame, slot: Integer, ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
-        most: int, radius_m: float,
+        cls, frame: Frame, slot: Integer, is_ignored: Bool[Array, " S"], path: Float[Array, "M 2"],
+        count: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Select the ``most`` agents within ``radius_m`` that come nearest to ego's path ``way`` in five seconds."""
-        away = norm(frame.box[:, :2] - frame.box[slot, :2])
-        counts = others_on_level(frame, slot) & ~ignored & (away <= radius_m)
-        times = jnp.arange(_LOOKS)[:, None] * _LOOK_S
+        """Select ``count`` agents within ``radius_m`` that come nearest to ego's path in five seconds."""
+        distance = norm(frame.box[:, :2] - frame.box[slot, :2])
+        is_eligible = others_on_level(frame, slot) & ~is_ignored & (distance <= radius_m)
+        times = jnp.arange(_SAMPLES)[:, None] * _SAMPLE_S
         x = frame.box[:, X] + times * frame.velocity[:, 0]
         y = frame.box[:, Y] + times * frame.velocity[:, 1]
-        squared = (x - way[:, 0, None, None]) ** 2 + (y - way[:, 1, None, None]) ** 2
-        reach = norm(frame.box[:, LENGTH : WIDTH + 1]) / 2
-        clear = jnp.maximum(jnp.sqrt(jnp.min(squared, axis=(0, 1))) - reach, 0.0)
-        rank = jnp.where(counts, clear + _FURTHER * away, jnp.inf)
-        _, rows = jax.lax.top_k(-rank, min(most, away.shape[0]))
-        return cls(frame.box[rows], frame.velocity[rows], frame.kind[rows], counts[rows])
+        squared = (x - path[:, 0, None, None]) ** 2 + (y - path[:, 1, None, None]) ** 2
+        radius = norm(frame.box[:, LENGTH : WIDTH + 1]) / 2
+        clearance = jnp.maximum(jnp.sqrt(jnp.min(squared, axis=(0, 1))) - radius, 0.0)
+        rank = jnp.where(is_eligible, clearance + _DISTANCE_WEIGHT * distance, jnp.inf)
+        _, rows = jax.lax.top_k(-rank, min(count, distance.shape[0]))
+        return cls(frame.box[rows], frame.velocity[rows], frame.kind[rows], is_eligible[rows])
 
     def at(self, times_s: Float[Array, " T"]) -> Float[Array, "T K 6"]:
-        """Boxes at each time."""
+        """Return the boxes at each time."""
         times = times_s[:, None]
-        moved = (self.box[:, X] + times * self.velocity[:, 0], self.box[:, Y] + times * self.velocity[:, 1])
-        same = (jnp.broadcast_to(self.box[:, part], moved[0].shape) for part in (COS, SIN, LENGTH, WIDTH))
-        return jnp.stack([*moved, *same], axis=-1)
+        x, y = (self.box[:, axis] + times * self.velocity[:, axis] for axis in (X, Y))
+        constants = (jnp.broadcast_to(self.box[:, column], x.shape) for column in (COS, SIN, LENGTH, WIDTH))
+        return jnp.stack([x, y, *constants], axis=-1)
 
 
 def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]:
-    """Boxes of one size at motions (x, y, heading, speed)."""
+    """Return boxes of one size at motions (x, y, heading, speed)."""
     heading = motion[..., MOTION_HEADING]
-    length, width = (jnp.broadcast_to(part, heading.shape) for part in size)
-    parts = (motion[..., MOTION_X], motion[..., MOTION_Y], jnp.cos(heading), jnp.sin(heading), length, width)
-    return jnp.stack(parts, axis=-1)
+    length, width = (jnp.broadcast_to(extent, heading.shape) for extent in size)
+    x, y = motion[..., MOTION_X], motion[..., MOTION_Y]
+    return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), length, width], axis=-1)
 
 
 def overlapping(
     motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float = 0.0
 ) -> Bool[Array, "T K"]:
-    """Mask of the agents that ego overlaps within a horizon from each step of a motion, at constant velocities."""
-    me = boxes_of(motion, size)[:, None]
-    velocity = me[..., COS : SIN + 1] * motion[:, None, MOTION_SPEED, None]
-    then = others.at(jnp.arange(motion.shape[0]) * DT_S)
-    return overlap_within(me, velocity, then, others.velocity, horizon_s) & others.valid
+    """Return the mask of agents that ego overlaps within a horizon of each step of a motion, at constant velocities."""
+    ego_box = boxes_of(motion, size)[:, None]
+    velocity = ego_box[..., COS : SIN + 1] * motion[:, None, MOTION_SPEED, None]
+    boxes = others.at(jnp.arange(motion.shape[0]) * DT_S)
+    return overlap_within(ego_box, velocity, boxes, others.velocity, horizon_s) & others.valid
 
 
 @record
 class Contacts:
     """First contact of ego's motion with each agent, and whose fault it is."""
 
-    touches: Bool[Array, "*batch K"]
+    touches: Bool[Array, "*batch K"]  # Mask of the agents that ego touches
     step: Int[Array, "*batch K"]  # Of the motion; 0 without a contact
     lawful_fault: Bool[Array, "*batch K"]  # Ego's fault if it is in a single lane and on the road
     unlawful_fault: Bool[Array, "*batch K"]  # Ego's fault otherwise
@@ -88,34 +88,37 @@ class Contacts:
     def along(cls, motion: Float[Array, "T 4"], size: Vector, others: Forecast) -> Contacts:
         """Find the first overlap with each agent; ``simulator.contact.classify_contacts`` decides its fault."""
         steps = jnp.arange(motion.shape[0])
-        touching = overlapping(motion, size, others)
-        first = jnp.min(jnp.where(touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+        is_touching = overlapping(motion, size, others)
+        first = jnp.min(jnp.where(is_touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
         touches = jnp.isfinite(first)
         step = jnp.where(touches, first, 0.0).astype(jnp.int32)
-        me = boxes_of(motion[step], size)
-        moved = others.box.at[:, :2].add(others.velocity * (step * DT_S)[:, None])
+        ego_boxes = boxes_of(motion[step], size)
+        other_boxes = others.box.at[:, :2].add(others.velocity * (step * DT_S)[:, None])
 
-        def at_fault(unlawful: bool, both: Array, kind: Array, speed: Array, other: Array) -> Array:
+        def is_at_fault(
+            is_unlawful: bool, boxes: Array, kind: Array, speed: Array, other_speed: Array
+        ) -> Array:
+            """Return whether ego, the first of two boxes, is at fault in its contact with the other."""
             zeros, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
             kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
-            frame = Frame(both, jnp.zeros((2, 2)), zeros, zeros == 0.0, kinds, lights)
-            fresh = jnp.arange(2) == 1
-            return classify_contacts(frame, slot, fresh, speed, zeros + other, jnp.asarray(unlawful))[0][1]
+            frame = Frame(boxes, jnp.zeros((2, 2)), zeros, zeros == 0.0, kinds, lights)
+            is_new, speeds = jnp.arange(2) == 1, zeros + other_speed
+            return classify_contacts(frame, slot, is_new, speed, speeds, jnp.asarray(is_unlawful))[0][1]
 
-        pairs = jnp.stack([me, moved], axis=1)
+        pairs = jnp.stack([ego_boxes, other_boxes], axis=1)
         contacts = pairs, others.kind, motion[step, MOTION_SPEED], norm(others.velocity)
-        faults = (jax.vmap(partial(at_fault, unlawful))(*contacts) for unlawful in (False, True))
+        faults = (jax.vmap(partial(is_at_fault, is_unlawful))(*contacts) for is_unlawful in (False, True))
         return cls(touches, step, *faults)
 
     def needs_lanes(self, steps: int) -> Bool[Array, " T"]:
-        """Mask of the steps at which a fault depends on lanes and road."""
+        """Return the mask of steps at which a fault depends on lanes and road."""
         depends = self.touches & (self.lawful_fault != self.unlawful_fault)
         return ((self.step == jnp.arange(steps)[:, None]) & depends).any(axis=1)
 
-    def fault_times(self, unlawful: Bool[Array, " T"]) -> Float[Array, " K"]:
-        """Return the time of the contact with each agent if it is at fault, s, else infinity.
+    def fault_times(self, is_unlawful: Bool[Array, " T"]) -> Float[Array, " K"]:
+        """Return the time of ego's contact with each agent, s; infinite without a contact that is ego's fault.
 
-        ``unlawful`` masks the steps at which ego is in several lanes or off the road.
+        ``is_unlawful`` masks the steps at which ego is in several lanes or off the road.
         """
-        fault = jnp.where(unlawful[self.step], self.unlawful_fault, self.lawful_fault)
+        fault = jnp.where(is_unlawful[self.step], self.unlawful_fault, self.lawful_fault)
         return jnp.where(self.touches & fault, self.step * DT_S, jnp.inf)

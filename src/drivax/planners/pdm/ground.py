@@ -33,8 +33,10 @@ from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Ve
 from drivax.scenario.record import record
 from drivax.simulator.simulator import map_where
 
-#: Most edges, and most lanes of the corridor, near the path and near a group of poses; with more, the grid is queried.
+#: Maximum number of edges, and of lanes of the corridor, near the path and near a group of poses; with more, poses are
+#: looked up in the grid.
 PATH_SEGMENTS, GROUP_SEGMENTS = 96, 40
+#: Coordinate of padding.
 _FAR_M = 1e6
 
 
@@ -42,18 +44,13 @@ _FAR_M = 1e6
 class Ground:
     """Position relative to lanes and road at each step of a motion."""
 
-    several: Bool[Array, "*T"]  # In more than one lane
-    off: Bool[Array, "*T"]  # Some corner is off the road
-    # The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic)
-    astray: Bool[Array, "*T"]
+    is_in_several_lanes: Bool[Array, "*T"]  # No lane holds all corners
+    is_offroad: Bool[Array, "*T"]  # Some corner is off the road
+    is_astray: Bool[Array, "*T"]  # The centre is outside the lanes in the route's direction
 
 
 def ground_at(
-    bank: ScenarioBank,
-    row: Integer,
-    box: Float[Array, " 6"],
-    z: Scalar,
-    on_route: Bool[Array, ""],
+    bank: ScenarioBank, row: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
     """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
@@ -62,55 +59,54 @@ def ground_at(
     index, points = bank.scenario_of(row), corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z, row=row)
     distance = offroad_distance(bank, index, box[:2], points, lanes.points_near, z).max()
-    astray = jnp.where(bank.on_lanes[row] & on_route, ~lanes.on_corridor, lanes.wrong_way)
-    return Ground(lanes.leaving_lane, (distance > OFFROAD_TOLERANCE_M) & is_mapped(bank, index), astray)
+    is_astray = jnp.where(bank.on_lanes[row] & on_route, ~lanes.on_corridor, lanes.wrong_way)
+    is_offroad = (distance > OFFROAD_TOLERANCE_M) & is_mapped(bank, index)
+    return Ground(lanes.leaving_lane, is_offroad, is_astray)
 
 
 def ground_along(
     bank: ScenarioBank, row: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], needs_lanes: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
-    """Return :func:`ground_at` along N motions from one pose; ``several`` only where ``needs_lanes``, else false.
+    """Return :func:`ground_at` along N motions from one pose.
 
-    Looked up at every ``every``-th step (a divisor of T - 1); the steps between use the next look-up.
+    Every ``every``-th step (a divisor of T - 1) is looked up; the steps between use the next look-up. A step that does
+    not need lanes may count as being in a single lane.
     """
     count = len(motion)
     box, z, on_route = (values[:, ::every] for values in (boxes_of(motion, size), z, on_route))
     box, z, on_route = box.reshape(-1, 6), z.reshape(-1), on_route.reshape(-1)
-    between = needs_lanes[:, 1:].reshape(count, -1, every).any(axis=2)
-    needs_lanes = jnp.concatenate([needs_lanes[:, :1], between], axis=1).reshape(-1)
+    any_needs_lanes = needs_lanes[:, 1:].reshape(count, -1, every).any(axis=2)
+    needs_lanes = jnp.concatenate([needs_lanes[:, :1], any_needs_lanes], axis=1).reshape(-1)
     ground, is_exact = _look_up_sorted(bank, row, box, z, count)
-    queried = ~is_exact | ~(bank.on_lanes[row] & on_route) | needs_lanes
-    exact = map_where(queried, partial(ground_at, bank, row), box, z, on_route)
+    needs_query = ~is_exact | ~(bank.on_lanes[row] & on_route) | needs_lanes
+    exact = map_where(needs_query, partial(ground_at, bank, row), box, z, on_route)
 
     def each_step(value: Array, exact: Array) -> Array:
-        value = jnp.where(queried, exact, value).reshape(count, -1)
+        value = jnp.where(needs_query, exact, value).reshape(count, -1)
         return jnp.concatenate([value[:, :1], jnp.repeat(value[:, 1:], every, axis=1)], axis=1)
 
     return jax.tree.map(each_step, ground, exact)
 
 
 def _look_up_sorted(
-    bank: ScenarioBank,
-    row: Integer,
-    box: Float[Array, "P 6"],
-    z: Float[Array, " P"],
-    group: int,
+    bank: ScenarioBank, row: Integer, box: Float[Array, "P 6"], z: Float[Array, " P"], group: int
 ) -> tuple[Ground, Bool[Array, " P"]]:
-    """Look up poses on a route without ``several``, and the mask of those for which that is exact.
+    """Return the position of poses on a route, taken to be in a single lane, and the mask of poses where it is exact.
 
-    Groups of ``group`` poses are equally far from the first pose, where all motions begin.
+    Poses are sorted by their distance from the first one, where all motions begin, and looked up in groups of
+    ``group``.
     """
     _, order = jax.lax.top_k(-norm(box[:, :2] - box[0, :2]), len(box))
     path = box[order, :2]
     index = bank.scenario_of(row)
     lanes = bank.lanes[index]
-    corridor = in_corridor(bank, lanes, row)
-    lanes = jnp.where(corridor, lanes, _FAR_M)
-    lanes_m = jnp.max(jnp.where(corridor, lanes[LaneRow.HALF_WIDTH], 0.0)) + LANE_MARGIN_M
-    edges_m = norm(box[0, 4:]) / 2 + EDGE_CUTOFF_M
-    edges_near = SortedSegments.near_path(bank.edges[index], path, edges_m)
-    lanes_near = SortedSegments.near_path(lanes, path, lanes_m)
+    is_in_corridor = in_corridor(bank, lanes, row)
+    lanes = jnp.where(is_in_corridor, lanes, _FAR_M)
+    lane_reach_m = jnp.max(jnp.where(is_in_corridor, lanes[LaneRow.HALF_WIDTH], 0.0)) + LANE_MARGIN_M
+    edge_reach_m = norm(box[0, 4:]) / 2 + EDGE_CUTOFF_M
+    edges_near = SortedSegments.near_path(bank.edges[index], path, edge_reach_m)
+    lanes_near = SortedSegments.near_path(lanes, path, lane_reach_m)
 
     def look_up(poses: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         box, z = poses
@@ -122,17 +118,20 @@ def _look_up_sorted(
             left, known = left_of_segments(edges, is_level(edges[EdgeRow.Z], z), points)
             distance, is_exact = offroad_by_edges(bank, index, points, left, known)
             squared = to_segments(lanes, box[None, :2])[0][0]
-            holds = squared <= (lanes[LaneRow.HALF_WIDTH] + LANE_MARGIN_M) ** 2
-            astray = ~(holds & is_level(lanes[LaneRow.Z], z)).any()
-            return distance.max() > OFFROAD_TOLERANCE_M, astray, is_exact.all()
+            is_in_lane = squared <= (lanes[LaneRow.HALF_WIDTH] + LANE_MARGIN_M) ** 2
+            is_astray = ~(is_in_lane & is_level(lanes[LaneRow.Z], z)).any()
+            return distance.max() > OFFROAD_TOLERANCE_M, is_astray, is_exact.all()
 
-        off, astray, is_exact = jax.vmap(at_pose)(box, z)
-        return off, astray, is_exact & has_edges & has_lanes
+        is_offroad, is_astray, is_exact = jax.vmap(at_pose)(box, z)
+        return is_offroad, is_astray, is_exact & has_edges & has_lanes
 
-    groups = (values[order].reshape(-1, group, *values.shape[1:]) for values in (box, z))
-    results = jax.lax.map(look_up, tuple(groups))
-    off, astray, is_exact = (jnp.zeros(len(box), bool).at[order].set(flags.reshape(-1)) for flags in results)
-    return Ground(jnp.zeros_like(off), off & is_mapped(bank, index), astray), is_exact
+    groups = tuple(values[order].reshape(-1, group, *values.shape[1:]) for values in (box, z))
+    masks = jax.lax.map(look_up, groups)
+    is_offroad, is_astray, is_exact = (
+        jnp.zeros(len(box), bool).at[order].set(mask.reshape(-1)) for mask in masks
+    )
+    is_offroad &= is_mapped(bank, index)
+    return Ground(jnp.zeros_like(is_offroad), is_offroad, is_astray), is_exact
 
 
 @record
@@ -143,7 +142,7 @@ class SortedSegments:
     direction: Vector
     begin_m: Float[Array, " S"]  # Where each segment begins along the direction
     length_m: Scalar  # Longest extent of a segment along it
-    reach_m: Scalar
+    reach_m: Scalar  # Width by which the rectangle around the path is enlarged
     complete: Bool[Array, ""]  # Whether no segment within reach is missing
 
     @classmethod
@@ -151,34 +150,34 @@ class SortedSegments:
         cls, segments: Float[Array, "F A"], path: Float[Array, "P 2"], reach_m: Scalar
     ) -> SortedSegments:
         """Select the segments that meet the rectangle around a path, widened by a reach."""
-        step = path[-1] - path[0]
-        step = jnp.where(norm(step) > 1e-3, step, jnp.array([1.0, 0.0]))
-        direction = step / norm(step)
+        chord = path[-1] - path[0]
+        chord = jnp.where(norm(chord) > 1e-3, chord, jnp.array([1.0, 0.0]))
+        direction = chord / norm(chord)
         ends = segments[EdgeRow.A], segments[EdgeRow.B]
 
         def extent(direction: Array) -> tuple[Array, Array, Array]:
-            """Begin and end of each segment along a direction, and whether it meets the rectangle's extent."""
+            """Return begin and end of each segment along a direction, and whether it meets the rectangle's extent."""
             a, b = (_along(direction, *end) for end in ends)
             begin, end, points = jnp.minimum(a, b), jnp.maximum(a, b), _along(direction, *path.T)
             return begin, end, (end >= points.min() - reach_m) & (begin <= points.max() + reach_m)
 
         begin, end, is_near = extent(direction)
         is_near &= extent(jnp.stack([-direction[1], direction[0]]))[2]
-        most = min(PATH_SEGMENTS, len(begin))
-        ranked, chosen = jax.lax.top_k(jnp.where(is_near, -begin, -_FAR_M), most)
-        near = jnp.where(ranked > -_FAR_M, segments[:, chosen], _FAR_M)
-        longest = jnp.max(jnp.where(is_near, end - begin, 0.0))
-        return cls(near, direction, -ranked, longest, reach_m, is_near.sum() <= most)
+        count = min(PATH_SEGMENTS, len(begin))
+        negative_begin, index = jax.lax.top_k(jnp.where(is_near, -begin, -_FAR_M), count)
+        near_segments = jnp.where(negative_begin > -_FAR_M, segments[:, index], _FAR_M)
+        length_m = jnp.max(jnp.where(is_near, end - begin, 0.0))
+        return cls(near_segments, direction, -negative_begin, length_m, reach_m, is_near.sum() <= count)
 
     def near_points(self, points: Float[Array, "P 2"]) -> tuple[Float[Array, "F M"], Bool[Array, ""]]:
         """Return the segments within reach of points of the path, and whether none is missing."""
-        along, most = _along(self.direction, *points.T), min(GROUP_SEGMENTS, len(self.begin_m))
-        first = jnp.sum(self.begin_m < along.min() - self.reach_m - self.length_m)
-        end = jnp.sum(self.begin_m <= along.max() + self.reach_m)
-        near = jax.lax.dynamic_slice_in_dim(self.segments, first, most, axis=1)
-        return near, self.complete & (end - first <= most)
+        along_m, count = _along(self.direction, *points.T), min(GROUP_SEGMENTS, len(self.begin_m))
+        first = jnp.sum(self.begin_m < along_m.min() - self.reach_m - self.length_m)
+        end = jnp.sum(self.begin_m <= along_m.max() + self.reach_m)
+        segments = jax.lax.dynamic_slice_in_dim(self.segments, first, count, axis=1)
+        return segments, self.complete & (end - first <= count)
 
 
 def _along(direction: Vector, x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Coordinate along a direction; products of matrices are less exact on GPUs."""
+    """Return coordinates along a direction, without a matrix product, which is less exact on GPUs."""
     return direction[0] * x + direction[1] * y

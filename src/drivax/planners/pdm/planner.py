@@ -20,7 +20,7 @@ from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Contacts, Forecast
 from drivax.planners.pdm.ground import ground_along
-from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
+from drivax.planners.pdm.proposals import LINE_ALONG, LINE_Z, Lines, Proposals, unroll_idm
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
 from drivax.planners.pdm.tracking import Car, Reference, track
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
@@ -35,7 +35,7 @@ from drivax.tasks.actions import ActionSpace, Physical, Trajectory, action_of
 #: IDM of the proposals.
 PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_mps2=3.0)
 #: Stride of the route points that are compared with forecasts.
-_SPARSE = 5
+_STRIDE = 5
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class PdmConfig:
 
     def __post_init__(self) -> None:
         if not self.fractions or not self.offsets_m:
-            raise UsageError("PDM has no proposals", cure="give it a fraction and an offset at least")
+            raise UsageError("PDM has no proposals", cure="give it at least one fraction and one offset")
         for name, every in (("leader_every", self.leader_every), ("ground_every", self.scoring.ground_every)):
             if every < 1 or self.steps % every:
                 raise UsageError(f"{name} is {every}, steps {self.steps}", cure="use a divisor of steps")
@@ -100,9 +100,10 @@ class ScoredProposals:
 
 @record
 class PdmPlanner:
-    """Drive the best of 15 proposals, or brake; reads the true situation.
+    """Drive the best of 15 proposals, or brake.
 
-    Other agents are predicted at constant velocity; the planner does not read the log's future.
+    Reads the true situation, not observations. Other agents are predicted at constant velocity; the planner does not
+    read the log's future.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -114,96 +115,99 @@ class PdmPlanner:
         """Return a carry without touched agents; acceleration and steering from the last half second."""
         context = state.context
         length_m = jnp.maximum(bank.length_m(context.index, context.slot), 1.0)
-        now = recent_actuators(context.history, length_m, self.config.tracking)
-        return Memory(jnp.zeros(bank.agent_box.shape[1], bool), now[ACCELERATION], now[STEERING])
+        actuators = recent_actuators(context.history, length_m, self.config.tracking)
+        touched = jnp.zeros(bank.agent_box.shape[1], bool)
+        return Memory(touched, actuators[ACCELERATION], actuators[STEERING])
 
     def act(
         self, carry: Memory, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Memory]:  # fmt: skip
-        """Return the first action of the best proposal, or brake; the whole proposal where a controller tracks it."""
+        """Return the first action of the best proposal (in the space ``trajectory`` all of its poses), or brake."""
         context = situation.context
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         touched = carry.touched | overlaps(situation.surroundings.frame, context.slot)
-        carry = replace(carry, touched=touched)
-        tracked = self._plans
-        if tracked:
-            acceleration, steering = (
-                context.action[ACCELERATION],
-                steering_of(context.action[:3], tracked.controller),
-            )
-            carry = replace(carry, acceleration=acceleration, steering=steering)
-        scored = self.score_proposals(carry, bank, situation)
-        best = jnp.argmax(scored.score)
+        carry, space = replace(carry, touched=touched), self._plan_space
+        if space:
+            steering = steering_of(context.action[:3], space.controller)
+            carry = replace(carry, acceleration=context.action[ACCELERATION], steering=steering)
+        proposals = self.score_proposals(carry, bank, situation)
+        best = jnp.argmax(proposals.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
-        brakes = is_emergency(scored.metrics.fault_s[best], speed, brake)
-        hard = braking(speed, carry.acceleration, brake)
-        acceleration = jnp.where(brakes, hard, scored.cars.acceleration[best, 1])
-        steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
+        is_braking = is_emergency(proposals.metrics.fault_s[best], speed, brake)
+        brake_acceleration = braking(speed, carry.acceleration, brake)
+        acceleration = jnp.where(is_braking, brake_acceleration, proposals.cars.acceleration[best, 1])
+        steering = jnp.where(is_braking, 0.0, proposals.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = action_of(self.actions, bank, context, acceleration, curvature)
-        if tracked:
-            stopped = stop(tracked, motion, hard, length, brake)
-            action = jnp.where(brakes, stopped, tracked.plan(scored.plans[best]))
+        if space:
+            stop_plan = stop(space, motion, brake_acceleration, length, brake)
+            action = jnp.where(is_braking, stop_plan, space.plan(proposals.plans[best]))
         return action, Memory(touched, acceleration, steering)
 
     def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:
         """Simulate and score all proposals."""
-        config, context, around = self.config, situation.context, situation.surroundings
-        frame, motion = around.frame, context.history[-1]
-        me, speed = frame.box[context.slot], motion[MOTION_SPEED]
-        size = me[LENGTH : WIDTH + 1]
-        lines = Lines.along_route(bank, context.row, around.route.along_m, config.offsets_m, me)
-        way = lines.points[0, ::_SPARSE, :2]
-        others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
-        # Each stage is written out: XLA would compute it again in every operation that uses it.
+        config, context, surroundings = self.config, situation.context, situation.surroundings
+        frame, motion = surroundings.frame, context.history[-1]
+        box, speed = frame.box[context.slot], motion[MOTION_SPEED]
+        size = box[LENGTH : WIDTH + 1]
+        lines = Lines.along_route(bank, context.row, surroundings.route.along_m, config.offsets_m, box)
+        path = lines.points[0, ::_STRIDE, :2]
+        others = Forecast.of(frame, context.slot, carry.touched, path, config.agents, config.radius_m)
+        # Without barriers, XLA would compute a stage again in every operation that uses it.
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
-        desired = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
+        desired = jnp.where(lines.remaining_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
         stop_m = stop_line_m(bank, context, frame)
-        driver = (config.driver, config.steps, config.leader_every)
-        proposals = unroll_idm(lines, others, size, speed, desired, stop_m, driver)
-        reference = jax.lax.optimization_barrier(proposals.reference(lines))
+        proposals = unroll_idm(
+            lines, others, size, speed, desired, stop_m, config.driver, config.steps, config.leader_every
+        )
         wheelbase, car = self._wheelbase(size[0]), Car(motion, carry.acceleration, carry.steering)
+        plans, cars = self._simulate(lines, proposals, car, wheelbase)
+        rows = lines.at(proposals.arc_m).reshape(*plans.shape[:2], -1)
+        ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
+        z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_ALONG] <= lines.remaining_m
+        # The controller swings out in bends and touches curbs between look-ups.
+        every = 1 if self._plan_space else config.scoring.ground_every
+        contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
+        needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
+        ground = ground_along(bank, context.row, cars.motion, size, z, on_route, needs_lanes, every)
+        progress_m = lines.route_distances(cars.motion[:, -1, :2]) - lines.route_distances(motion[:2])
+        yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
+
+        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, None, None, None, 0, 0, 0, None))(
+            cars, yaw_rate, size, others, contacts, ground, progress_m, config.scoring
+        )
+        return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
+
+    def _simulate(
+        self, lines: Lines, proposals: Proposals, car: Car, wheelbase: Scalar
+    ) -> tuple[Float[Array, "N T 3"], Car]:
+        """Return the plans of all proposals, and the cars that track them."""
+        reference = jax.lax.optimization_barrier(proposals.reference(lines))
         heading = jnp.arctan2(reference.pose[..., 3:], reference.pose[..., 2:3])
         plans = jnp.concatenate([reference.pose[..., :2], heading], axis=-1)
         # One copy per proposal: XLA vectorises over arrays of one shape.
         copies = jax.tree.map(
-            lambda part: jnp.broadcast_to(part, (len(plans), *part.shape)), (car, wheelbase)
+            lambda leaf: jnp.broadcast_to(leaf, (len(plans), *leaf.shape)), (car, wheelbase)
         )
-        car, wheelbases = jax.lax.optimization_barrier(copies)
-        cars = jax.vmap(self._track)(car, wheelbases, reference, plans)
-        cars = jax.lax.optimization_barrier(cars)
-        rows = lines.at(proposals.way).reshape(*plans.shape[:2], -1)
-        ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
-        z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
-        # The controller swings out in bends and touches curbs between look-ups.
-        every = 1 if self._plans else config.scoring.ground_every
-        contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
-        needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)
-        ground = ground_along(bank, context.row, cars.motion, size, z, on_route, needs_lanes, every)
-        ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
-        yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
-
-        metrics = jax.vmap(scoring.evaluate_proposal, in_axes=(0, None, None, None, 0, 0, 0, None))(
-            cars, yaw_rate, size, others, contacts, ground, ends, config.scoring
-        )
-        return ScoredProposals(plans, cars, metrics, scoring.scores(metrics, config.scoring))
+        cars, wheelbases = jax.lax.optimization_barrier(copies)
+        return plans, jax.lax.optimization_barrier(jax.vmap(self._track)(cars, wheelbases, reference, plans))
 
     def _track(self, car: Car, wheelbase: Scalar, reference: Reference, plan: Float[Array, "T 3"]) -> Car:
         """Track one proposal as it would be executed."""
-        if self._plans is None:
+        space = self._plan_space
+        if space is None:
             return track(car, reference, wheelbase, self.config.tracking)
-        whole = replace(self._plans, steps=max(self._plans.steps, self.config.steps)).plan(plan)
-        controller = self._plans.controller
-        fitted = Reference.fitted(whole.reshape(-1, 3), self.config.steps, wheelbase, controller)
-        return track(car, fitted, wheelbase, controller, about_axle=True)
+        poses = replace(space, steps=max(space.steps, self.config.steps)).plan(plan).reshape(-1, 3)
+        axle_reference = Reference.fitted(poses, self.config.steps, wheelbase, space.controller)
+        return track(car, axle_reference, wheelbase, space.controller, about_axle=True)
 
     @property
-    def _plans(self) -> Trajectory | None:
-        """Action space of plans, whose controller executes them; None for other action spaces."""
+    def _plan_space(self) -> Trajectory | None:
+        """The action space ``trajectory``, whose controller executes plans; None for other action spaces."""
         return self.actions if isinstance(self.actions, Trajectory) else None
 
     def _wheelbase(self, length_m: Scalar) -> Scalar:
-        tracking = self._plans.controller if self._plans else self.config.tracking
+        tracking = self._plan_space.controller if self._plan_space else self.config.tracking
         return tracking.wheelbase * jnp.maximum(length_m, 1.0)

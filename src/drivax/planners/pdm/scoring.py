@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.boxes import LENGTH
+from drivax.geometry.boxes import COS, LENGTH, SIN
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
 from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
@@ -36,7 +36,7 @@ class ScoringConfig:
         static_collision: Gate of an at-fault collision with an object other than a vehicle, pedestrian or cyclist.
         ttc_s: Horizon of the time to collision at each step.
         standing_mps: Speed below which time to collision is not evaluated.
-        astray_m: Continuous distances off the route's direction up to which the gate is 1, and up to which it is 0.5.
+        astray_m: Continuous distances outside the route's lanes below which the gate is 1, and below which it is 0.5.
         least_progress_m: If the best proposal makes less progress, all allowed proposals count as making the most.
         ground_every: Steps between look-ups of lanes and edges; in the action space ``trajectory`` every step, as
             published.
@@ -77,93 +77,93 @@ def evaluate_proposal(
     ``contacts`` and ``ground`` are those along its motion.
     """
     motion = car.motion
-    faults = contacts.fault_times(ground.several | ground.off)
-    soon = overlapping(motion, size, others, config.ttc_s)
-    alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
-    alive |= others.kind == AgentKind.CYCLIST
-    passed = jnp.where(jnp.isfinite(faults), jnp.where(alive, 0.0, config.static_collision), 1.0)
+    fault_times = contacts.fault_times(ground.is_in_several_lanes | ground.is_offroad)
+    is_imminent = overlapping(motion, size, others, config.ttc_s)
+    is_road_user = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
+    is_road_user |= others.kind == AgentKind.CYCLIST
+    fault_gates = jnp.where(is_road_user, 0.0, config.static_collision)
     return ProposalMetrics(
-        collision=jnp.min(passed),
-        road=1.0 - ground.off.any().astype(jnp.float32),
-        direction=_direction(motion, ground.astray, config),
+        collision=jnp.min(jnp.where(jnp.isfinite(fault_times), fault_gates, 1.0)),
+        road=1.0 - ground.is_offroad.any().astype(jnp.float32),
+        direction=_direction(motion, ground.is_astray, config),
         progress_m=progress_m,
-        ttc=1.0 - _foreseen(motion, size, others, soon, config).astype(jnp.float32),
+        ttc=1.0 - _has_short_ttc(motion, size, others, is_imminent, config).astype(jnp.float32),
         comfort=is_comfortable(motion, car.acceleration, yaw_rate).astype(jnp.float32),
-        fault_s=jnp.min(faults),
+        fault_s=jnp.min(fault_times),
     )
 
 
 def scores(metrics: ProposalMetrics, config: ScoringConfig) -> Float[Array, " N"]:
-    """Scores of N proposals in [0, 1]: the product of the gates times the weighted mean.
+    """Return the scores of N proposals in [0, 1]: the product of the gates times the weighted mean.
 
-    Progress is relative to the largest progress after gates.
+    Progress is multiplied by the gates, and relative to that of the best proposal.
     """
     gates = metrics.collision * metrics.road * metrics.direction
-    gained = metrics.progress_m * gates
-    most = jnp.max(gained)
-    allowed = (gates > 0.0).astype(jnp.float32)
-    progress = jnp.where(most > config.least_progress_m, gained / jnp.maximum(most, 1e-6), allowed)
+    progress_m = metrics.progress_m * gates
+    largest_m = jnp.max(progress_m)
+    is_allowed = (gates > 0.0).astype(jnp.float32)
+    relative = progress_m / jnp.maximum(largest_m, 1e-6)
+    progress = jnp.where(largest_m > config.least_progress_m, relative, is_allowed)
     weights = config.progress, config.ttc, config.comfort
     terms = progress, metrics.ttc, metrics.comfort
     return gates * (sum(weight * term for weight, term in zip(weights, terms, strict=True)) / sum(weights))
 
 
-def _direction(motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig) -> Scalar:
-    """Gate of wrong-way driving: 1, 1/2 or 0 by the longest continuous distance astray."""
-    steps = norm(jnp.diff(motion[:, :2], axis=0)) * astray[1:]
-    whole = jnp.cumsum(steps)
-    # Distance astray up to the last step that was not.
-    before = jax.lax.cummax(jnp.where(astray[1:], 0.0, whole))
-    longest = jnp.max(whole - before)
-    fine, half = config.astray_m
-    return jnp.where(longest < fine, 1.0, jnp.where(longest < half, 0.5, 0.0))
+def _direction(motion: Float[Array, "T 4"], is_astray: Bool[Array, " T"], config: ScoringConfig) -> Scalar:
+    """Return the gate of wrong-way driving: 1, 1/2 or 0 by the longest continuous distance astray."""
+    total_m = jnp.cumsum(norm(jnp.diff(motion[:, :2], axis=0)) * is_astray[1:])
+    # Total at the last step that was not astray.
+    start_m = jax.lax.cummax(jnp.where(is_astray[1:], 0.0, total_m))
+    longest_m = jnp.max(total_m - start_m)
+    full_m, half_m = config.astray_m
+    return jnp.where(longest_m < full_m, 1.0, jnp.where(longest_m < half_m, 0.5, 0.0))
 
 
-def _foreseen(
-    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon: Bool[Array, "T K"],
+def _has_short_ttc(
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, is_imminent: Bool[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
-    """Whether some step has a short time to collision with an agent that is not behind ego.
+    """Return whether some step has a short time to collision with an agent that is not behind ego.
 
     The first such step decides for each agent. Sources do not mark intersections, so agents next to ego always count.
     """
     steps = jnp.arange(motion.shape[0])
-    sees = soon & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
-    first = jnp.min(jnp.where(sees, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
-    seen = jnp.isfinite(first)
-    step = jnp.where(seen, first, 0.0).astype(jnp.int32)
-    me = boxes_of(motion[step], size)
-    then = others.box[:, :2] + others.velocity * (step * DT_S)[:, None]
-    dx, dy = jnp.moveaxis(then - me[:, :2], -1, 0)
-    ahead = dx * me[:, 2] + dy * me[:, 3] + REAR_AXLE * me[:, LENGTH]
-    left = dy * me[:, 2] - dx * me[:, 3]
-    behind = ahead < _BEHIND_COS * jnp.sqrt(ahead * ahead + left * left)
-    return (seen & ~behind).any()
+    is_short = is_imminent & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
+    first = jnp.min(jnp.where(is_short, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+    has_step = jnp.isfinite(first)
+    step = jnp.where(has_step, first, 0.0).astype(jnp.int32)
+    box = boxes_of(motion[step], size)
+    other_xy = others.box[:, :2] + others.velocity * (step * DT_S)[:, None]
+    dx, dy = jnp.moveaxis(other_xy - box[:, :2], -1, 0)
+    ahead = dx * box[:, COS] + dy * box[:, SIN] + REAR_AXLE * box[:, LENGTH]
+    left = dy * box[:, COS] - dx * box[:, SIN]
+    is_behind = ahead < _BEHIND_COS * jnp.sqrt(ahead * ahead + left * left)
+    return (has_step & ~is_behind).any()
 
 
 def is_comfortable(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar
 ) -> Bool[Array, ""]:
-    """Whether a motion stays within nuPlan's comfort limits at every step, with the windows of ``metrics.comfort``."""
+    """Return whether a motion always keeps nuPlan's comfort limits, with the windows of ``metrics.comfort``."""
     steps = motion.shape[0]
-    turned = wrap(jnp.diff(motion[:, MOTION_HEADING]))
-    heading = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
-    rates = jnp.concatenate([yaw_rate[None], turned / DT_S])
-    lateral = motion[:, MOTION_SPEED] * rates
+    heading_changes = wrap(jnp.diff(motion[:, MOTION_HEADING]))
+    heading = jnp.concatenate([jnp.zeros(1), jnp.cumsum(heading_changes)])
+    yaw_rates = jnp.concatenate([yaw_rate[None], heading_changes / DT_S])
+    lateral = motion[:, MOTION_SPEED] * yaw_rates
     magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
 
-    def filtered(signal: Array, window: tuple[int, int, int]) -> Array:
+    def smooth(signal: Array, window: tuple[int, int, int]) -> Array:
         return jnp.asarray(comfort.savgol_matrix(steps, *window), jnp.float32) @ signal / DT_S ** window[2]
 
     low, high = comfort.LONGITUDINAL_MPS2
-    smooth = filtered(acceleration, comfort.SMOOTH)
-    within = ((smooth >= low) & (smooth <= high)).all()
+    longitudinal = smooth(acceleration, comfort.SMOOTH)
+    is_within = ((longitudinal >= low) & (longitudinal <= high)).all()
     for values, limit in (
-        (filtered(lateral, comfort.SMOOTH), comfort.LATERAL_MPS2),
-        (filtered(smooth, comfort.JERK), comfort.JERK_MPS3),
-        (filtered(filtered(magnitude, comfort.SMOOTH), comfort.JERK), comfort.JERK_MAGNITUDE_MPS3),
-        (filtered(heading, comfort.YAW_RATE), comfort.YAW_RATE_RPS),
-        (filtered(heading, comfort.YAW_ACCELERATION), comfort.YAW_ACCELERATION_RPS2),
+        (smooth(lateral, comfort.SMOOTH), comfort.LATERAL_MPS2),
+        (smooth(longitudinal, comfort.JERK), comfort.JERK_MPS3),
+        (smooth(smooth(magnitude, comfort.SMOOTH), comfort.JERK), comfort.JERK_MAGNITUDE_MPS3),
+        (smooth(heading, comfort.YAW_RATE), comfort.YAW_RATE_RPS),
+        (smooth(heading, comfort.YAW_ACCELERATION), comfort.YAW_ACCELERATION_RPS2),
     ):
-        within &= (jnp.abs(values) <= limit).all()
-    return within
+        is_within &= (jnp.abs(values) <= limit).all()
+    return is_within

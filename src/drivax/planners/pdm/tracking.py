@@ -1,8 +1,8 @@
 """Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
-The tracker of ``simulator.controller``. The car moves as in the simulator, so the first step of a tracked proposal
-equals the executed one: by ``simulator.dynamics.bicycle``, along the speeds and curvatures of a proposal, or, in the
-action space ``trajectory``, about its rear axle, along speeds and curvatures that are fitted to the plan.
+The tracker is that of ``simulator.controller``. The car moves as in the simulator, so the first step of a tracked
+proposal equals the executed one: by ``simulator.dynamics.bicycle``, along the speeds and curvatures of a proposal, or,
+in the action space ``trajectory``, about its rear axle, along speeds and curvatures that are fitted to the plan.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drivax.simulator.types import MOTION_SPEED
 
 @record
 class Car:
-    """A car with actuators."""
+    """Motion and actuators of a car."""
 
     motion: Float[Array, "*batch 4"]  # x, y, heading, speed
     acceleration: Float[Array, "*batch"]  # m/s2
@@ -56,8 +56,8 @@ class Reference:
         The reference is that of the rear axle. The controller fits again at every step; this is its first fit.
         """
         x, y, heading = plan.T
-        cos, sin, behind = jnp.cos(heading), jnp.sin(heading), _axle_m(wheelbase, config)
-        x, y = x - behind * cos, y - behind * sin
+        cos, sin, axle_m = jnp.cos(heading), jnp.sin(heading), _axle_m(wheelbase, config)
+        x, y = x - axle_m * cos, y - axle_m * sin
         poses = jnp.stack([x, y, heading], axis=-1)
         speeds = fit_speeds(poses, config)
         pose = jnp.stack([x, y, cos, sin], axis=-1)[: steps + 1]
@@ -89,32 +89,33 @@ def track(
 ) -> Car:
     """Return the car at every step of a reference, the present one included; ``about_axle`` as in :func:`step_car`."""
     steps, last = reference.pose.shape[0] - 1, reference.speed.shape[0] - 1
-    ahead = np.minimum(np.arange(steps)[:, None] + np.arange(config.horizon), last)
+    horizon_steps = np.minimum(np.arange(steps)[:, None] + np.arange(config.horizon), last)
     target_speed = reference.speed[np.minimum(np.arange(steps) + config.horizon, last)]
-    behind = _axle_m(wheelbase, config) if about_axle else 0.0
+    axle_m = _axle_m(wheelbase, config) if about_axle else 0.0
 
-    def step(car: Car, now: tuple[Any, Array, Array]) -> Any:
-        (x, y, cos, sin), desired, curvatures = now
-        own_x, own_y, own_heading, speed = car.motion
-        own_x, own_y = own_x - behind * jnp.cos(own_heading), own_y - behind * jnp.sin(own_heading)
-        stops = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
-        gentle = config.stopping_gain * (desired - speed)
-        acceleration = jnp.where(stops, gentle, acceleration_to(speed, desired, config))
-        lateral = (own_y - y) * cos - (own_x - x) * sin
-        heading = wrap(own_heading - jnp.arctan2(sin, cos))
-        held = speed + acceleration * DT_S * np.arange(config.horizon)
-        speeds = held if about_axle else jnp.maximum(held, 0.0)
-        rate = steering_rate((lateral, heading, car.steering), speeds, curvatures, wheelbase, config)
+    def step(car: Car, target: tuple[Any, Array, Array]) -> Any:
+        (x, y, cos, sin), desired, curvatures = target
+        car_x, car_y, car_heading, speed = car.motion
+        car_x, car_y = car_x - axle_m * jnp.cos(car_heading), car_y - axle_m * jnp.sin(car_heading)
+        is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
+        stopping_acceleration = config.stopping_gain * (desired - speed)
+        acceleration = jnp.where(is_stopping, stopping_acceleration, acceleration_to(speed, desired, config))
+        lateral_error = (car_y - y) * cos - (car_x - x) * sin
+        heading_error = wrap(car_heading - jnp.arctan2(sin, cos))
+        speeds = speed + acceleration * DT_S * np.arange(config.horizon)
+        speeds = speeds if about_axle else jnp.maximum(speeds, 0.0)
+        errors = (lateral_error, heading_error, car.steering)
+        rate = steering_rate(errors, speeds, curvatures, wheelbase, config)
         # XLA vectorises the regulator apart from the car.
-        rate = jax.lax.optimization_barrier(jnp.where(stops, 0.0, rate))
+        rate = jax.lax.optimization_barrier(jnp.where(is_stopping, 0.0, rate))
         car = step_car(car, acceleration, rate, wheelbase, config, about_axle)
         return car, car
 
     poses = tuple(reference.pose[:steps].T)
-    _, cars = jax.lax.scan(step, car, (poses, target_speed, reference.curvature[ahead]))
+    _, cars = jax.lax.scan(step, car, (poses, target_speed, reference.curvature[horizon_steps]))
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), car, cars)
 
 
 def _axle_m(wheelbase: Scalar, config: TrackingConfig) -> Scalar:
-    """Distance of the rear axle behind the box centre, m."""
+    """Return the distance of the rear axle behind the box centre, m."""
     return REAR_AXLE * wheelbase / config.wheelbase

@@ -96,7 +96,9 @@ def _label(metric: MetricComparison) -> MetricLabel:
 
 def _p_text(p: float | None) -> str:
     """Format a p-value with three digits, or as ``< 0.001``."""
-    return MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
+    if p is None:
+        return MISSING
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def effect_name(comparison: Comparison) -> str:

@@ -47,11 +47,9 @@ def page(
 
 
 def _edited_html() -> str:
-    """Return the warning of a page that is made with edited files."""
-    files = ", ".join(map(escape, edited_files()))
-    return (
-        f"<p><b>Made with files that were edited after drivax wrote them:</b> {files}.</p>" if files else ""
-    )
+    """Return the warning of a page that is made with edited files, or "" without any."""
+    warning, files = "Made with files that were edited after drivax wrote them:", edited_files()
+    return f"<p><b>{warning}</b> {', '.join(map(escape, files))}.</p>" if files else ""
 
 
 def section(title: str, *parts: str, note: str = "", attributes: str = "") -> str:

@@ -53,7 +53,7 @@ def write_report(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: ``out`` exists, no run is given, or ``episodes`` is negative.
+        UsageError: ``out`` exists, no run is given or one twice, or ``episodes`` is negative.
     """
     check_output(out, overwrite)
     if episodes < 0:
@@ -296,7 +296,9 @@ _SHOWN = (
 def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[ScenarioKey, int]) -> str:
     """Return the data of the list as a script element; ``playable`` has the player's index of each shown episode.
 
-    - ``metrics``: label of each metric, and the value of a rate that means failure.
+    - ``scenarios``: ids; ``played`` has the player's index by index of the scenario.
+    - ``metrics``: label of each metric, and the value of a rate that means failure; ``shown`` has the indices of those
+      that are columns of the list.
     - ``runs[].values``: a column per metric, worst row first, with four significant digits; null where undefined.
     - ``runs[].errors``: step and error of each crash by row.
     - ``tags``: words of each tag, and their indices for each scenario.

@@ -70,7 +70,8 @@ def replace_traffic(scenario: Scenario, rollout: Rollout) -> Scenario:
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False
     record["agent_valid"][steps, slots] = present
-    record["agent_xy"][steps, slots], record["agent_heading"][steps, slots] = (poses[..., :2], poses[..., 2])
+    record["agent_xy"][steps, slots] = poses[..., :2]
+    record["agent_heading"][steps, slots] = poses[..., 2]
     return replace(scenario, record=record)
 
 
@@ -175,14 +176,14 @@ class Drawing:
         yield from self.parked.shapes(step)
         yield from self.agents.shapes(step)
 
-    def ego(self, path: Float[Array, "step _"], step: int, logged: bool = True) -> Iterator[Shape]:
-        """Yield ego at a step: its path so far, the dashed box of the log (``logged``), its box and its arrow.
+    def ego(self, path: Float[Array, "step _"], step: int, with_log: bool = True) -> Iterator[Shape]:
+        """Yield ego at a step: its path so far, the dashed box of the log (``with_log``), its box and its arrow.
 
         ``path`` has position and heading at every step, NaN where ego is absent.
         """
         path, size = path[: step + 1], self.log.size[0]
         yield Shape([path[np.isfinite(path).all(axis=1), :2]], "ego", level=4.5)
-        if logged and self.log.valid[step, 0]:
+        if with_log and self.log.valid[step, 0]:
             box = _outline(self.log.xy[step, 0], self.log.heading[step, 0], size)
             yield Shape([box], "log", dash=(4.0, 3.0), level=5)
         if np.isfinite(path[-1]).all():

@@ -137,13 +137,8 @@ def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
 def _draw(axes: Axes, config: ObservationConfig, groups: ObservationGroups) -> None:
     if config.road:
         _draw_reach(axes, config)
-    layers = (
-        ("road", _draw_road),
-        ("route", _draw_route),
-        ("lights", _draw_lights),
-        ("agents", _draw_agents),
-    )
-    for group, draw in layers:
+    layers = {"road": _draw_road, "route": _draw_route, "lights": _draw_lights, "agents": _draw_agents}
+    for group, draw in layers.items():
         if groups.has(group, "position"):
             draw(axes, groups)
     _draw_ego(axes, groups)
@@ -175,11 +170,11 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
         kinds = groups["road", "type"][mask]
     half = direction * length / 2
     pieces = _to_paper(np.stack([middle - half, middle + half], axis=1))
-    for number, (colour, width) in enumerate(_ROADS.values()):
-        of_kind = kinds[:, number] > 0
+    for number, (kind, (colour, width)) in enumerate(_ROADS.items()):
+        is_kind = kinds[:, number] > 0
         style: dict[str, Any] = {"linewidths": width, "capstyle": "butt", "zorder": 1.5 - number / 4}
-        collection = LineCollection(list(pieces[of_kind]), colors=LIGHT[colour], **style)
-        if number == 2:
+        collection = LineCollection(list(pieces[is_kind]), colors=LIGHT[colour], **style)
+        if kind == "crosswalk":
             collection.set(linestyles=[(0, (0.5, 0.5))], alpha=0.55)
         axes.add_collection(collection)
     lanes = kinds[:, 0] > 0
@@ -211,7 +206,7 @@ def _draw_lights(axes: Axes, groups: ObservationGroups) -> None:
 
 
 def _opacity(step: int, steps: int) -> float:
-    """Return the opacity of a pose: 1 at the last step, the less the earlier before it."""
+    """Return the opacity of a pose: 1 at the last step, lower at earlier ones."""
     return 1.0 if step == steps - 1 else 0.12 + 0.3 * step / steps
 
 

@@ -27,7 +27,7 @@ Array = np.ndarray[Any, Any]
 #: Marks an absent pose or value.
 ABSENT = -32768
 #: Packed headings per radian, and largest packed value: int16 holds little more.
-_PER_RADIAN, _MOST = 10_000, 32_000
+_PER_RADIAN, _MAX_VALUE = 10_000, 32_000
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Scale:
         low, high = np.array(box[:2]), np.array(box[2:])
         centre = (low + high) / 2
         reach = float((high - low).max()) / 2 + 10.0
-        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach / _MOST))
+        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach / _MAX_VALUE))
 
     def points(self, xy: Array) -> Array:
         """Return points ``[..., 2]`` as int16."""
@@ -65,7 +65,8 @@ class Scale:
 def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) -> dict[str, Any]:
     """Return one scenario and its rollouts as JSON values.
 
-    Arrays are little-endian int16 in base64, in C order. Other agents move as in the last rollout.
+    Arrays are little-endian int16 (``lights.state``: int8) in base64, in C order. Other agents move as in the last
+    rollout.
 
     - ``map``: by layer, the number of points of each line and the points of all lines.
     - ``agents.pose``: ``[agent, step, 3]``.
@@ -131,7 +132,7 @@ def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
 def _rollout(rollout: Rollout, scale: Scale, steps: int) -> dict[str, Any]:
     ego = np.asarray(rollout.ego, np.float64)[:steps]
     valid = np.asarray(np.isfinite(ego).all(axis=1))
-    speed = np.clip(np.round(np.where(valid, ego[:, 3], 0.0) * 100), -_MOST, _MOST)
+    speed = np.clip(np.round(np.where(valid, ego[:, 3], 0.0) * 100), -_MAX_VALUE, _MAX_VALUE)
     return {
         "planner": rollout.planner,
         "pose": _encode(scale.poses(ego[:, :2], ego[:, 2], valid)),
@@ -153,5 +154,5 @@ def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None)
 
 
 def _signal(signal: Signal, values: Float[Array, " step"]) -> str:
-    rounded = np.clip(np.round(values / signal.step), -_MOST, _MOST)
+    rounded = np.clip(np.round(values / signal.step), -_MAX_VALUE, _MAX_VALUE)
     return _encode(np.where(np.isnan(rounded), ABSENT, rounded).astype(np.int16))

@@ -47,8 +47,9 @@ def draw_scenario(
     except ImportError as error:
         raise missing_package(error) or error from error
     path = None if ego is None else np.asarray(ego, dtype=np.float64)
-    logged = scenario.agent_xy[step, 0]
-    centre = logged if path is None or not np.isfinite(path[step]).all() else path[step, :2]
+    centre = scenario.agent_xy[step, 0]
+    if path is not None and np.isfinite(path[step]).all():
+        centre = path[step, :2]
     colours, legend_in = THEMES[theme], _LEGEND_IN if legend else 0.0
     height_in = 7 + legend_in
     figure = Figure(figsize=(7, height_in), dpi=110, facecolor=colours["ground"])
@@ -86,11 +87,11 @@ def draw_on(
     # Shapes whose centre lies up to 5 m outside may reach into the square.
     (x, y), half_size_m = centre, reach_m + 5.0
     drawing = Drawing.of(scenario, (x - half_size_m, y - half_size_m, x + half_size_m, y + half_size_m))
-    logged = path is not None
+    with_log = path is not None
     if path is None:
         path = np.column_stack((scenario.agent_xy[:, 0], scenario.agent_heading[:, 0])).astype(np.float64)
         path[~scenario.agent_valid[:, 0]] = np.nan
-    for shape in (*drawing.ground(), *drawing.traffic(step), *drawing.ego(path, step, logged)):
+    for shape in (*drawing.ground(), *drawing.traffic(step), *drawing.ego(path, step, with_log)):
         _draw(axes, colours, shape)
     axes.set(xlim=(x - reach_m, x + reach_m), ylim=(y - reach_m, y + reach_m))
     axes.set_aspect("equal")

@@ -289,11 +289,10 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
     absent = not np.isfinite(rollout.ego[step]).all()
     speed = "gone" if absent else f"{rollout.ego[step, 3]:.1f} m/s"
     canvas.text(canvas.width - 10, 20, f"{speed}   {step * dt_s:.1f} s", 12, right=True)
-    past_events = [
-        name for name in rollout.events if 0 <= rollout.events[name] <= step and name in EVENT_WORDS
-    ]
-    for line, name in enumerate(past_events):
-        text = f"✕ {EVENT_WORDS[name]} at {rollout.events[name] * dt_s:.1f} s"
+    events = ((name, first) for name, first in rollout.events.items() if name in EVENT_WORDS)
+    past_events = ((name, first) for name, first in events if 0 <= first <= step)
+    for line, (name, first) in enumerate(past_events):
+        text = f"✕ {EVENT_WORDS[name]} at {first * dt_s:.1f} s"
         canvas.text(10, _BAR + 18 + 16 * line, text, 12, "mark")
     _scale_bar(canvas, scale)
     return canvas.pixels()
