@@ -82,7 +82,7 @@ FINDINGS: Mapping[str, Quantity] = {
     "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
     "lights_seen": Quantity("number", "lights with an observed state"),
     "ignored_overlaps": Quantity(
-        "number", "most agents at a step that overlap ego since they appeared and are ignored"
+        "number", "most agents at a step that have overlapped ego since they appeared"
     ),
     "clipped_physical": Quantity("number", f"{_EXCEEDS} `physical` and `discrete`"),
     "clipped_published": Quantity("number", f"{_EXCEEDS} `published`"),
