@@ -312,7 +312,6 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 def check(recording: Recording, capacity: Capacity) -> None:
     """Refuse an invalid recording."""
-    # Each check relies on those before it.
     finding = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     finding = finding or _check_tracks(recording) or _check_extent(recording)
     finding = finding or _check_map(recording) or _check_lights(recording)

@@ -175,7 +175,7 @@ def _requested_facts(
     bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
 ) -> dict[str, Array]:  # fmt: skip
-    """Return the facts measured on request; those outside ``reads`` have placeholders."""
+    """Return the facts measured on request; placeholders for those outside ``reads``."""
     facts: dict[str, Array] = dict.fromkeys(ON_REQUEST, jnp.zeros(()))
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if reads & _SCHEDULE:

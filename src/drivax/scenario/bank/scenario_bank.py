@@ -174,8 +174,7 @@ class ScenarioBank:
         lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.pack_sides``).
-        grid_origin: Smallest x, y of the grid.
-        map_box: Smallest and largest x, y of edges and lanes.
+        grid_origin, map_box: Smallest x, y of the grid; smallest and largest x, y of edges and lanes.
         routes, route_points: Points 1 m apart of the routes to the goals, :class:`RouteColumn`, and their numbers.
         on_lanes: Whether the route lies on lanes; otherwise it is the logged path, which is privileged.
         goal: End of the log on the route: x, y.

@@ -374,10 +374,9 @@ def _crossings(line: Numbers, points: Numbers, spacing: Numbers) -> Float[np.nda
 
 
 def _stops(arc: Numbers, heading: Numbers, spacing: float, exits: Numbers) -> list[tuple[float, int]]:
-    """Return the stops of a path in order: arc length, and the light that counts.
+    """Return a path's stops in order: arc length, and the light whose lane ends closest to the heading 20 m beyond.
 
-    That is the light whose lane ends closest to the heading of the path 20 m beyond. ``arc`` are the arc lengths at
-    which the path crosses each line, ``exits`` the headings at the ends of their lanes.
+    ``arc`` are the arc lengths at which the path crosses each line, ``exits`` the headings at the ends of their lanes.
     """
     groups: list[list[int]] = []
     for light in (int(light) for light in np.argsort(arc) if np.isfinite(arc[light])):
