@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import jax
@@ -25,6 +26,17 @@ from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
 
 BANK = bank_of(straight_road([car(speed=10.0), car(30.0), car(0, 3.7, 0, 9)], light=RED))
+
+
+def test_step_metrics_of_no_values_are_empty():
+    simulator = Simulator(evaluation_task(Task()))
+
+    def read(values):
+        return steps.step_metrics(simulator.situation(BANK, simulator.reset(BANK, 0)), values)
+
+    immediate = {name for name, value in STEP_VALUES.items() if not value.delayed}
+    assert jax.eval_shape(partial(read, ())) == {}
+    assert jax.eval_shape(partial(read, None)).keys() == immediate
 
 
 #: Work that only some metrics need.

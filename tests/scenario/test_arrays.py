@@ -91,9 +91,10 @@ def test_invalid_entries_may_hold_anything(agents, roads):
 
 def test_heights_are_required_where_roads_have_them(agents, roads):
     np.testing.assert_allclose(recording_from_arrays("a", agents, roads).tracks.z[:, 40], [0.75, 0.9])
-    roads["lanes"][0]["points"] = [(-50, 0, 0), (50, 0, 3)]
-    with pytest.raises(UsageError, match=r'agents\["z"\] is missing'):
-        recording_from_arrays("a", agents, roads)
+    for heights in ((0, 3), (5, 5)):
+        roads["lanes"][0]["points"] = [(-50, 0, heights[0]), (50, 0, heights[1])]
+        with pytest.raises(UsageError, match=r'agents\["z"\] is missing'):
+            recording_from_arrays("a", agents, roads)
     agents["z"] = np.full((2, 91), 2.0)
     assert recording_from_arrays("a", agents, roads).tracks.z[0, 3] == 2.0
 

@@ -187,8 +187,8 @@ def score(metrics: Inputs, weights: Mapping[str, float], gates: tuple[str, ...])
     """Return a full and a partial score: a weighted mean of metrics, times the gates.
 
     Gates multiply the mean by 1 minus their value; progress and direction multiply it by their value. The full score
-    is defined if all inputs are. The partial score is defined if some input is not: undefined terms are removed from
-    the mean, and undefined gates count as passed.
+    is defined if all inputs are. The partial score is defined if some input is not and some term of the mean is:
+    undefined terms are removed from the mean, and undefined factors count as 1.
     """
     terms = jnp.stack([jnp.clip(metrics[name].value, 0.0, 1.0) for name in weights])
     term_defined = jnp.stack([metrics[name].defined for name in weights])
@@ -295,13 +295,13 @@ METRICS: dict[str, Metric] = {
         label="wrong way within 1 s", needs=_LANES),
     "direction": _derived_metric(
         partial(_grade, "wrong_way_worst", 2.0, 6.0), ("wrong_way_worst",), "high",
-        "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s"),
+        "1 up to 2 m against traffic within 1 s, 0.5 up to 6 m, else 0"),
     "lane_straddle": _step_metric(
         "lane_straddle", "sum", "s", "low", "time across the border of ego's lanes", needs=_LANES),
     # A margin of 1 ms absorbs the rounding of sums of 0.1 s in float32.
     "lane_keeping": _derived_metric(
         partial(_grade, "lane_straddle", 3.401, 5.701), ("lane_straddle",), "high",
-        "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer"),
+        "1 up to 3.4 s of straddling, 0.5 up to 5.7 s, else 0"),
     "progress": _step_metric(
         "progress", "last", "m", "high", "distance gained along the route",
         label="progress along the route", needs=_ROUTE, compute=_progress),
@@ -325,7 +325,7 @@ METRICS: dict[str, Metric] = {
         "within 3 m of the goal, or progress ratio at least 0.95", label="goal reached", **_RATE),
     "distance": _step_metric("distance", "sum", "m", "-", "distance driven"),
     "ignored_overlaps": _step_metric(
-        "ignored", "max", "-", "-", "agents ignored because they overlapped at the start"),
+        "ignored", "max", "-", "-", "most agents at a step that have overlapped ego since they appeared"),
     "steps": _derived_metric(_steps, (), "-", "steps driven", summarised=False),
     "last_step": _derived_metric(_last_step, (), "-", "last step of the log", summarised=False),
     "log_lead": _step_metric(

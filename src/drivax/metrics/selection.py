@@ -49,17 +49,22 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     The last word of a dotted name (``package.module:name``) is the name of a user-defined metric.
 
     Raises:
-        UsageError: A set or metric is unknown, or two metrics have the same name.
+        UsageError: A set, metric or input is unknown, a dotted name is no metric, or two metrics have the same name.
     """
-    requested: dict[str, None] = {}
+    requested: list[str] = []
     own: dict[str, Metric] = {}
     for entry in (names,) if isinstance(names, str) else names:
         if is_dotted(entry):
             name = entry.rpartition(":")[2].rpartition(".")[2]
             own[name] = _own_metric(entry, name, own)
-            requested[name] = None
+            requested.append(name)
+        elif entry in SETS:
+            requested += SETS[entry]
+        elif entry in METRICS:
+            requested.append(entry)
         else:
-            requested |= dict.fromkeys(SETS[entry] if entry in SETS else (_check_name(entry),))
+            raise UsageError(f"unknown metric {entry!r}", cure=did_you_mean(entry, [*SETS, *METRICS]))
+    requested = list(dict.fromkeys(requested))
     metrics: dict[str, Metric] = {}
     for name in requested:
         _add_with_inputs(name, METRICS | own, metrics)
@@ -77,12 +82,6 @@ def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
     return MappingProxyType({name: specs[name] for name in selection.names})
 
 
-def _check_name(name: str) -> str:
-    if name not in METRICS:
-        raise UsageError(f"unknown metric {name!r}", cure=did_you_mean(name, [*SETS, *METRICS]))
-    return name
-
-
 def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     metric = find_named(entry)
     if not isinstance(metric, Metric):
@@ -91,9 +90,8 @@ def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
         raise UsageError(f"{entry!r}: the metric {name!r} already exists", cure="choose another name")
     for input_name in metric.inputs:
         if input_name not in METRICS and input_name not in others:
-            raise UsageError(
-                f"{entry!r}: unknown input {input_name!r}", cure=did_you_mean(input_name, [*METRICS])
-            )
+            problem = f"{entry!r}: unknown input {input_name!r}"
+            raise UsageError(problem, cure=did_you_mean(input_name, [*METRICS]))
     return metric
 
 

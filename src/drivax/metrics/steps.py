@@ -48,7 +48,7 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and a mask of final values: the oldest, at the end of the episode all."""
+        """Comfort of the last twelve steps, and a mask of final values after the start: the oldest, at the end all."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
@@ -135,9 +135,11 @@ def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None
     The situation must contain the facts that the values read (with ``metrics: full`` it contains all facts). Comfort
     needs the eleven following steps; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
     """
+    if values is None:
+        values = [value for value in STEP_VALUES.values() if not value.delayed]
     moment = Moment(situation, situation.context.step, jnp.zeros((), bool))
     result = {}
-    for value in values or [value for value in STEP_VALUES.values() if not value.delayed]:
+    for value in values:
         number, defined = value.read(moment)
         result[value.name] = Value(number.astype(jnp.float32), jnp.asarray(defined, bool))
     return result

@@ -55,7 +55,7 @@ def recording_from_arrays(
         dataset: Short name of the source.
 
     Raises:
-        UsageError: An argument is missing, misspelt, or has another shape.
+        UsageError: An argument is missing or misspelt, or has another shape or an invalid value.
     """
     if abs(dt_s - DT_S) > 1e-3:
         cure = f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out"
@@ -63,8 +63,8 @@ def recording_from_arrays(
     _check_keys(agents, _AGENT_KEYS, "agents")
     _check_keys(roads, _ROAD_KEYS, "roads")
     features = tuple(_features(roads))
-    uneven = any(np.ptp(feature.points[:, 2]) > 0 for feature in features)
-    tracks = _tracks(agents, ego, needs_height=uneven)
+    has_heights = any(feature.points[:, 2].any() for feature in features)
+    tracks = _tracks(agents, ego, needs_z=has_heights)
     steps = tracks.valid.shape[1]
     lanes = features[: len(roads.get("lanes", ()))]
     return Recording(
@@ -143,11 +143,11 @@ def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | 
         raise UsageError(
             f'agents["{name}"] is not an array of numbers', cure="give one row per agent"
         ) from error
-    if values.ndim != len(shape) or any(
-        size not in (None, own_size) for size, own_size in zip(shape, values.shape, strict=True)
-    ):
-        problem = f"has shape {values.shape}, not {tuple('any' if size is None else size for size in shape)}"
-        raise UsageError(f'agents["{name}"] {problem}', cure="see recording_from_arrays")
+    sizes = [own if size is None else size for size, own in zip(shape, values.shape, strict=False)]
+    if values.ndim != len(shape) or values.shape != tuple(sizes):
+        expected = tuple("any" if size is None else size for size in shape)
+        problem = f'agents["{name}"] has shape {values.shape}, not {expected}'
+        raise UsageError(problem, cure="see recording_from_arrays")
     return values
 
 
@@ -156,7 +156,7 @@ def _zero_invalid(values: Array, valid: Array) -> Array:
     return np.where(valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim)), values, 0.0)
 
 
-def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
+def _tracks(agents: Mapping[str, Any], ego: int, needs_z: bool) -> Tracks:
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
     xy = _zero_invalid(_array(agents, "xy", float, (count, steps, 2)), valid)
@@ -170,7 +170,7 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
         velocity = differentiate(xy, valid, np.arange(steps) * DT_S)
     if "z" in agents:
         z = _zero_invalid(_array(agents, "z", float, (count, steps)), valid)
-    elif needs_height:
+    elif needs_z:
         raise UsageError('the roads have heights, agents["z"] is missing', cure="give z of the box centres")
     else:
         default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])[:, None]

@@ -17,7 +17,7 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, NAMES, STEPS, AgentKind, 
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
-#: A recording with steps that differ more from the median is resampled; longer ones (in median steps) are gaps.
+#: Deviation of a step from the median above which a recording is resampled, s; length of a gap, in median steps.
 LATE_S, GAP_STEPS = 0.02, 2.5
 DATASET_BYTES = 16
 #: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
@@ -132,12 +132,14 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
     make three). Windows without a valid ego at the current step are dropped, and counted in ``lost`` of the others as
     ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
 
-    No window spans a gap of two or more frames: each side is cut on its own, and ``lost`` counts the ``time_gaps``.
-    Where no side fills a window, the longest one is the window. A side with a frame more than 20 ms early or late, such
-    as one after a dropped frame, is interpolated at even times; ``interpolated_steps`` counts steps without a frame.
+    No window spans a gap of two or more missing frames: the pieces between gaps are cut on their own, and ``lost``
+    counts the ``time_gaps``. If no piece fills a window, the longest one with a valid ego is the window. A piece with a
+    step that differs by more than 20 ms from the median, such as one across a missing frame, is interpolated at even
+    times; ``interpolated_steps`` counts steps without a frame.
 
     Raises:
-        DataError: No window has a valid ego at its current step.
+        DataError: A recording that is cut has no window with a valid ego at its current step.
+        UsageError: ``stride`` is below 1.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
@@ -291,7 +293,11 @@ def _cut(recording: Recording, part: slice) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another vehicle, valid at the current step, as the ego, without route and ``seen``."""
+    """Return the recording with another vehicle as the ego: without route and ``seen``, its id with the track's.
+
+    Raises:
+        UsageError: The track is not a vehicle that is valid at the current step.
+    """
     tracks = recording.tracks
     is_vehicle = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
     if not is_vehicle or not tracks.valid[row, recording.current_step]:
@@ -306,11 +312,12 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 def check(recording: Recording, capacity: Capacity) -> None:
     """Refuse an invalid recording."""
-    problem = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
-    problem = problem or _check_tracks(recording) or _check_extent(recording)
-    problem = problem or _check_map(recording) or _check_lights(recording)
-    if problem is not None:
-        raise DataError(problem[0], record=recording.scenario_id, cure=problem[1])
+    finding = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
+    finding = finding or _check_tracks(recording) or _check_extent(recording)
+    finding = finding or _check_map(recording) or _check_lights(recording)
+    if finding is not None:
+        problem, cure = finding
+        raise DataError(problem, record=recording.scenario_id, cure=cure)
 
 
 def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
@@ -330,10 +337,8 @@ def _check_names(recording: Recording) -> Finding:
     for name in NAMES:
         text = getattr(recording, name)
         if not text or any(character < " " for character in text):
-            return (
-                f"{name} {text[:80]!r} is empty or contains control characters",
-                f"set {name} in the reader",
-            )
+            problem = f"{name} {text[:80]!r} is empty or contains control characters"
+            return problem, f"set {name} in the reader"
     if len(recording.dataset.encode()) > DATASET_BYTES:
         problem = f"dataset {recording.dataset[:80]!r} is longer than {DATASET_BYTES} bytes"
         return problem, "shorten it in the reader"

@@ -14,9 +14,9 @@ def lane_count(scenario: Scenario) -> int:
 
 
 def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:
-    """Centre line of every car lane in the local frame, in the order of the lane graph.
+    """Centre line of every lane of the lane graph in the local frame.
 
-    A lane of which no segment is stored has no points.
+    Bike lanes, and lanes of which no segment is stored, have no points.
     """
     first, last = (int(end) for end in scenario.segment_blocks[1:3])
     lane, start_m = scenario.segment_lane[first:last], scenario.segment_start_m[first:last]

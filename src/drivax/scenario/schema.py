@@ -154,9 +154,9 @@ class Capacity:
     egos: int = 1
 
     def lasting(self, future_s: float) -> Capacity:
-        """Return the capacity of scenarios with this many seconds after the current step, 2 to 60.
+        """Return the capacity of scenarios with ``future_s`` seconds after the current step, 2 to 60.
 
-        Routes get 40 m of room per second more than 8 s (144 km/h).
+        Each second beyond 8 s adds 40 m to the room for routes (144 km/h).
 
         Raises:
             UsageError: ``future_s`` is out of range.
@@ -171,7 +171,7 @@ class Capacity:
         return replace(self, name=name, steps=steps, route_points=points)
 
     def with_egos(self, egos: int) -> Capacity:
-        """Return the capacity of scenarios with routes for up to 1 to 8 egos.
+        """Return the capacity of scenarios with routes for ``egos`` egos, 1 to 8.
 
         Raises:
             UsageError: ``egos`` is out of range.

@@ -67,7 +67,7 @@ AGAIN = "convert or generate the set again"
 _PAGE = 4096
 #: Bytes of the largest manifest that is read, of some 500,000 scenarios; sparse shards may claim any size.
 _MOST_MANIFEST = 1 << 30
-#: Scenarios that an iteration reads at a time, and those of a task of a thread.
+#: Scenarios that an iteration reads at a time, and that a thread reads in one task.
 _BATCH, _PART = 64, 8
 #: Threads map a shard once.
 _MAP_LOCK = threading.Lock()
@@ -133,13 +133,13 @@ class ScenarioWriter:
             self.notes.append(part["note"])
         self._known = {_key(entry) for entry in self._entries}
         names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
-        for entry in self._partial.content.iterdir():  # Remove a shard that was never closed.
+        for entry in self._partial.content.iterdir():  # Remove unfinished shards and files.
             if entry.name not in names:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return self
 
     def _is_finished(self, part: Mapping[str, Any]) -> bool:
-        """Whether a closed shard is full (the last one of the data is not) and exactly as it was written."""
+        """Whether a closed shard is as it was written, and full: a last shard that is not is written again."""
         if not part["shard"]["count"] == len(part["scenarios"]) == self._shard_size:
             return False
         with contextlib.suppress(DataError):
@@ -214,9 +214,8 @@ class ScenarioWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
             with explain_full_disk(self.path, self._buffer.dtype.itemsize):
-                if isinstance(
-                    error, OSError | FullDiskError
-                ):  # Raised in this block, a full disk is explained.
+                # Raise an error of the body again, so that a full disk is reported with the path of the set.
+                if isinstance(error, OSError | FullDiskError):
                     raise error
                 if kind is None:
                     self._finish()
@@ -279,8 +278,8 @@ class ScenarioSet(Sequence[Scenario]):
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
         """Open a set.
 
-        Shards and entries are compared with the digests of the manifest (sets of earlier versions have none), and the
-        first and the last record of each shard with their entries; no record is read as a whole.
+        The manifest and the checksum files are compared with their digests (sets of earlier versions have none), and
+        the names in the first and the last record of each shard with their entries; no record is read as a whole.
 
         Raises:
             DataError: The manifest or a shard is damaged, or belongs to another set or to another place in this one.
@@ -303,12 +302,13 @@ class ScenarioSet(Sequence[Scenario]):
             yield from self[first : first + _BATCH]
 
     def take(self, indices: Iterable[int]) -> list[Scenario]:
-        """Return scenarios; threads test the checksums of the ones that were not read before."""
+        """Return scenarios; threads test the checksums of those that were not read before."""
         numbers = list(indices)
+        if not self.verify:
+            return [self[number] for number in numbers]
         parts = [numbers[first : first + _PART] for first in range(0, len(numbers), _PART)]
         with ThreadPoolExecutor() as pool:  # zlib releases the lock of the interpreter
-            read = pool.map if self.verify else map
-            return list(chain.from_iterable(read(lambda part: [self[number] for number in part], parts)))
+            return list(chain.from_iterable(pool.map(lambda part: [self[number] for number in part], parts)))
 
     def __getitem__(self, index: Any) -> Any:
         """Return a scenario (a view of the file), or a list for a slice."""
@@ -330,7 +330,7 @@ class ScenarioSet(Sequence[Scenario]):
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) over those of the shards; entries (tags, audit) have one of their own in the manifest."""
+        """SHA-256 (hex) over those of the shards; it does not cover the entries of the manifest (tags, audit)."""
         digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
         return hashlib.sha256(digests.encode()).hexdigest()
 
@@ -379,7 +379,7 @@ def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
 class Shard:
     """A shard file: expected layout, memory map, and a mask of the records that passed their checksum.
 
-    ``entry`` is that of the shard in the manifest, ``scenarios`` are those of its records.
+    ``entry`` is the shard's entry in the manifest, ``scenarios`` are those of its records.
     """
 
     def __init__(
@@ -424,9 +424,9 @@ class Shard:
         fields = self._dtype.fields or {}
         for name in NAMES:
             size, begin = fields[name][0].itemsize, fields[name][1]
-            expected = stored_name(text := str(self._scenarios[row][name]), size)
-            if data[begin : begin + size].tobytes().rstrip(b"\0") != expected:
-                problem = f"{name} is not {text!r}, that of the manifest: half copied, or another shard"
+            expected = str(self._scenarios[row][name])
+            if data[begin : begin + size].tobytes().rstrip(b"\0") != stored_name(expected, size):
+                problem = f"{name} is not {expected!r}, that of the manifest: half copied, or another shard"
                 raise self._damage(problem, row)
 
     def record(self, row: int, verify: bool) -> _Bytes:
@@ -445,11 +445,11 @@ class Shard:
         self._check_file("sha256")
 
     def _check_file(self, key: str) -> None:
-        """Compare a file's SHA-256 with the manifest's; earlier versions stored none of the checksums."""
+        """Compare a file's SHA-256 with the manifest's; sets of earlier versions have none of checksum files."""
         path = self.crc_path if key == "crc_sha256" else self.path
         if self._entry.get(key) not in (None, file_digest(path)):
-            problem, cure = "SHA-256 differs from the manifest's", f"copy the whole set again or {AGAIN}"
-            raise DataError(f"{problem}: damaged, or of another set", file=path, cure=cure)
+            problem = "SHA-256 differs from the manifest's: damaged, or of another set"
+            raise DataError(problem, file=path, cure=f"copy the whole set again or {AGAIN}")
 
     def _map(self) -> _Bytes:
         with _MAP_LOCK:
@@ -537,7 +537,7 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
             raise ValueError(f"shard {number} has no checksum")
     for number, entry in enumerate(manifest["scenarios"]):
         SourceCounts(**entry["source"])
-        if tuple(map(type, itemgetter(*_ENTRY)(entry))) != tuple(_ENTRY.values()):
+        if any(type(entry[name]) is not kind for name, kind in _ENTRY.items()):
             raise ValueError(f"scenario {number} has a value of another type")
     if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
         raise DataError("field table is not this version's", file=file, cure=AGAIN)

@@ -123,7 +123,7 @@ class Simulator:
     ) -> SimState:  # fmt: skip
         """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
-        All start as logged: a noisy start supports a single driven agent.
+        ``start`` must be :class:`LogStart`: a noisy start knows no other driven agents.
         """
         contexts = jax.vmap(partial(self.context, bank, index, step))(slots, keys)
         return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)

@@ -34,7 +34,7 @@ from drivax.simulator.types import (
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
-#: Steps before the start of an episode in which a lane change may begin.
+#: Rows of the history, the present one included, in which a lane change may begin before an episode.
 _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
@@ -175,7 +175,7 @@ def _requested_facts(
     bank: ScenarioBank, context: AgentContext, frame: Frame, codes: Int[Array, " S"], reads: frozenset[str],
     strand: Any,
 ) -> dict[str, Array]:  # fmt: skip
-    """Return the facts measured on request; those outside ``reads`` are zero."""
+    """Return the facts measured on request; placeholders for those outside ``reads``."""
     facts: dict[str, Array] = dict.fromkeys(ON_REQUEST, jnp.zeros(()))
     facts |= {"strand": jnp.int16(-1)} | dict.fromkeys(("lane_changed", "merged"), jnp.zeros((), bool))
     if reads & _SCHEDULE:

@@ -205,7 +205,7 @@ class Route(Physical):
     offset_m: float = 3.5
 
     def steer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
-        """Return the action of :class:`Physical` that steers to the offset of an action, clipped to its bounds."""
+        """Return the action of :class:`Physical` that steers to the offset of an action; only the offset is clipped."""
         offset_m = self.offset_m * jnp.clip(action[1], -1.0, 1.0)
         curvature = follow_route(bank, context, offset_m)
         return jnp.stack([action[0], curvature / self.steering])

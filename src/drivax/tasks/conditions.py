@@ -71,9 +71,8 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
             cure = f"give {terms[0]} a weight" if terms else did_you_mean(name, [*weights, *options])
             raise UsageError(f"condition {name}: not in the reward", cure=cure)
         if condition.high > options.get(name, math.inf):
-            raise UsageError(
-                f"condition {name}: high is {condition.high}", cure=f"use at most {options[name]:g}"
-            )
+            problem = f"condition {name}: high is {condition.high}"
+            raise UsageError(problem, cure=f"use at most {options[name]:g}")
         if names.count(name) > 1:
             raise UsageError(f"condition {name} occurs twice", cure="name it once")
 

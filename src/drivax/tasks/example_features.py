@@ -73,7 +73,7 @@ def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) ->
 def recommended_speed(
     bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
-    """Return the recommended speed at ten route points 5 m apart, ``clip(30 - 25 |k|, 5, 30)`` m/s, in 15 m/s."""
+    """Return ``clip(30 - 25 |k|, 5, 30)`` m/s at ten route points 5 m apart, in units of 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
     _, valid = route_ahead(bank, context.row, context.route_m, offsets)
     curvature = features.route_curvature(bank, context.row, context.route_m + offsets)
@@ -103,8 +103,8 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:
     """Return the inputs of a car-following driver along the route.
 
-    Gap to the leader or a light that requires a stop, at most 90 m, in 50 m; closing speed and speed of the leader, in
-    15 m/s (0 without one); whether there is one; speed by the limit and the curves ahead, in 15 m/s.
+    Gap to the leader or a light that requires a stop, at most 90 m, in units of 50 m; closing speed and speed of the
+    leader (0 without one); whether there is one; speed by the limit and the curves ahead. Speeds in units of 15 m/s.
     """
     speed = context.history[-1, MOTION_SPEED]
     inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)
@@ -115,9 +115,10 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
-    """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether one exists.
+    """Return the distance to the next stop line on the route, whether its light is red, and whether there is one.
 
-    Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
+    The distance is from the front bumper, in units of 50 m; 1 without a line. Lines beyond 50 m, behind the bumper or
+    without an observed light do not count.
     """
     arc = bank.light_line[context.index, LightRow.ARC + bank.ego_number(context.row)]
     line_m = arc - context.route_m

@@ -84,7 +84,7 @@ class ObservationConfig:
         lanes, edges, crosswalks: Layers of the road group.
         road_ahead_m, road_behind_m, road_side_m: Range of the road group ahead, behind and to each side.
         road_cut: Number of rows per road piece (of at most 10 m), which is cut along its chord into equal parts.
-        lights: Number of the nearest lights on or near the route.
+        lights: Number of lights: those on the route first, then the others, each by distance.
         route: Points of the route, ``route_step_m`` apart.
         features: Columns of each group.
         perception: Errors of perception; none by default.
@@ -117,9 +117,8 @@ class ObservationConfig:
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
         if self.road_cut < 1 or self.road % self.road_cut:
-            raise ValueError(
-                f"observation.road_cut is {self.road_cut}; use a number that divides road ({self.road})"
-            )
+            cure = f"use a number that divides road ({self.road})"
+            raise ValueError(f"observation.road_cut is {self.road_cut}; {cure}")
 
     @classmethod
     def preset(cls, name: str) -> ObservationConfig:

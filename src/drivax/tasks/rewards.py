@@ -204,8 +204,8 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane that ends within
-# 100 m or joins another (``scenario.bank.queries.lane_passage``).
+# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane that ends, or joins
+# the new lane, within 100 m (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
@@ -241,7 +241,7 @@ def urgency(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 
 @reward_term("limit_mps", "speed_mps", option="desired_speed")
 def excess_speed(before: Facts, now: Facts, around: Surroundings, desired_speed: Any = 1.0) -> Scalar:
-    """Speed above ``desired_speed`` x the limit over the limit, in [0, 1]; 0 where no limit is known."""
+    """Speed in excess of ``desired_speed`` x the limit, as a share of the limit, in [0, 1]; 0 without a known limit."""
     known = now.limit_mps > 0
     ratio = now.speed_mps / jnp.where(known, now.limit_mps, 1.0)
     return known * jnp.clip(ratio - desired_speed, 0.0, 1.0)
@@ -257,7 +257,7 @@ def time_gap_shortfall(before: Facts, now: Facts, around: Surroundings, time_gap
 # 1 at a step at which a collision begins that is the agent's fault.
 _event_term("at_fault_collision", "at_fault")
 
-#: Terms that lower a softened term, and the share by which each lowers it at 1; at least 0.36 of the term remains.
+#: Terms that lower a softened term, and the share by which each lowers it at 1; at least 0.358 of the term remains.
 SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.2}
 
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
@@ -349,7 +349,7 @@ class RewardConfig(_Weights):
 
     @property
     def reads(self) -> frozenset[str]:
-        """Facts that the terms read; user-defined terms read all that are not on request."""
+        """Facts that the terms read; user-defined terms read all of ``FACTS``, and what they name."""
         reads = {name: term.reads for name, term in TERMS.items()}
         reads |= {term.name: FACTS.union(term.reads) for term in self.own}
         if self.collision_margin_m:
@@ -366,15 +366,14 @@ class RewardConfig(_Weights):
         The reward is the sum of all. ``conditions`` are factors of terms and replacements of options, by name.
         """
         conditions = conditions or {}
+        options = {name: getattr(self, name) for name in OPTIONS} | dict(conditions)
         # A user's term has no option, and is not softened.
         terms = TERMS | {term.name: RewardTerm(term.term, frozenset()) for term in self.own}
         result = {}
         for name, weight in self.weights().items():
             term = terms[name]
-            options = (
-                () if term.option is None else (conditions.get(term.option, getattr(self, term.option)),)
-            )
-            value = self.scale * weight * term(before, now, around, *options)
+            option = () if term.option is None else (options[term.option],)
+            value = self.scale * weight * term(before, now, around, *option)
             value = conditions[name] * value if name in conditions else value
             result[name] = value
             for factor, share in (SOFT_FACTORS if term.softened else {}).items():

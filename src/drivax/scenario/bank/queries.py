@@ -140,8 +140,9 @@ class LaneHits:
     """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near, points_near: A lane centre lies within the cut-off; the same for each corner. Corners outside the map's
-            box are near where the lane nearest to the centre would go on straight, and if that is over 8 m away.
+        near, points_near: A lane centre lies within the cut-off; the same for each corner. A corner outside the map's
+            box is near, too, if it is within the cut-off of the lane nearest to the centre, continued straight, or if
+            no lane is within 8 m of the centre.
         on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
         straddling: Some corner is outside all lanes in the direction of the ego.
@@ -317,7 +318,7 @@ def offroad_by_edges(
 
 
 def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]) -> Int[Array, " P"]:
-    """Code of the side cell of each point (``scenario.build.grid.packed``); 0 outside the grid."""
+    """Code of the side cell of each point (``scenario.build.grid.pack_sides``); 0 outside the grid."""
     grid = round(bank.grid_side.shape[1] ** 0.5)
     fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
     inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
@@ -399,7 +400,7 @@ def light_crossing(
     """Mask of the stop lines that a point crossed forwards between two steps, and its distance before each line, m.
 
     A line is crossed if the signed distance along the heading of its lane changes sign and the point passes through the
-    finite segment. The distance is infinite for lines of other levels and lanes (more than 2 m sideways).
+    finite segment. The distance is infinite for lines on other levels and for those that end more than 2 m to the side.
     """
     line = bank.light_line[index]
     cos, sin, half = line[LightRow.COS], line[LightRow.SIN], line[LightRow.HALF]

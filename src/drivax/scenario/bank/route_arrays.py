@@ -17,7 +17,7 @@ _Arrays = dict[str, np.ndarray[Any, Any]]
 
 
 def interleave(*columns: np.ndarray[Any, Any]) -> Float[np.ndarray, "*n column"]:
-    """Interleave columns in float32; those with one dimension more than the last hold several."""
+    """Interleave columns in float32; arrays with one dimension more than the last hold several columns."""
     rank = columns[-1].ndim
     flat: list[np.ndarray[Any, Any]] = []
     for values in columns:
@@ -49,8 +49,8 @@ def _route_columns(xy: Any, z: Any, heading: Any, limit: Any, lane: Any) -> Floa
 
 
 def _stack_egos(records: Sequence[_Record]) -> _Arrays:
-    last, flags = (stack_field(records, name)[:, None].astype(np.int32) for name in ("steps", "flags"))
-    slot, last, on_lanes = np.zeros_like(last), last - 1, (flags & int(Flag.ROUTE)) > 0
+    steps, flags = (stack_field(records, name)[:, None].astype(np.int32) for name in ("steps", "flags"))
+    slot, last, on_lanes = np.zeros_like(steps), steps - 1, (flags & int(Flag.ROUTE)) > 0
     if most_egos(records) > 1:
         further = [stack_field(records, f"ego_{name}") for name in ("slot", "last_step", "on_lanes")]
         pairs = zip((slot, last, on_lanes), further, strict=True)
@@ -123,7 +123,7 @@ def most_egos(records: Sequence[_Record]) -> int:
 
 
 def of_ego(records: Sequence[_Record], name: str, ego: int, *part: int) -> np.ndarray[Any, Any]:
-    """Stack a field of the k-th ego: ``name``, or the part of it, for the recorded one, ``ego_name`` for others."""
+    """Stack a field of the k-th ego: ``name`` (or ``part`` of it) for the recorded one, ``ego_name`` for others."""
     return stack_field(records, f"ego_{name}", ego - 1) if ego else stack_field(records, name, *part)
 
 

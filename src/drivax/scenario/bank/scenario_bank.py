@@ -103,8 +103,9 @@ class Sizes:
     @classmethod
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
         """Return the sizes that one or more scenarios of one capacity use."""
-        batches = iter(scenarios)
-        batch_sizes = [_batch_sizes(batch) for batch in iter(lambda: list(islice(batches, _BATCH)), [])]
+        remaining, batch_sizes = iter(scenarios), list[Sizes]()
+        while batch := list(islice(remaining, _BATCH)):
+            batch_sizes.append(_batch_sizes(batch))
         if not batch_sizes:
             raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
         return cls(*(max(getattr(sizes, field.name) for sizes in batch_sizes) for field in fields(cls)))
@@ -167,16 +168,17 @@ class ScenarioBank:
         agent_box: Size and kind of all agents, :class:`SizeColumn`.
         parked: Parked agents in their slots, :class:`AgentColumn`.
         parked_when: Steps at which parked agents are observed: bit ``t % 32`` of word ``t // 32``.
-        light_line: Stop lines, :class:`LightRow`.
+        light_line, light_state: Stop lines, :class:`LightRow`, and their ``LightState`` at each step.
         edges, lanes: Segments of road edges (drivable side on the left) and of car lanes, sorted by grid cell,
             :class:`EdgeRow` and :class:`LaneRow`.
         lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.pack_sides``).
-        map_box: Smallest and largest x, y of edges and lanes.
+        grid_origin, map_box: Smallest x, y of the grid; smallest and largest x, y of edges and lanes.
         routes, route_points: Points 1 m apart of the routes to the goals, :class:`RouteColumn`, and their numbers.
         on_lanes: Whether the route lies on lanes; otherwise it is the logged path, which is privileged.
-        log_routes, log_route_points: The same for the logged paths of the recorded egos.
+        goal: End of the log on the route: x, y.
+        log_routes, log_route_points: Points 1 m apart of the logged paths of the recorded egos, and their numbers.
         log_progress, log_ahead: Arc length of the logged ego along its route; distance that it still drives, m.
         road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
         road_at, road_curvature: x, y and layer of the same pieces; their curvature, left positive, 1/m.

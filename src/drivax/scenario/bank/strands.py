@@ -179,10 +179,9 @@ class _Segments:
         lane = (first[has_lane] + index[has_lane]).astype(np.min_scalar_type(len(lanes.scenario)))
         # Keys: the bits of the start, which order floats of one sign, then the index. Integers sort several times
         # faster than np.lexsort.
-        by_start = np.abs(start[has_lane]).view(np.uint32).astype(np.uint64) << 32 | np.arange(
-            len(has_lane), dtype=np.uint64
-        )
-        order = (np.sort(by_start) & 0xFFFFFFFF).astype(np.int64)
+        start_bits = np.abs(start[has_lane]).view(np.uint32).astype(np.uint64)
+        keys = (start_bits << 32) | np.arange(len(has_lane), dtype=np.uint64)
+        order = (np.sort(keys) & 0xFFFFFFFF).astype(np.int64)
         order = order[np.argsort(lane[order], kind="stable")]
         lane, order = lane[order], has_lane[order]
         bounds = np.searchsorted(lane, np.arange(len(lanes.scenario) + 1))

@@ -73,8 +73,8 @@ Record = np.ndarray[Any, Any]
 MARGIN_M, MAP_M = 100.0, 500_000.0
 #: Largest deviation from the median step without ``JITTERED_TIME``, and largest range of heights without ``ELEVATION``.
 JITTER_S, FLAT_M = 0.002, 0.01
-#: Flags that assembly measures; they override those of the reader. ``LIGHTS`` is not among them: a source may know that
-#: there are no lights.
+#: Flags that assembly alone decides; those of the reader are ignored. ``LIGHTS`` is not among them: a source may know
+#: that there are no lights.
 MEASURED = (
     Flag.LANE_GRAPH | Flag.DEFAULT_LIMITS | Flag.SPEED_LIMITS | Flag.CHAINED_GRAPH
     | Flag.CLOSED_EDGES | Flag.OVERFLOW | Flag.ROUTE | Flag.ELEVATION
@@ -118,7 +118,7 @@ class Parts:
 
 
 def count_source(recording: Recording) -> SourceCounts:
-    """Count the features and points of the source, before cropping and capping."""
+    """Count the steps, tracks, map features and lights of the source, before cropping and capping."""
     kinds = np.array([feature.kind for feature in recording.features], dtype=np.int64)
     tracks = recording.tracks
     return SourceCounts(
@@ -230,14 +230,14 @@ def _drop_jumps(recording: Recording) -> Recording:
     """Drop steps of tracks that are not plausible, and count the tracks that lose some."""
     tracks = recording.tracks
     valid = plausible(recording)
-    jumping = (valid != tracks.valid).any(axis=1)
-    if not jumping.any():
+    has_jump = (valid != tracks.valid).any(axis=1)
+    if not has_jump.any():
         return recording
     velocity = tracks.velocity.copy()
     if Flag.DIFFERENTIATED_VELOCITY in recording.flags:
         # Velocities next to a jump were computed from it.
-        velocity[jumping] = differentiate(tracks.xy[jumping], valid[jumping], recording.timestamps_s)
-    lost = {**recording.lost, "jumping_tracks": int(jumping.sum())}
+        velocity[has_jump] = differentiate(tracks.xy[has_jump], valid[has_jump], recording.timestamps_s)
+    lost = {**recording.lost, "jumping_tracks": int(has_jump.sum())}
     return replace(recording, tracks=replace(tracks, valid=valid, velocity=velocity), lost=lost)
 
 
@@ -263,7 +263,8 @@ def ego_log(
     """Return the log of the ego, or of another track, up to step ``last``."""
     row = tracks.ego if row is None else row
     speed, valid = np.hypot(*tracks.velocity[row].T), tracks.valid[row].copy()
-    valid[len(valid) if last is None else last + 1 :] = False
+    if last is not None:
+        valid[last + 1 :] = False
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, valid, current_step)
 
 
@@ -307,7 +308,7 @@ def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteS
 
 
 def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
-    """Positive numbers of items that did not fit, by name; ``lost`` has some of them."""
+    """Positive numbers of items that did not fit, by name; ``lost`` has those of lanes and features."""
     counts = parts.placement.overflow | lost
     for part in (parts.grid, parts.lights, parts.stops, parts.rows):
         counts |= part.overflow
@@ -319,7 +320,7 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
 
 
 def _flags(recording: Recording, parts: Parts) -> Flag:
-    """Flags of the reader, with those of ``MEASURED``, which describe the record."""
+    """Flags of the reader, except those of ``MEASURED``, and the flags that the parts justify."""
     slots, segments = parts.placement, parts.grid.segments
     heights = np.concatenate((segments.a[:, 2], segments.b[:, 2]))
     facts = (

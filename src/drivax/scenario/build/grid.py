@@ -234,9 +234,8 @@ def _nearest_sides(side_grid: Grid, edges: Segments) -> tuple[Int[Array, " cell"
     sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest)
     sides = np.where(unknown | (distance > _REACH_M), 0, sign)
     shape, square = (rows, columns), (side_grid.side, side_grid.side)
-    return _crop(sides, shape, low, np.zeros(square, int)), _crop(
-        distance, shape, low, np.full(square, np.inf)
-    )
+    sides = _crop(sides, shape, low, np.zeros(square, int))
+    return sides, _crop(distance, shape, low, np.full(square, np.inf))
 
 
 def _nearest_pairs(
@@ -313,9 +312,8 @@ def _sides_within_rings(
     """Sides of ringed cells far from every edge: 1 drivable, -1 not, 0 unknown.
 
     No edge crosses a cell whose 3 x 3 block holds none, so the whole cell lies on one side. Rings have the drivable
-    side on their left (outer rings counter-clockwise, islands clockwise), so the winding number of its centre is one
-    lower off the road. Crossings of the line through the cell centres of a row are counted from the right (Sunday,
-    2001).
+    side on their left (outer rings counter-clockwise, islands clockwise), so winding numbers are one lower off the road
+    than on it. Crossings of the line through the cell centres of a row are counted from the right (Sunday, 2001).
     """
     side = np.zeros(grid.side**2, dtype=np.int8)
     rings = edges.take(closed)

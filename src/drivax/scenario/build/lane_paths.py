@@ -28,7 +28,7 @@ GAP_M, FADE_M = (0.05, 2.0), 10.0
 REACH_M, TURN_RAD, SAME_TURN_RAD = 4.0, np.deg2rad(60.0), np.deg2rad(45.0)
 #: Costs in metres: of a lane change, of a metre between ego and its first lane, of a radian of turning.
 CHANGE_COST_M, LATERAL_COST, TURN_COST_M = 60.0, 30.0, 10.0
-#: Of a radian between the headings of ego and of its first lane, and of a lane outside the intended corridor.
+#: Costs of a radian between the headings of ego and of its first lane, and of a lane outside the intended corridor.
 ASKEW_COST_M, OUTSIDE_COST_M = 30.0, 200.0
 MOST_CHANGES, MOST_EXPANSIONS, MOST_GOAL_LANES = 2, 400, 3
 #: Cost of each missing metre of an unfinished path, which makes the search go forward.

@@ -481,7 +481,8 @@ def place_stops(
 ) -> Stops:  # fmt: skip
     """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``.
 
-    Signs of these lanes, and those in the box of ``path`` widened by ``margin_m``, come first; only they are counted.
+    Signs that control a lane of ``graph``, and those in the box of ``path`` widened by ``margin_m``, come first; only
+    they are counted.
     """
     signs = [f for f in features if f.kind == RoadKind.STOP_SIGN and len(f.points)]
     xy = np.array([f.points[0] for f in signs], dtype=np.float64).reshape(-1, 3)[:, :2] - origin[:2]

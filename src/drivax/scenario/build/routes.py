@@ -41,8 +41,8 @@ RouteStyle = Literal["graph", "published"]
 OFFSET_M, _POSE_SPACING_M = 1.0, 1.0
 #: Largest drift of the ego across a line, metres per metre (a change of 3.5 m within 12 m).
 _MOST_SLOPE = 0.3
-#: The shift of a route fades out over this distance behind the first driven pose.
-_BEHIND_M = 20.0
+#: Lateral shifts of a route fade out over this distance behind the first driven pose and beyond the end of the log.
+_FADE_M = 20.0
 #: Published candidates begin on lanes within this distance of the ego at the start of the log, m.
 PUBLISHED_REACH_M = 2.5
 #: Least length and largest number of published candidates, and largest number of paths that their search extends.
@@ -288,7 +288,7 @@ def join(
     direction (Hermite: shift and slope at the ego, zero both ``ahead_m`` ahead). Points of ``xyz`` are about 1 m apart.
     """
     # The line may pass the poses again later on: project them onto its beginning only.
-    count = int(arc_lengths(history)[-1] + 2 * _BEHIND_M) + 2
+    count = int(arc_lengths(history)[-1] + 2 * BEHIND_M) + 2
     s, pose_shift = _shifts(xyz[:count], history)
     if not pose_shift.any():
         return xyz
@@ -296,7 +296,7 @@ def join(
     shift, is_behind, is_ahead = np.interp(arc, s, pose_shift), arc < s[0], arc > s[-1]
     slope = np.diff(pose_shift) / np.diff(s) if len(s) > 1 else np.zeros(1)
     slope = np.clip(slope, -_MOST_SLOPE, _MOST_SLOPE)
-    shift[is_behind] = _fade(s[0] - arc[is_behind], pose_shift[0], -slope[0], _BEHIND_M)
+    shift[is_behind] = _fade(s[0] - arc[is_behind], pose_shift[0], -slope[0], _FADE_M)
     shift[is_ahead] = _fade(arc[is_ahead] - s[-1], pose_shift[-1], slope[-1], ahead_m)
     result = xyz.copy()
     result[:, :2] += shift[:, None] * left_normals(headings(xyz))
@@ -351,7 +351,7 @@ def _continuation(lane_segments: LaneSegments, pose: Float[Array, "3"], heading:
     else:
         lateral = float((pose[:2] - lines.at(lane, s)[0, :2]) @ left_normals(lines.heading(lane, s))[0])
         points, courses = walk(lane_segments.graph, lane, s, 1.0, count)
-        fade = lateral * np.maximum(1.0 - distance / BEHIND_M, 0.0)
+        fade = lateral * np.maximum(1.0 - distance / _FADE_M, 0.0)
         xy = points[0] + fade[:, None] * left_normals(courses[0])
     return np.concatenate((xy, np.full((count, 1), pose[2])), axis=1)
 

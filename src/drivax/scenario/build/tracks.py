@@ -45,8 +45,8 @@ _UNRELATED_M, _PREFERENCE_M = 1e6, 1e7
 class LocalTracks:
     """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
-    ``size`` is the median length, width and height over the valid steps, metres; ``has_default_size``
-    masks tracks that have the size of their class.
+    ``size`` is the median length, width and height over the valid steps, metres; ``has_default_size`` masks tracks of
+    which a length, width or height is that of the class.
     """
 
     xyz: Float[Array, "track time 3"]
@@ -89,10 +89,9 @@ def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row ti
     """Median over the valid entries of the last axis; 0 without any."""
     sorted_values = np.sort(np.where(valid, values, np.inf), axis=-1)
     count = valid.sum(axis=-1)
-    middle = np.stack(
-        (np.maximum((count - 1) // 2, 0), np.minimum(count // 2, values.shape[-1] - 1)), axis=-1
-    )
-    low, high = np.moveaxis(np.take_along_axis(sorted_values, middle, axis=-1), -1, 0)
+    lower, upper = np.maximum((count - 1) // 2, 0), np.minimum(count // 2, values.shape[-1] - 1)
+    middle = np.take_along_axis(sorted_values, np.stack((lower, upper), axis=-1), axis=-1)
+    low, high = np.moveaxis(middle, -1, 0)
     with np.errstate(invalid="ignore"):
         return np.where(count > 0, (low + high) / 2, 0.0)
 

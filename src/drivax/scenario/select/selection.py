@@ -74,22 +74,22 @@ FINDINGS: Mapping[str, Quantity] = {
     "distance_m": Quantity("number", "distance that the log drives after the current step"),
     "reverse_m": Quantity("number", "distance that the log drives backwards after the current step"),
     "log_reverses": Quantity(
-        "truth", "`reverse_m` exceeds 20 m: no manoeuvre, but headings that are wrong by pi"
+        "truth", "`reverse_m` exceeds 20 m, or 5 m and 90 % of the distance: its headings are wrong by pi"
     ),
-    "agents_reversing": Quantity("number", "other vehicles and cyclists that drive more than 20 m backwards"),
+    "agents_reversing": Quantity("number", "other vehicles and cyclists that reverse as in `log_reverses`"),
     "route_deviation_mean_m": Quantity("number", "mean distance of the log to the route"),
     "route_deviation_max_m": Quantity("number", "largest distance of the log to the route"),
     "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
     "lights_seen": Quantity("number", "lights with an observed state"),
     "ignored_overlaps": Quantity(
-        "number", "most agents that overlapped ego from the beginning and are ignored"
+        "number", "most agents at a step that have overlapped ego since they appeared"
     ),
     "clipped_physical": Quantity("number", f"{_EXCEEDS} `physical` and `discrete`"),
     "clipped_published": Quantity("number", f"{_EXCEEDS} `published`"),
     "default_sizes": Quantity("truth", "some box sizes are those of the class"),
     "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
     "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),
-    "clean": Quantity("truth", "no collision, never off the road, no red light run, at most 20 m backwards"),
+    "clean": Quantity("truth", "no collision, never off the road, no red light run, not `log_reverses`"),
 }
 
 
@@ -151,7 +151,8 @@ class Filter:
         if self.operator in _COMPARISONS:
             return _COMPARISONS[self.operator](value, self.values[0])
         values = value if isinstance(value, frozenset) else {value}
-        return values.isdisjoint(self.values) == (self.operator == "!=")
+        is_match = not values.isdisjoint(self.values)
+        return is_match if self.operator == "=" else not is_match
 
     def find(self, entry: Mapping[str, Any]) -> Any:
         """Return the value in a manifest entry: a number, a word, a truth or a set of words; None if unknown."""
@@ -284,7 +285,7 @@ def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
 
 
 def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
-    """Return the error for an empty selection, with the filter that no scenario satisfies."""
+    """Return the error for an empty selection; it names the first ``=`` filter that no scenario satisfies, if any."""
     for condition in selection.filters:
         if condition.operator == "=" and not any(condition.matches(entry) for entry in data.entries):
             tag = condition.name.removeprefix("tag.")

@@ -96,7 +96,7 @@ def hold_out(
 
 
 def _choose(sizes: Mapping[tuple[str, str], int]) -> set[tuple[str, str]]:
-    """Return recordings in the order of their place while they fit into the share; else the smallest one."""
+    """Return the recordings that fit into the share, taken in the order of their place; else the smallest one."""
     if len(sizes) < 2:
         return set()
     order = sorted(sizes, key=lambda recording: _place(*recording))

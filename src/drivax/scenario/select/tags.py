@@ -153,15 +153,13 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
 
 
 def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
-    """Return whether the log enters a lane that another lane enters too, neither of them in a junction."""
-    changes = np.flatnonzero(lane[1:] != lane[:-1])
-    entries = (
-        (old, graph.predecessor[new]) for old, new in zip(lane[changes], lane[changes + 1], strict=True)
-    )
-    entries = ((old, entering[entering >= 0]) for old, entering in entries)
-    return any(
-        old in entering and len(entering) > 1 and not junction[entering].any() for old, entering in entries
-    )
+    """Return whether the log passes to a successor that other lanes enter too, and none of them is in a junction."""
+    for change in np.flatnonzero(lane[1:] != lane[:-1]):
+        entering = graph.predecessor[lane[change + 1]]
+        entering = entering[entering >= 0]
+        if lane[change] in entering and len(entering) > 1 and not junction[entering].any():
+            return True
+    return False
 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:

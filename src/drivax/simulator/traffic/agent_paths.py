@@ -47,8 +47,8 @@ _CURVE_M, _CURVE_S = 2.5, 0.25
 STOPS = 4
 #: Stop lines that a path crosses within this distance are one stop, m.
 _ONE_STOP_M = 3.0
-#: Of the lights of a stop that one counts whose lane ends closest to the path's heading this far beyond, m.
-_EVALUATED_AFTER_M = 20.0
+#: Distance beyond a stop at which the path's heading decides which of its lights counts, m.
+_DECISION_M = 20.0
 #: Minimum cosine of the angle between a path and the lane of a line that it crosses.
 _MIN_COS = 0.5
 Numbers = np.ndarray[Any, Any]
@@ -105,7 +105,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     logs = _candidates(bank, kinds)
     lines, log_arc = _lines(bank, logs)
     count = np.bincount(logs.scenario, minlength=len(bank))
-    # A bank that keeps its padding shares programs with others of its capacity.
+    # An even number, or the capacity: a bank that keeps its padding shares programs with others of its capacity.
     rows = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
     row = np.arange(len(logs.slot)) - np.concatenate(([0], np.cumsum(count)))[logs.scenario]
 
@@ -374,7 +374,7 @@ def _crossings(line: Numbers, points: Numbers, spacing: Numbers) -> Float[np.nda
 
 
 def _stops(arc: Numbers, heading: Numbers, spacing: float, exits: Numbers) -> list[tuple[float, int]]:
-    """Return the stops of a path in order: arc length, and the light that counts.
+    """Return a path's stops in order: arc length, and the light whose lane ends closest to the heading 20 m beyond.
 
     ``arc`` are the arc lengths at which the path crosses each line, ``exits`` the headings at the ends of their lanes.
     """
@@ -386,7 +386,7 @@ def _stops(arc: Numbers, heading: Numbers, spacing: float, exits: Numbers) -> li
             groups.append([light])
     stops = []
     for group in groups:
-        point = min(round((arc[group[0]] + _EVALUATED_AFTER_M) / spacing), len(heading) - 1)
+        point = min(round((arc[group[0]] + _DECISION_M) / spacing), len(heading) - 1)
         light = min(group, key=lambda light: abs(float(wrap(exits[light] - heading[point]))))
         stops.append((float(arc[light]), light))
     return stops

@@ -55,8 +55,8 @@ class Reactive:
 class IdmTraffic:
     """Vehicles that react to ego, to all other agents and to red lights.
 
-    A vehicle that travels more than 2 m in the rest of its log follows its own path; all other agents replay. Pairs
-    that overlap when the vehicle appears ignore each other until they separate.
+    A vehicle that travels more than 2 m in the rest of its log, and does not reverse, follows its own path; all other
+    agents replay. A vehicle ignores up to two agents that it overlaps when it appears, until they separate.
 
     Attributes:
         drivers: IDM parameters of each reacting class (``scenario.schema.AgentKind``); other classes replay.
