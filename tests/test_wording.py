@@ -16,7 +16,6 @@ import yaml
 REPOSITORY = Path(__file__).resolve().parent.parent
 _YAML = yaml.safe_load((REPOSITORY / "tests" / "wording.yaml").read_text())
 TABLE: list[dict[str, Any]] = _YAML["rows"]
-#: Files that are still to be rewritten.
 #: Records of the past keep the words of their day.
 HISTORY = ("docs/log/", "docs/decisions/")
 SUFFIXES = {".py", ".pyi", ".md", ".js", ".css", ".html", ".template"}
