@@ -166,7 +166,9 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
         first = lines.points[0, 0, 0]
         moved = replace(others, box=others.box.at[:, 0].add(first))
         wanted = jnp.asarray(fractions, jnp.float32)
-        return unroll_idm(lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, PUBLISHED_DRIVER, 40, 2)
+        return unroll_idm(
+            lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, PUBLISHED_DRIVER, range(0, 40, 2)
+        )
 
     found = quick(proposals, bank, others, jnp.asarray(stop, jnp.float32))
     braked = False

@@ -159,9 +159,8 @@ class PdmPlanner:
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
         desired = jnp.where(lines.remaining_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
         stop_m = stop_line_m(bank, context, frame)
-        proposals = unroll_idm(
-            lines, others, size, speed, desired, stop_m, config.driver, config.steps, config.leader_every
-        )
+        updates = range(0, config.steps, config.leader_every)
+        proposals = unroll_idm(lines, others, size, speed, desired, stop_m, config.driver, updates)
         wheelbase, car = self._wheelbase(size[0]), Car(motion, carry.acceleration, carry.steering)
         plans, cars = self._simulate(lines, proposals, car, wheelbase)
         rows = lines.at(proposals.arc_m).reshape(*plans.shape[:2], -1)

@@ -138,16 +138,17 @@ class Proposals:
 
 def unroll_idm(
     lines: Lines, others: Forecast, size: Vector, speed: Scalar, desired: Float[Array, " F"], stop_m: Scalar,
-    parameters: IdmParameters, steps: int, leader_every: int,
+    parameters: IdmParameters, updates: range,
 ) -> Proposals:  # fmt: skip
-    """Simulate IDM along every line, from ego's speed to each desired speed (m/s), by ``steps`` Euler steps of 0.1 s.
+    """Simulate IDM along every line, from ego's speed to each desired speed (m/s), by Euler steps of 0.1 s.
 
-    The leader is updated every ``leader_every`` steps: of the agents whose box reaches into the corridor of ego's width
-    and whose centre is ahead, the one nearest to ego's box. Its gap shrinks by ego's motion until the next update.
-    ``stop_m`` is the distance from ego's front to the nearest stop line that requires a stop, infinite for none.
+    ``updates`` has the steps at which the leader is updated, and stops after the last step of the simulation. The
+    leader is, of the agents whose box reaches into the corridor of ego's width and whose centre is ahead, the one
+    nearest to ego's box. Its gap shrinks by ego's motion until the next update. ``stop_m`` is the distance from ego's
+    front to the nearest stop line that requires a stop, infinite for none.
     """
     count = lines.points.shape[0], desired.shape[0]
-    boxes = others.at(jnp.arange(0, steps, leader_every) * DT_S)
+    boxes = others.at(jnp.arange(0, updates.stop, updates.step) * DT_S)
     is_inside = _on_corridor(lines.corridors(size[1]), boxes) & others.valid
     distances = lines.route_distances(boxes[..., :2])
     stop_along_m = stop_m + size[0] / 2
@@ -170,7 +171,7 @@ def unroll_idm(
         leader_speed = jnp.where(stop_gap_m < gap_m, 0.0, leader_speed)
         gap_m = jnp.minimum(stop_gap_m, gap_m)
         states = []
-        for _ in range(leader_every):
+        for _ in range(updates.step):
             effective_gap_m = jnp.maximum(gap_m, parameters.min_gap_m)
             acceleration = idm_acceleration(speed, desired, effective_gap_m, leader_speed, parameters)
             arc_m, gap_m = arc_m + DT_S * speed, gap_m - DT_S * speed
