@@ -59,10 +59,11 @@ def collision_potential(frame: Frame, slot: Integer, margin_m: float = 0.5) -> F
 def offroad_potential(
     bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], ground: Scalar, margin_m: float = 0.5
 ) -> Scalar:
-    """Return the potential of the road edges: the sum over the corners of a box, whose ground is at a height, m.
+    """Return the off-road potential of a box, summed over its corners.
 
-    Positive where a corner is off the road (0.3 m beyond an edge, as in the metric); zero where every corner is on the
-    road by the margin or more, and without a map; constant further than 3 m beyond every edge.
+    ``ground`` is the height of the road under the box, m. The limit is that of the metric, 0.3 m beyond a road edge: the
+    potential is positive where a corner is beyond it, zero where every corner is at least ``margin_m`` inside it, zero
+    without a map, and constant further than 3 m beyond every edge.
 
     Raises:
         UsageError: The margin is wider than 3 m, the reach of edge queries.

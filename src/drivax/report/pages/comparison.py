@@ -190,7 +190,7 @@ def _power_sentences(comparison: Comparison) -> list[str]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return notes on undefined values, seeds and sensitivity."""
+    """Return notes on undefined values and on seeds."""
     lines = []
     for metric in (comparison.primary, *comparison.secondary):
         if metric.undefined_a or metric.undefined_b:
