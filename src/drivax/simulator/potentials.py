@@ -61,9 +61,9 @@ def offroad_potential(
 ) -> Scalar:
     """Return the off-road potential of a box, summed over its corners.
 
-    ``ground`` is the height of the road under the box, m. The limit is that of the metric, 0.3 m beyond a road edge: the
-    potential is positive where a corner is beyond it, zero where every corner is at least ``margin_m`` inside it, zero
-    without a map, and constant further than 3 m beyond every edge.
+    ``ground`` is the height of the road under the box, m. The limit is that of the metric, 0.3 m beyond a road edge.
+    The potential is positive where a corner is beyond it, zero where every corner is at least ``margin_m`` inside it,
+    zero without a map, and constant further than 3 m beyond every edge.
 
     Raises:
         UsageError: The margin is wider than 3 m, the reach of edge queries.
