@@ -82,10 +82,11 @@ def recommended_speed(
 
 
 def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
-    """Return the time gap to the leader's bumper over 10 s, at most 1, and whether there is a leader.
+    """Return the time gap to the leader in units of 10 s, at most 1, and whether there is a leader.
 
-    The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Speeds below 1 m/s
-    count as 1 m/s. Without a leader the first number is 1.
+    The time gap is the distance from bumper to bumper divided by ego's speed, of which less than 1 m/s counts as 1 m/s.
+    The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Without a leader the
+    first number is 1.
     """
     now, view = frames(0), View.of(context)
     position = view.point(now.box[:, :2])

@@ -47,7 +47,7 @@ def write_videos(
     runs: Sequence[Path], out: Path, which: str, side_by_side: bool = False, data: Path | None = None,
     theme: str = "light", overwrite: bool = False, progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Write episodes of evaluation runs as mp4 files in real time, and return the files, worst episode first.
+    """Write episodes of evaluation runs as mp4 files that play in real time; return the files, worst episode first.
 
     Args:
         runs: Run folders; the last evaluation is the policy, whose episodes are ranked.
@@ -61,7 +61,7 @@ def write_videos(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: A file exists, the scenario has no episode, or a package for videos is not installed.
+        UsageError: A file exists, ``which`` is invalid, the scenario has no episode, or a package for videos is not installed.
     """
     evaluations = read_evaluations(runs)
     groups = _select_episodes(evaluations, which)
