@@ -194,6 +194,14 @@ def test_low_memory_limit_is_one_line(limit, command):
     assert (result.returncode, result.stdout) == (2, "")
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """A shell's background job ignores Ctrl-C, and so would the tests and their programs."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
 class Callback:
     """Its finaliser is a callback: Python drops what a signal handler raises in it."""
 
@@ -206,14 +214,10 @@ class Callback:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_signals_in_callbacks_are_not_lost(number):
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
-    try:
-        with pytest.raises(KeyboardInterrupt) as stopped, cli._stop_at_signals():
-            Callback(number)
-            time.sleep(5)
-            raise AssertionError(f"{number.name} was lost")
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    with pytest.raises(KeyboardInterrupt) as stopped, cli._stop_at_signals():
+        Callback(number)
+        time.sleep(5)
+        raise AssertionError(f"{number.name} was lost")
     assert getattr(stopped.value, "signal", signal.SIGINT) == number
 
 
@@ -230,14 +234,10 @@ def test_signals_wait_for_the_end_of_an_import(number, tmp_path, monkeypatch):
     (tmp_path / "interrupted.py").write_text(IMPORTED.format(number=int(number)))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "interrupted", raising=False)
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
-            importlib.import_module("interrupted")
-            time.sleep(5)
-            raise AssertionError(f"{number.name} was lost")
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
+        importlib.import_module("interrupted")
+        time.sleep(5)
+        raise AssertionError(f"{number.name} was lost")
     assert sys.modules["interrupted"].complete
 
 
@@ -256,14 +256,10 @@ def test_two_signals_in_an_import_wake_the_main_thread(tmp_path, monkeypatch):
     code = f"import os, time\nfor number in {numbers}: os.kill(os.getpid(), number)\ntime.sleep(0.1)\n"
     (tmp_path / "both.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     started = time.monotonic()
-    try:
-        with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
-            importlib.import_module("both")
-            time.sleep(20)
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
+        importlib.import_module("both")
+        time.sleep(20)
     assert time.monotonic() - started < 10
 
 

@@ -61,7 +61,7 @@ def write_videos(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: A file exists, ``which`` is invalid, the scenario has no episode, or a package for videos is not installed.
+        UsageError: A file exists, ``which`` is invalid, the scenario has no episode, or a package is not installed.
     """
     evaluations = read_evaluations(runs)
     groups = _select_episodes(evaluations, which)
