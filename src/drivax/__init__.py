@@ -1,7 +1,8 @@
 """Train, curate and judge driving planners on recorded traffic, in one JAX program.
 
 Every command of the command line has a function here. Names are imported on first use: ``import drivax`` is fast, and
-worker processes that convert data never load JAX.
+worker processes that convert data never load JAX. ``plugins`` resolves dotted names, and decides which modules a
+stranger's file may name.
 """
 
 from __future__ import annotations

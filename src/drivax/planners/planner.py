@@ -107,7 +107,7 @@ class Held:
         self, carry: tuple[Any, Action], bank: ScenarioBank, state: SimState, situation: Situation,
         observation: Any, key: Array,
     ) -> tuple[Action, Any]:  # fmt: skip
-        """Return the planner's action at every ``steps``-th step of an episode, in between the last one."""
+        """Return a new action of the planner at every ``steps``-th step of an episode, and repeat it until the next."""
         decision = self.planner.act(carry[0], bank, state, situation, observation, key)
         decides = (state.context.step - state.start) % self.steps == 0
         action, inner = jax.tree.map(

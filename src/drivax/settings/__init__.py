@@ -46,7 +46,7 @@ def load(
         file, values = None, _copy(source)
     else:
         file = _find_file(source)
-        values = _read_settings(file, extends=trust is None)
+        values = _read_settings(file, follow_extends=trust is None)
     values = _override(values, overrides)
     if trust is not None:
         check_names(values, trust, file)
@@ -98,10 +98,13 @@ def _find_file(source: str | Path) -> Path:
     return preset(source)
 
 
-def _read_settings(file: Path, extensions: tuple[Path, ...] = (), extends: bool = True) -> dict[str, Any]:
-    """Return the settings of a file, merged over those of the file that it ``extends`` (unless that key is data).
+def _read_settings(
+    file: Path, extended_by: tuple[Path, ...] = (), follow_extends: bool = True
+) -> dict[str, Any]:
+    """Return the settings of a file, merged over those of the file that it ``extends``.
 
-    ``extensions`` are the files that extend this one, from the first one that was read.
+    ``extended_by`` has the files that extend this one, outermost first. Without ``follow_extends``, ``extends`` is a
+    setting as any other.
     """
     try:
         values = parse_yaml(read_text(file, "name a YAML file"), file)
@@ -110,13 +113,13 @@ def _read_settings(file: Path, extensions: tuple[Path, ...] = (), extends: bool 
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
-    if not extends or "extends" not in values:
+    if not follow_extends or "extends" not in values:
         return values
-    base, extensions = _find_base(file, values.pop("extends")), (*extensions, file.resolve())
-    if base.resolve() in extensions:
-        cycle = " -> ".join(path.name for path in (*extensions, base))
+    base, chain = _find_base(file, values.pop("extends")), (*extended_by, file.resolve())
+    if base.resolve() in chain:
+        cycle = " -> ".join(path.name for path in (*chain, base))
         raise UsageError(f"extends itself: {cycle}", file=file, cure="remove an extends line")
-    return _merge(_read_settings(base, extensions), values)
+    return _merge(_read_settings(base, chain), values)
 
 
 def _find_base(file: Path, name: Any) -> Path:

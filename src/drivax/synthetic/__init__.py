@@ -1,4 +1,4 @@
-"""The procedural traffic world."""
+"""The built-in traffic world: procedural roads, traffic and events."""
 
 import lazy_loader
 

@@ -354,7 +354,7 @@ class MapApi(DevkitObject):
         raise NotImplementedError(f"the map has no {name}; {did_you_mean(name, methods)}")
 
     def _objects(self, layer: Any) -> list[Any]:
-        """Return the objects of a layer of this map or the devkit, by its number."""
+        """Return the objects of a layer, given as a member of our or the devkit's ``SemanticMapLayer``."""
         try:
             member = SemanticMapLayer(int(layer))
         except ValueError:

@@ -1,1 +1,4 @@
-"""Road users of the procedural world: their roles, and the simulation of their motion."""
+"""Road users of the built-in world.
+
+``role_assignment`` draws who takes part, ``placement`` where vehicles start, and ``simulation`` moves them.
+"""
