@@ -122,7 +122,7 @@ def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_pa
     for wrong, words in ((4.0, "use 8 to 60"), (61.0, "use 2 to 60")):
         with pytest.raises(UsageError, match=f"future_s is {wrong:g}; {words}"):
             generate(tmp_path / "no", 1, 0, Generation(future_s=wrong))
-    with pytest.raises(UsageError, match="the benchmark's world is fixed"):
+    with pytest.raises(UsageError, match="its world is fixed but for its domain"):
         generation.generate_benchmark(tmp_path / "no", Generation(future_s=15.0), 1)
 
 
