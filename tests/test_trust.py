@@ -335,7 +335,7 @@ def test_other_parts_of_drivax_are_refused(place, name, folder):
 
 def test_policies_of_useless_settings_are_one_line(folder, data):
     run = write_stranger(
-        folder / "run", {"algorithm": {"kind": "ppo", "network": {"encoder": {"hidden": []}}}}
+        folder / "run", {"algorithm": {"kind": "ppo", "network": {"encoder": {"hidden": [-1]}}}}
     )
     with pytest.raises(DataError, match=r"config\.yaml: makes no policy"):
         load_policy(run, drivax.load(data.path).bank)
