@@ -16,6 +16,7 @@ from drivax.datasets import spool
 from drivax.errors import DataError
 from drivax.scenario.schema import CAPACITIES
 from drivax.synthetic import generate
+from drivax.tracking import workers
 from drivax.tracking.workers import one_core_each, worker_pool
 
 PROGRAM = """
@@ -59,6 +60,18 @@ def test_dead_worker_is_one_line(tasks):
             time.sleep(0.1)
             futures.append(pool.submit(abs, 1))
         futures[0].result()
+
+
+def ignore_sigterm():
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+def test_worker_that_does_not_end_is_killed(monkeypatch):
+    monkeypatch.setattr(workers, "_STOP_S", 0.2)
+    with pytest.raises(KeyError), worker_pool(1) as pool:
+        pool.submit(ignore_sigterm).result()
+        pool.submit(time.sleep, 60)
+        raise KeyError
 
 
 def test_workers_ignore_what_their_parent_ignores():

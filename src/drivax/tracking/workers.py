@@ -21,6 +21,8 @@ from drivax.errors import DataError, UsageError
 _NO_SHARED_MEMORY = (errno.ENOENT, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
 #: A Ctrl-C that killed a worker raises KeyboardInterrupt in its parent within this time (s).
 _INTERRUPT_S = 0.3
+#: A worker that has not ended in this time after SIGTERM is killed (s).
+_STOP_S = 10.0
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -56,6 +58,10 @@ class WorkerPool(ProcessPoolExecutor):
         for process in running:
             process.terminate()
         for process in running:
+            process.join(
+                _STOP_S
+            )  # A training takes SIGTERM as a wish, and may then wait for a lock of a dead worker.
+            process.kill()
             process.join()
 
 
