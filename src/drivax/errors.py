@@ -121,9 +121,8 @@ def check_memory_limit() -> None:
     """Raise a UsageError if this process may take so little memory that JAX would abort it."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
-        problem = (
-            f"JAX needs {_LEAST_MEMORY // 1024} kB of memory, the limit of this process is {limit // 1024}"
-        )
+        least, limit = _LEAST_MEMORY // 1024, limit // 1024
+        problem = f"JAX needs {least} kB of memory, the limit of this process is {limit}"
         raise UsageError(problem, cure="raise the limit: ulimit -v unlimited")
 
 

@@ -109,8 +109,8 @@ def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
 def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
-    The operating system's error for a write names no file. Of nested blocks, the outermost one names the output, and
-    the outermost one that knows it the size. Other errors of the system get the name if they have none, or a hidden
+    The operating system's error for a write names no file. Of nested blocks, the outermost names the output; the size
+    is that of the outermost block that has one. Other errors of the system get the name if they have none, or a hidden
     one.
     """
     try:

@@ -34,7 +34,7 @@ from drivax.errors import (
     did_you_mean,
     explain_system,
     missing_package,
-)  # fmt: skip
+)
 from drivax.escaping import escape_controls, show
 from drivax.seal import allow_edited, edited_files
 
@@ -52,7 +52,7 @@ class Command:
 
 #: Flags of all commands.
 _FLAGS = ("--debug", "--no-cache", "--edited")
-#: Largest width of tables, and the width of help, that are not printed to a terminal.
+#: Width of tables and help that are not printed to a terminal, and the largest width of tables that are.
 _COLUMNS = 100
 #: Files of Python's functions that no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")

@@ -43,7 +43,7 @@ class WorkerPool(ProcessPoolExecutor):
         if isinstance(error, BrokenProcessPool):
             time.sleep(_INTERRUPT_S)
             problem = "a worker process died (out of memory, or a script without a main guard)"
-            raise DataError(problem, cure="use fewer --workers") from error
+            raise DataError(problem, cure="use fewer --workers or --cores") from error
 
     def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
         """Submit a call; a worker that starts for it gets Ctrl-C only when it has set up its signals."""
@@ -58,9 +58,8 @@ class WorkerPool(ProcessPoolExecutor):
         for process in running:
             process.terminate()
         for process in running:
-            process.join(
-                _STOP_S
-            )  # A training takes SIGTERM as a wish, and may then wait for a lock of a dead worker.
+            # A training only notes SIGTERM, and may then wait for a lock that a dead worker holds.
+            process.join(_STOP_S)
             process.kill()
             process.join()
 
@@ -73,9 +72,8 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
     processes = multiprocessing.get_context("spawn")
     core_queue: Any = None
     try:
-        with _block(
-            signal.SIGHUP
-        ):  # A closed terminal must not end Python's process that removes semaphores.
+        # A closed terminal must not end Python's process that removes semaphores.
+        with _block(signal.SIGHUP):
             resource_tracker.ensure_running()
         if cores is not None:
             core_queue = processes.SimpleQueue()
