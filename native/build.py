@@ -1,0 +1,92 @@
+"""Compile the kernels into ``src/drivax/kernels``; a C++17 compiler (``CXX``, default ``c++``) for x86-64 Linux.
+
+    python native/build.py [--sanitize]
+
+Each kernel is compiled once per instruction set, and once for its binding to XLA. Options allow no change of results: no fast-math, no
+code for this processor only. ``--sanitize`` builds with AddressSanitizer and UndefinedBehaviorSanitizer, for tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import jax.ffi
+
+SOURCES = Path(__file__).resolve().parent
+LIBRARY = SOURCES.parent / "src" / "drivax" / "kernels" / "libdrivax.so"
+#: Flags of each target, and floats per vector.
+TARGETS = {
+    "sse42": (("-msse4.2",), 4),
+    "avx2": (("-mavx2", "-mfma"), 8),
+    "avx512": (
+        ("-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl", "-mavx2", "-mfma", "-mprefer-vector-width=512"),
+        16,
+    ),
+}
+FLAGS = (
+    "-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra",
+    "-Werror", "-Wno-psabi", "-Wno-missing-field-initializers",
+)  # fmt: skip
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
+
+
+def compiler() -> str:
+    """Return the compiler, or end with one line."""
+    name = os.environ.get("CXX", "c++")
+    if shutil.which(name) is None:
+        sys.exit(f"make native: no C++ compiler {name!r}; install g++ or clang, or set CXX")
+    return name
+
+
+def commands(build: Path, sanitize: bool) -> list[list[str]]:
+    """Return the command of each object file; objects are named after source and target."""
+    flags = [*FLAGS, *(SANITIZERS if sanitize else ())]
+    start = [compiler(), *flags, "-c", f"-I{SOURCES}"]
+    binding = ("-isystem", jax.ffi.include_dir(), f'-DBUILD_HASH="{build_hash(flags)}"')
+    result = []
+    for source in sorted(SOURCES.glob("*.cc")):
+        targets = {} if source.name == "library.cc" else TARGETS
+        result.append([*start, *binding, str(source), "-o", str(build / f"{source.stem}.o")])
+        for target, (options, lanes) in targets.items():
+            defines = (f"-DTARGET={target}", f"-DLANES={lanes}")
+            output = build / f"{source.stem}.{target}.o"
+            result.append([*start, *options, *defines, str(source), "-o", str(output)])
+    return result
+
+
+def build_hash(flags: list[str]) -> str:
+    """Return a hash of sources, compiler and flags: compiled programs that are cached name the kernels by it."""
+    version = subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True).stdout
+    digest = hashlib.sha256(repr((version, flags, TARGETS)).encode())
+    for path in sorted(SOURCES.glob("*.[ch]*")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def build(sanitize: bool = False) -> None:
+    """Compile all sources and link them; the library appears under its name when it is complete."""
+    with tempfile.TemporaryDirectory(dir=LIBRARY.parent) as folder:
+        steps = commands(Path(folder), sanitize)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            if any(pool.map(lambda step: subprocess.run(step, check=False).returncode, steps)):
+                sys.exit("make native: the compiler failed; its message is above")
+        objects = [step[-1] for step in steps]
+        library = Path(folder) / LIBRARY.name
+        link = [compiler(), "-shared", "-Wl,-s", *(SANITIZERS if sanitize else ()), *objects, "-o", str(library)]
+        subprocess.run(link, check=True)
+        library.replace(LIBRARY)
+    print(f"wrote {LIBRARY.relative_to(SOURCES.parent)}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sanitize", action="store_true", help="for the tests of memory errors")
+    build(parser.parse_args().sanitize)

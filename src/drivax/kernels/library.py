@@ -1,0 +1,144 @@
+"""The compiled library: found next to this file or not, and called through XLA's foreign functions."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.sharding import AxisType, PartitionSpec
+
+#: ``make native`` and the wheels for Linux on x86-64 put it here.
+PATH = Path(__file__).parent / "libdrivax.so"
+#: 0: no kernels; a target: the best one up to it; anything else, or not set: the best one.
+VARIABLE = "DRIVAX_NATIVE"
+
+_allowed: ContextVar[bool] = ContextVar("kernels are allowed", default=True)
+
+
+@cache
+def _library() -> ctypes.CDLL | None:
+    """Return the library with its kernels registered, or None: not there, not wanted, or not loadable."""
+    if os.environ.get(VARIABLE) == "0" or not PATH.exists():
+        return None
+    try:
+        library = ctypes.CDLL(str(PATH))
+    except OSError:  # another system's or processor's
+        return None
+    for function in ("drivax_kernels", "drivax_target", "drivax_hash"):
+        getattr(library, function).restype = ctypes.c_char_p
+    for name in library.drivax_kernels().decode().split():
+        function = jax.ffi.pycapsule(getattr(library, f"drivax_{name}"))
+        jax.ffi.register_ffi_target(_target_name(library, name), function, platform="cpu")
+    return library
+
+
+def _target_name(library: ctypes.CDLL, kernel: str) -> str:
+    """Name with the hash of the build, since compiled programs are cached longer than builds live."""
+    return f"drivax_{kernel}_{library.drivax_hash().decode()}"
+
+
+def state() -> str:
+    """Return what is in use, as in ``drivax doctor``."""
+    library = _library()
+    if library is not None:
+        return f"native kernels {library.drivax_hash().decode()}, {library.drivax_target().decode()}"
+    if os.environ.get(VARIABLE) == "0":
+        return f"none, since {VARIABLE}=0"
+    return "none: make native" if not PATH.exists() else f"none: {PATH.name} does not load here"
+
+
+def in_use() -> bool:
+    """Whether programs that are traced now call native kernels: on CPUs, if the library is there."""
+    return _allowed.get() and _library() is not None and jax.default_backend() == "cpu"
+
+
+@contextlib.contextmanager
+def without_kernels() -> Iterator[None]:
+    """Trace programs without native kernels, for export and for comparisons."""
+    token = _allowed.set(False)
+    try:
+        yield
+    finally:
+        _allowed.reset(token)
+
+
+def call(
+    kernel: str, results: Sequence[jax.ShapeDtypeStruct], common: Sequence[Any], batched: Sequence[Any] = (),
+    axes: int = 0, **attributes: Any,
+) -> list[Any]:  # fmt: skip
+    """Call a kernel on a batch, or on one sample that ``jax.vmap`` makes a batch.
+
+    Args:
+        kernel: Its name.
+        results: Shapes of the results of one sample.
+        common: Arguments that all samples share, such as weights. A ``vmap`` over them is a loop of calls.
+        batched: The other arguments; each has the batch's axes first.
+        axes: Number of the batch's axes.
+        attributes: Constants.
+
+    Returns:
+        The results, with the batch's axes first. A batch is divided among the devices of the current mesh.
+    """
+    library = _library()
+    assert library is not None, "callers ask in_use() first"
+    name = _target_name(library, kernel)
+
+    @custom_vmap
+    def run(common: Any, batched: Any) -> list[Any]:
+        return _divide(run_share, lead(batched))(common, batched)
+
+    def run_share(common: Any, batched: Any) -> list[Any]:
+        shapes = [jax.ShapeDtypeStruct((*lead(batched), *result.shape), result.dtype) for result in results]
+        return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **attributes))
+
+    def lead(batched: Any) -> tuple[int, ...]:
+        return batched[0].shape[:axes] if axes else ()
+
+    @run.def_vmap
+    def run_batch(size: int, is_batched: Any, common: Any, batched: Any) -> tuple[list[Any], list[bool]]:
+        is_common_batched, is_batched = is_batched
+        outputs = [True] * len(results)
+        if any(is_common_batched):
+            return _loop(run, (common, batched), (is_common_batched, is_batched)), outputs
+        batched = [
+            value if is_array_batched else jnp.broadcast_to(value, (size, *value.shape))
+            for value, is_array_batched in zip(batched, is_batched, strict=True)
+        ]
+        return call(kernel, results, common, batched, axes + 1, **attributes), outputs
+
+    return run(list(common), list(batched))
+
+
+def _loop(function: Any, arguments: Any, is_batched: Any) -> Any:
+    """Call a function once for each index of the batched arguments' first axis."""
+    leaves, structure = jax.tree.flatten(arguments)
+    flags = jax.tree.leaves(is_batched)
+
+    def at_index(slices: list[Any]) -> Any:
+        rest = iter(slices)
+        return function(*jax.tree.unflatten(structure, [
+            next(rest) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)
+        ]))  # fmt: skip
+
+    return jax.lax.map(at_index, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
+
+
+def _divide(function: Any, lead: tuple[int, ...]) -> Any:
+    """Divide a batch among the devices of the current mesh by its first axis that they divide."""
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty or mesh.size == 1 or AxisType.Manual in mesh.axis_types:
+        return function
+    axis = next((number for number, size in enumerate(lead) if size % mesh.size == 0), None)
+    if axis is None:
+        return function
+    spec = PartitionSpec(*[None] * axis, mesh.axis_names)
+    return jax.shard_map(function, in_specs=(PartitionSpec(), spec), out_specs=spec, check_vma=False)
