@@ -27,7 +27,15 @@ TARGETS = {
     "sse42": (("-msse4.2",), 4),
     "avx2": (("-mavx2", "-mfma"), 8),
     "avx512": (
-        ("-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl", "-mavx2", "-mfma", "-mprefer-vector-width=512"),
+        (
+            "-mavx512f",
+            "-mavx512dq",
+            "-mavx512bw",
+            "-mavx512vl",
+            "-mavx2",
+            "-mfma",
+            "-mprefer-vector-width=512",
+        ),
         16,
     ),
 }
@@ -80,13 +88,23 @@ def build(sanitize: bool = False) -> None:
                 sys.exit("make native: the compiler failed; its message is above")
         objects = [step[-1] for step in steps]
         library = Path(folder) / LIBRARY.name
-        link = [compiler(), "-shared", "-Wl,-s", *(SANITIZERS if sanitize else ()), *objects, "-o", str(library)]
+        link = [
+            compiler(),
+            "-shared",
+            "-Wl,-s",
+            *(SANITIZERS if sanitize else ()),
+            *objects,
+            "-o",
+            str(library),
+        ]
         subprocess.run(link, check=True)
         library.replace(LIBRARY)
     print(f"wrote {LIBRARY.relative_to(SOURCES.parent)}")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sanitize", action="store_true", help="for the tests of memory errors")
     build(parser.parse_args().sanitize)

@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float
+from jax.custom_derivatives import CustomVJPPrimal
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
+from drivax.kernels import set_encoder
 
 Groups = Mapping[str, Array]
 #: Shapes of one observation, by group.
@@ -177,7 +179,26 @@ def max_pool(
 def _dense_and_max(
     activation: Activation, layers: Layers, rows: Float[Array, "B row inputs"], valid: Bool[Array, "B row"]
 ) -> Float[Array, "B outputs"]:
+    if set_encoder.supports(layers, activation):
+        return set_encoder.encode(layers, rows, valid)[0]
     return _dense_and_max_forward(activation, layers, rows, valid)[0]
+
+
+def _save_dense_and_max(
+    activation: Activation, layers: Any, rows: CustomVJPPrimal, valid: CustomVJPPrimal
+) -> tuple[Array, Any]:
+    """Return the output and the residuals of either implementation; the native one has no gradient of rows."""
+    layers = tuple((kernel.value, bias.value) for kernel, bias in layers)
+    if set_encoder.supports(layers, activation) and not rows.perturbed:
+        output, winner = set_encoder.encode(layers, rows.value, valid.value)
+        return output, _NativeResiduals(layers, rows.value, winner)
+    return _dense_and_max_forward(activation, layers, rows.value, valid.value)
+
+
+class _NativeResiduals(NamedTuple):
+    layers: Layers
+    rows: Float[Array, "B row inputs"]
+    winner: Int[Array, "B outputs"]
 
 
 def _dense_and_max_forward(
@@ -203,8 +224,10 @@ def _dense_and_max_forward(
 
 def _dense_and_max_backward(
     activation: Activation, residuals: Any, gradient: Array
-) -> tuple[Any, Array, None]:
+) -> tuple[Any, Array | None, None]:
     """Differentiate all rows as one matrix: on CPUs, XLA's gathers and scatters are slower than its zeros."""
+    if isinstance(residuals, _NativeResiduals):
+        return set_encoder.differentiate(*residuals, gradient), None, None
     layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
     (gradient,) = vjp(jnp.where(is_positive, gradient, 0.0))
     is_largest = (products == largest[:, None]) & valid[..., None]
@@ -217,7 +240,7 @@ def _dense_and_max_backward(
     return tuple(reversed(gradients)), (by_row @ layers[0][0].T).reshape(*valid.shape, -1), None
 
 
-_dense_and_max.defvjp(_dense_and_max_forward, _dense_and_max_backward)
+_dense_and_max.defvjp(_save_dense_and_max, _dense_and_max_backward, symbolic_zeros=True)
 
 
 def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Float[Array, " F"]]]:

@@ -1,0 +1,45 @@
+"""Shared by the tests of native kernels: they skip without the library, and run once for each instruction set."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivax import kernels
+
+needs_kernels = pytest.mark.skipif(not kernels.in_use(), reason=f"no native kernels: {kernels.state()}")
+TARGETS = ("sse4.2", "avx2")
+
+
+def run_on_target(target, test_file):
+    """Run a file's tests for an older instruction set, in a process of its own."""
+    if "DRIVAX_TARGET_TEST" in os.environ:
+        pytest.skip("runs inside of the same test")
+    environment = os.environ | {"DRIVAX_NATIVE": target, "DRIVAX_TARGET_TEST": "1"}
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        str(Path(test_file)),
+    ]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout[-2000:]
+    assert "passed" in result.stdout
+
+
+def assert_close(actual, expected, tolerance=1e-5):
+    """Compare floats to the scale of the largest; NaN and infinity must be the same."""
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    finite = np.isfinite(expected)
+    scale = max(np.abs(expected[finite]).max(initial=0.0), 1e-6)
+    np.testing.assert_array_equal(actual[~finite], expected[~finite])
+    np.testing.assert_allclose(actual[finite] / scale, expected[finite] / scale, rtol=0, atol=tolerance)
