@@ -15,7 +15,7 @@ from drivax.synthetic.traffic.path_arrays import (
 from drivax.synthetic.traffic.paths import SLOTS
 from drivax.synthetic.traffic.roles import Drivers
 
-#: Half of the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, 1.5 m to a car.
+#: Right part of a lane that a cyclist takes, m: half a bicycle, its distance from the kerb, 1.5 m to a passing car.
 _CYCLIST_PASSING_M = 0.35 + 0.55 + 1.5
 
 
@@ -27,7 +27,7 @@ class Leaders:
         self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
         self._rows = np.arange(len(self._half_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist within each lane.
+        # Half the width of the widest car that may pass a cyclist in the middle of each lane.
         widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
         self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
         self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
@@ -35,7 +35,10 @@ class Leaders:
     def find(
         self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
     ) -> tuple[PerVehicle, VehicleRows]:
-        """Return the gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
+        """Return the gap to the nearest vehicle ahead on the lanes of the path (infinite: none), and its row.
+
+        A world without a vehicle on a lane keeps its last result.
+        """
         own, world = at_m[:, None], self._worlds.world
         lane, along = tables.lanes_at(at_m)
         lane[~active] = -1
@@ -64,7 +67,6 @@ class Leaders:
         gap -= self._half_m[:, None]
         nearest = gap.argmin(axis=1)
         result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
-        # A world without a vehicle on a lane keeps the last result.
         empty = (k[:, 0] < 0)[world]
         for values, last in zip(result, self._nearest, strict=True):
             values[empty] = last[empty]

@@ -73,7 +73,7 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
 
 
 def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
-    """Add lanes that lead to any of several lanes within 160 m; one first reached on a longer way may cut others off."""
+    """Add the lanes that lead to any of several lanes within 160 m."""
     result: set[int] = set()
     queue = [(lane, 0.0) for lane in sorted(lanes)]
     while queue:
@@ -95,9 +95,9 @@ def assign_roles(
         network: The roads.
         domain: Density and composition of traffic.
         times_s: Times of all steps; the warm-up of traffic ends at time 0.
-        lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
-        timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination the light is
-            green when ego arrives.
+        lane_change_share: Share of random routes with room for it on which ego plans a lane change.
+        timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination it is green
+            on arrival.
         rng: Source of randomness.
         destinations: Candidate places for ego to pass; if it can reach none, its route is random.
         critical: Whether ego must give way to dense traffic, if the roads allow it; ``destinations`` are ignored.
