@@ -254,7 +254,10 @@ def arrivals(
     network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
     valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
 ) -> dict[int, _Steps]:  # fmt: skip
-    """Return the steps at which a vehicle other than ego is on a connector with priority, or about to enter it."""
+    """Return, for connectors to which others yield, the steps at which a vehicle is or will be on them within 2 s.
+
+    Ego, row 0, does not count. Connectors on no other path are left out.
+    """
     watched = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):
