@@ -279,8 +279,8 @@ def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) ->
 def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float64[np.ndarray, "count count"]:
     """Return the Savitzky-Golay filter (Savitzky and Golay 1964) of ``count`` samples as a matrix.
 
-    ``count`` is at least ``window``; derivatives are per sample. The first and last polynomials extend to the ends. As in SciPy, an even window is
-    evaluated half a sample before the upper one of its two middle samples.
+    ``count`` is at least ``window``; derivatives are per sample. The first and last polynomials extend to the ends. As
+    in SciPy, an even window is evaluated half a sample before the upper one of its two middle samples.
     """
     half = window // 2
     first = np.clip(np.arange(count) - half + (window % 2 == 0), 0, count - window)
