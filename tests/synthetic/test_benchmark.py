@@ -55,7 +55,7 @@ def test_benchmark_sets_share_no_map(small):
 
 
 @pytest.mark.slow
-def test_smaller_benchmark_is_a_prefix_of_the_full_one(small, tmp_path):
+def test_smaller_benchmark_is_a_prefix_of_a_larger_one(small, tmp_path):
     path, *_ = small
     generate_benchmark(tmp_path / "less", Generation(), train=1)
     for name in SPLITS:

@@ -333,18 +333,8 @@ def test_flags_override_the_configuration_file(tmp_path):
 def test_signal_leaves_nothing(tmp_path):
     """SIGTERM while scenarios are drawn; the first shard would be full after 512."""
     code = "from drivax.cli import main; raise SystemExit(main())"
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        "generate",
-        tmp_path / "set",
-        "--scenarios",
-        "512",
-        "--workers",
-        "1",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    words = ["generate", tmp_path / "set", "--scenarios", "512", "--workers", "1"]
+    process = subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not (tmp_path / ".set.partial" / "content").is_dir() and time.monotonic() < deadline:
         time.sleep(0.05)

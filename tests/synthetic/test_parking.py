@@ -52,7 +52,7 @@ def test_double_parked_cars_leave_room_to_pass():
     # A lane of 3.5 m without a neighbour leaves no room to pass.
     for seed in range(20):
         assert parked_cars(street(oncoming=False), 0.0, 1.0, np.random.default_rng(seed), 5) == ()
-    # 5 m are enough for both.
+    # A lane of 5 m leaves room to pass.
     assert parked_cars(street(5.0, oncoming=False), 0.0, 1.0, np.random.default_rng(0), 5)
 
 

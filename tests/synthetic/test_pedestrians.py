@@ -92,7 +92,8 @@ def test_pedestrians_wait_for_cars_that_cannot_stop(marked):
 
 
 def test_pedestrians_take_priority_only_at_marked_crossings():
-    # 40 m away at 10 m/s: 1.3 m/s2 are enough to stop; the car would come after 4 s, crossing takes 6 s.
+    # At 4 s the pedestrian is near the kerb, and the car is 40 m away at 10 m/s: it could stop with 1.3 m/s2, or would
+    # arrive 4 s later, when the pedestrian, who needs 6 s, is still on the road.
     def braking(t):
         since = max(0.0, 0.1 * t - 4.0)
         v = max(0.0, 10.0 - 1.6 * since)
@@ -106,14 +107,14 @@ def test_pedestrians_take_priority_only_at_marked_crossings():
 
 
 def test_pedestrians_wait_for_enough_red_at_lights():
-    # Green from step 0 to 5.4 s, yellow 3 s, then red for 24.5 s.
+    # From step 0 on green for 5.4 s, yellow for 3 s, then red for 26 s.
     network = street(green_s=5.4)
     xy, _, _, occupied = play(network, (over(),))
     colour, _ = network.signals.colours(TIMES, len(network.lanes))
     on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
     assert on.any() and np.all(colour[on, 1] == Colour.RED)
     assert not occupied[colour[:, 1] != Colour.RED].any()
-    # Red is about to end when this one arrives: 1.5 s are left.
+    # When this one starts to look for a gap, 1.4 s of red are left.
     late = SignalPlan(network.signals.groups, ((0,), (1,)), (6.0, 3.1), offset_s=-20.0 + 0.3)
     waits = RoadNetwork("test", network.lanes, (), crossings=network.crossings, signals=late)
     xy = play(waits, (over(),))[0]
@@ -126,7 +127,7 @@ def test_no_pedestrian_enters_a_standing_queue():
     standing = lambda t: (np.array([[50.0, -1.75]]), np.zeros(1), np.zeros(1))  # noqa: E731
     xy, _, speed, _ = play(street(), (over(),), standing)
     assert xy[:, 0, 1].max() < -4.0 and speed[-1, 0] == pytest.approx(0.0, abs=0.05)
-    # Nor off crossings.
+    # Pedestrians stop before a vehicle off crossings, too.
     along = Pedestrian(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 0.0, 1.4)
     xy = play(street(), (along,), standing)[0]
     assert xy[:, 0, 1].max() < -1.75 - 0.95

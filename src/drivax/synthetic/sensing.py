@@ -154,12 +154,12 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
         dx *= sin
         lateral -= dx
         reach = radius[near_rows, None] + radius[targets]
-        meets = blocking[near_rows].take(steps, axis=1) & (np.abs(lateral, out=lateral) < reach)
-        meets &= ahead > -radius[near_rows, None]
+        may_cut = blocking[near_rows].take(steps, axis=1) & (np.abs(lateral, out=lateral) < reach)
+        may_cut &= ahead > -radius[near_rows, None]
         reach += length[batch]
-        meets &= ahead < reach
-        meets &= near_rows[:, None] != targets
-        occluder, ray = np.nonzero(meets)
+        may_cut &= ahead < reach
+        may_cut &= near_rows[:, None] != targets
+        occluder, ray = np.nonzero(may_cut)
         pairs.append((ray + first, near_rows[occluder]))
     ray, occluder = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return ray, occluder

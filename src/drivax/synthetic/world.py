@@ -230,16 +230,8 @@ def _attempt(
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + draw.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
-    roles = assign_roles(
-        draw.network,
-        domain,
-        times,
-        config.lane_change_share,
-        config.signal_timing,
-        rng,
-        draw.destinations,
-        critical,
-    )
+    shares = config.lane_change_share, config.signal_timing
+    roles = assign_roles(draw.network, domain, times, *shares, rng, draw.destinations, critical)
     traffic = Traffic(roles, times)
     if draw.event:
         result = yield from _stage_event(draw, traffic, rng)

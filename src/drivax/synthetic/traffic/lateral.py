@@ -263,13 +263,9 @@ class Detours:
         return None
 
     def _is_free(
-        self,
-        request: DetourRequest,
-        positions: DetourPositions,
-        lateral: float,
-        obstacles: Extents,
+        self, request: DetourRequest, positions: DetourPositions, lateral: float, obstacles: Extents,
         moving: Boxes,
-    ) -> bool:
+    ) -> bool:  # fmt: skip
         """Whether the detour is free of road edges, standing obstacles and oncoming, crossing or overtaking users."""
         begin, out_end, back, end = positions
         half = request.size_m[1] / 2

@@ -255,8 +255,8 @@ def _nearest_samples(
     points, index = tables.samples_ahead(at_m, viewer, _SAMPLES_M)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
     separation = dx * dx + dy * dy
-    pair = np.arange(len(viewer)), separation.argmin(axis=1)
-    return points[pair], index[pair] * tables.step_m[viewer], separation[pair]
+    nearest = np.arange(len(viewer)), separation.argmin(axis=1)
+    return points[nearest], index[nearest] * tables.step_m[viewer], separation[nearest]
 
 
 def _leaves_corridor(

@@ -200,9 +200,9 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
             along[(current < span.from_m) | (current > span.until_m)] = math.inf
         for shared_lane, until_m in _shared_lanes(network)[span.lane]:
             on_lane = ((along < until_m) & (slots < SLOTS)).nonzero()[0]
-            place = (first + on_lane) * SLOTS + slots[on_lane]
-            lane.put(place, shared_lane)
-            lane_m.put(place, along[on_lane])
+            slot_index = (first + on_lane) * SLOTS + slots[on_lane]
+            lane.put(slot_index, shared_lane)
+            lane_m.put(slot_index, along[on_lane])
             slots[on_lane] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 

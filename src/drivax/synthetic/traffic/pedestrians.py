@@ -223,14 +223,14 @@ class Pedestrians:
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of a world if its active vehicles leave them a gap."""
         conflicts, crossing = self._conflicts[world], self._crossing[waiting]
-        local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
+        local, inverse = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
-        any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
+        any_s, hard_s = (s[inverse] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
         safe = np.where(self._has_yielding_drivers[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(safe):
-            is_blocked = overlap(conflicts.strip[local[place[safe]], None], boxes[None]).any(axis=1)
+            is_blocked = overlap(conflicts.strip[local[inverse[safe]], None], boxes[None]).any(axis=1)
             self._is_released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:

@@ -99,8 +99,8 @@ def conflict_zones(
             for i, j, hit in ((a, b, is_near.any(axis=1)), (b, a, is_near.any(axis=0))):
                 if hit.any():
                     step = network.lanes[i].length_m / (hit.size - 1)
-                    places = np.flatnonzero(hit)
-                    begin[i, j], end[i, j] = places[0] * step, places[-1] * step
+                    samples = np.flatnonzero(hit)
+                    begin[i, j], end[i, j] = samples[0] * step, samples[-1] * step
     return begin, end
 
 

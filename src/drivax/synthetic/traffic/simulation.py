@@ -164,7 +164,7 @@ class Traffic:
             self.colour, self.to_red = roles.network.signals.colours(times_s, shape[1])
 
     def before_step(self, steps: int) -> Traffic:
-        """Return the traffic with fewer steps."""
+        """Return the traffic of the first ``steps`` steps."""
         shorter = copy.copy(self)
         shorter.times_s = self.times_s[:steps]
         return shorter
@@ -388,13 +388,9 @@ class _Simulation:
         else:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
+            others = self._moving_users, self._users_by_world
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables,
-                self._vehicles,
-                self._position_m,
-                active,
-                self._moving_users,
-                self._users_by_world,
+                self._tables, self._vehicles, self._position_m, active, *others
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
