@@ -191,16 +191,16 @@ def _box_conflicts(
     coarse = ego[::_STRIDE, :2]
     xy = others[user, step, :2]
     gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
-    row, block = np.nonzero(gap < reach[user, None] ** 2)
+    entry, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
-    row = np.repeat(row, _STRIDE)
+    entry = np.repeat(entry, _STRIDE)
     is_inside = (point >= 0) & (point < len(ego))
-    row, point = row[is_inside], point[is_inside]
-    other, ego_box = others[user[row], step[row]], ego[point]
-    is_close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
-    row, point, other, ego_box = row[is_close], point[is_close], other[is_close], ego_box[is_close]
+    entry, point = entry[is_inside], point[is_inside]
+    other, ego_box = others[user[entry], step[entry]], ego[point]
+    is_close = overlap(_grow_boxes(ego_box, margin_m[user[entry]]), other)
+    entry, point, other, ego_box = entry[is_close], point[is_close], other[is_close], ego_box[is_close]
     hard = overlap(_grow_boxes(ego_box, np.array(HARD_M)), other)
-    return Conflicts(user[row], step[row], point, hard)
+    return Conflicts(user[entry], step[entry], point, hard)
 
 
 def _grow_boxes(

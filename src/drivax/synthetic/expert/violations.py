@@ -134,10 +134,10 @@ def first_overlap_step(
     dx, dy = (box[first, :, axis] - box[second, :, axis] for axis in (0, 1))
     gap = dx * dx + dy * dy
     near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
-    pair, time = np.nonzero(near)
-    hit = overlap(box[first[pair], time], box[second[pair], time])
+    index, time = np.nonzero(near)
+    hit = overlap(box[first[index], time], box[second[index], time])
     result = np.full((len(box), len(box)), box.shape[1])
-    np.minimum.at(result, (first[pair[hit]], second[pair[hit]]), time[hit])
+    np.minimum.at(result, (first[index[hit]], second[index[hit]]), time[hit])
     return np.minimum(result, result.T)
 
 

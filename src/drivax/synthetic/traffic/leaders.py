@@ -39,35 +39,35 @@ class Leaders:
 
         A world without a vehicle on a lane keeps its last result.
         """
-        own, world = at_m[:, None], self._worlds.world
+        own_m, world = at_m[:, None], self._worlds.world
         lane, along = tables.lanes_at(at_m)
         lane[~active] = -1
-        # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
+        # Occupied (vehicle, lane) of each world, padded with -1, and their positions on the path of each vehicle.
         slots = (lane.ravel() >= 0).nonzero()[0]
         if not len(slots):
             return self._nearest
         vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
-        k = group_indices(world[vehicle], len(self._worlds))
-        lanes = np.where(k < 0, self._worlds.first_lane[:-1, None], lane[k])
+        entry = group_indices(world[vehicle], len(self._worlds))
+        lanes = np.where(entry < 0, self._worlds.first_lane[:-1, None], lane[entry])
         index = lanes.take(world, axis=0)
         index += tables.column[:, None]
         position = tables.scale.take(index)
-        position *= along.ravel().take(slots)[k].take(world, axis=0)
+        position *= along.ravel().take(slots)[entry].take(world, axis=0)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = vehicle[k]
-        is_ahead = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
+        vehicle_ahead = vehicle[entry]
+        is_ahead = (position > own_m) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
         if self._any_cyclist:
             # Cyclists are overtaken within lanes that are wide enough.
             limit_m = np.where(self._cyclist[vehicle_ahead], self._passing_half_m[lanes], -np.inf)
             is_ahead &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
-        position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
+        position -= np.where(entry < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
         gap = np.where(is_ahead, position, np.inf)
-        gap -= own
+        gap -= own_m
         gap -= self._half_m[:, None]
         nearest = gap.argmin(axis=1)
         result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
-        empty = (k[:, 0] < 0)[world]
+        empty = (entry[:, 0] < 0)[world]
         for values, last in zip(result, self._nearest, strict=True):
             values[empty] = last[empty]
         self._nearest = result

@@ -62,7 +62,7 @@ _LINE_GAP_M = 1.0
 _OBSTACLE_GAP_M = 5.0
 #: Gap that the IDM keeps, and distance kept to the end of a lane in addition to it, m.
 _IDM_GAP_M, _LANE_END_GAP_M = 2.0, 10.0
-#: Largest speed of a vehicle that starts a detour, and of one where a halted user may block the way, m/s.
+#: Largest speed of a vehicle that starts a detour; in worlds with a stuck vehicle or a halted user, m/s.
 _DETOUR_MPS, _SLOW_DETOUR_MPS = 9.0, 3.0
 #: Speed below which vehicles and users count as halted, m/s, and length of users that need a detour, m.
 _HALTED_MPS, _LARGE_M = 0.05, 1.2
