@@ -172,7 +172,7 @@ class _OccupiedStates:
 
 
 def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
-    """Return the distance from each place to the next hard one ahead, m (1 km: none)."""
+    """Return the distance from each place to the next hard one, m (0: it is hard itself; 1 km or more: none)."""
     places = occupancy.hard.shape[1]
     index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]

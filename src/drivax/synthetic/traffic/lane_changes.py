@@ -31,12 +31,12 @@ _SAFE_BRAKING_MPS2, _URGENT_BRAKING_MPS2 = 2.5, 4.5
 _MANDATORY_M, _MANDATORY_S = 120.0, 9.0
 #: Duration of a change, s, its least length, m, and the lowest speed of a discretionary one, m/s.
 _DURATION_S, _MIN_LENGTH_M, _MIN_SPEED_MPS = 4.2, 14.0, 3.0
-#: Required bumper-to-bumper gaps on the new lane, m; time added behind, times the follower's speed, and ahead, times
-#: the closing speed, s; and the share of the time behind that the most urgent changes do without.
+#: Required bumper-to-bumper gap on the new lane, m; times added at the follower's speed behind and at the closing speed
+#: ahead, s; share by which urgency reduces the time behind.
 _GAP_M, _FOLLOWER_S, _CLOSING_S, _URGENT_SHARE = 2.0, 0.25, 1.0, 0.6
 #: Least distances of a discretionary change from the junction behind and to the one ahead, m.
 _FROM_JUNCTION_M, _TO_JUNCTION_M = 12.0, 25.0
-#: Half the length of a static obstacle, and distance behind a vehicle up to which it still counts as ahead, m.
+#: Half the length of a static obstacle, m, and distance behind a vehicle up to which it counts as ahead, m.
 _HALF_OBSTACLE_M, _OBSTACLE_BEHIND_M = 2.4, 3.0
 #: Half the width of a car that an obstacle may block, m.
 _HALF_CAR_M = 0.95

@@ -198,7 +198,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 
 
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
-    """Run tasks and return their results in order.
+    """Run tasks and yield their results in order.
 
     Each task yields runs and receives their motion. Up to six runs of different tasks are simulated together.
     """
