@@ -34,6 +34,14 @@ def test_sizes_follow_the_table_or_scale():
         sizes(0)
 
 
+def test_existing_set_is_refused_before_others_are_written(tmp_path):
+    (tmp_path / "test-rare").mkdir()
+    (tmp_path / "test-rare" / "manifest.json").touch()
+    with pytest.raises(UsageError, match="test-rare: output folder already exists"):
+        generate_benchmark(tmp_path, train=1)
+    assert [child.name for child in tmp_path.iterdir()] == ["test-rare"]
+
+
 @pytest.mark.slow
 def test_benchmark_sets_share_no_map(small):
     path, sets, progress = small

@@ -359,7 +359,7 @@ def generate_benchmark(
         audit: See :func:`generate`.
 
     Raises:
-        UsageError: Wrong options, or a set exists; this is found when its turn comes, after earlier ones are written.
+        UsageError: Wrong options, or one of the sets exists and is not to be overwritten.
         DataError: The disk has too little space.
     """
     options = options or Generation()
@@ -371,6 +371,8 @@ def generate_benchmark(
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))
+    for name in SPLITS:
+        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)  # refuses an existing set
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
