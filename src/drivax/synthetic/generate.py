@@ -372,7 +372,8 @@ def generate_benchmark(
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))
     for name in SPLITS:
-        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)  # refuses an existing set
+        # Refuses an existing set.
+        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
