@@ -111,7 +111,7 @@ class WorldConfig:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
         if largest_shift_m(self.noise, *LARGEST_VEHICLE_M) > EGO_SKIN_M:
             raise UsageError(
-                f"noise with noise.level {self.noise.level} could exceed the margin of {EGO_SKIN_M} m around ego",
+                f"noise (noise.level {self.noise.level}) could exceed the margin of {EGO_SKIN_M} m around ego",
                 cure="use a smaller level or smaller deviations",
             )
         return DOMAINS[self.domain]
