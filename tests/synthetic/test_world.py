@@ -256,7 +256,7 @@ def test_noise_changes_other_agents_only():
         ),
         ({"noise": NoiseConfig(level=float("nan"))}, "noise.level is nan; use a finite number"),
         ({"noise": NoiseConfig(level=-3.0)}, "noise.level is -3.0; use a finite number that is not negative"),
-        ({"noise": NoiseConfig(level=2.0)}, "noise (noise.level 2.0) could exceed the margin of 0.1 m around ego"),
+        ({"noise": NoiseConfig(level=2.0)}, "(noise.level 2.0) could exceed the margin of 0.1 m around ego"),
     ],
 )
 def test_invalid_settings_are_refused(settings, message):
