@@ -48,7 +48,7 @@ def draw_braking(
 ) -> tuple[float, float] | None:
     """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
 
-    Return None if hard braking requires too little.
+    Return None if that range hardly overlaps ``SEVERITY_MPS2``, or the leader would have to stop at once.
     """
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
@@ -104,9 +104,9 @@ class LeadBrakes(EventScript):
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
         if self.tailgater:
-            behind = np.where(on_path & (station < own), own - station, np.inf)
-            follower = int(np.argmin(behind))
-            if not behind[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
+            distance_m = np.where(on_path & (station < own), own - station, np.inf)
+            follower = int(np.argmin(distance_m))
+            if not distance_m[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
                 return None
             followers, tailgates = (follower,), (Tailgate(follower, tailgating),)
         length = motion.size_m[: motion.vehicles, 0]
@@ -114,8 +114,8 @@ class LeadBrakes(EventScript):
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
-        lead = float(motion.speed[leader, step])
-        draft = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        leader_mps = float(motion.speed[leader, step])
+        draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > 3.0 else None
         if draft is None:
             return None
         braking, requested = draft
@@ -155,12 +155,12 @@ def _propose_leader(
 ) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; without
-    it stays.
+    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; with
+    None it stays where it stopped.
 
     Returns:
-        The proposal; None near junctions, if even hard braking would require too little of ego, or if the leader would
-        drive on only after the recording.
+        The proposal; None near junctions, if :func:`draw_braking` returns None, or if the leader would drive on only
+        after the recording.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -267,7 +267,7 @@ class CutIn(EventScript):
         station, side = ends[int(rng.integers(len(ends)))]
         speed = view.motion.speed[0]
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST + 1)
-        # The merge and its gap take about three seconds, and it ends within the last metres of the lane.
+        # The merge and its gap take about three seconds, and it ends within ``before_end_m`` of the lane's end.
         remaining_m = station - view.track.at[steps] - 3.0 * speed[steps]
         is_timely = (remaining_m > 0.0) & (remaining_m < self.before_end_m)
         candidates = steps[is_timely & (speed[steps] > 4.0)]
@@ -276,7 +276,7 @@ class CutIn(EventScript):
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Return the lateral offset of the actor's lane, and a mask of its steps; None without one."""
+        """Return the lateral offset of the actor's lane, and a mask of the steps with a lane there; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
         for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():

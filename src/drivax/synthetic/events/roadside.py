@@ -38,7 +38,7 @@ def _is_open_street(view: EgoView, station: float) -> bool:
 
 
 def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
-    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to reach it, s."""
+    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to it at its speed, s."""
     own, speed = view.at_step(step)
     room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
     return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
@@ -47,7 +47,7 @@ def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: f
 def _entry(
     view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
 ) -> tuple[Times, Times] | None:
-    """Return distance and speed of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
+    """Return :func:`gait` of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
     gain, loss = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
     return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
@@ -56,7 +56,7 @@ def _entry(
 def _crossing_actor(
     view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size
 ) -> ScriptedUser:
-    """Build an actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
+    """Build an actor that moves at a right angle to ego's path at a station; an actor that never moves faces it."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
     return scripted_motion(xy, toward, kind, size, np.ones(view.steps, bool))
@@ -83,7 +83,7 @@ class Jaywalker(_StreetScript):
         step, station, offset = origin
         if not _is_open_street(view, station):
             return None
-        # The walk ends beyond the other side of the road.
+        # The walk ends 0.6 m beyond the other side of the road, at most 14.6 m beyond ego's path.
         side = -int(math.copysign(1, offset))
         walk_m = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
@@ -99,7 +99,10 @@ class Jaywalker(_StreetScript):
     def _required_room(
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
     ) -> float | None:
-        """Return the distance from ego's front to the pedestrian's line at the first step; None if ego passes first."""
+        """Return the distance from ego's front to the pedestrian's line at the first step.
+
+        None if ego at its speed is there, or within 0.5 m, when the pedestrian enters its lane.
+        """
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
@@ -216,7 +219,7 @@ class WrongWayCyclist(_StreetScript):
     """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
-        out_s: Time in ego's lane, low and high.
+        out_s: Time from the first step until ego's lane is clear again, low and high.
         swing_s: Duration of each swing.
     """
 
