@@ -276,7 +276,7 @@ class CutIn(EventScript):
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Return the lateral offset of the actor's lane, and a mask of the steps with a lane there; None without one."""
+        """Return the offset of the actor's lane, and a mask of the steps with a lane there; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
         for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():
