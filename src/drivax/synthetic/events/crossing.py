@@ -16,7 +16,7 @@ from drivax.synthetic.events.adversary import (
     vehicles_in_lane,
 )
 from drivax.synthetic.events.destinations import Destination
-from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
@@ -178,7 +178,7 @@ class CrossTraffic(EventScript):
         for entry in range(first, last + 1):
             begin = entry - lead + NOTICED
             speed = float(view.motion.speed[0, begin])
-            if speed > 4.0:
+            if speed > SLOWEST_MPS:
                 room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
                 required[entry] = required_on_samples(speed, room)
         low, high = SEVERITY_MPS2

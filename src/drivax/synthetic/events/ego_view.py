@@ -23,7 +23,7 @@ NOTICED_S = NOTICED * DT_S
 #: Ego's path continues this far beyond its last position, m.
 _BEYOND_M = 160.0
 #: Least speed of ego at the beginning of an event, m/s.
-_SLOWEST_MPS = 4.0
+SLOWEST_MPS = 4.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ def ego_track(motion: Motion) -> Track:
     points, headings, along = xy[distinct], heading[distinct], arc[distinct]
     if motion.paths:
         curve = motion.paths[0].curve
+        # The second sample after the nearest one is ahead of ego.
         index = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
         remainder, turn = curve.xy[index:], curve.heading[index:]
         gaps = np.hypot(*np.diff(np.concatenate([points[-1:], remainder]), axis=0).T)
@@ -127,7 +128,7 @@ class EgoView:
     def draw_step(self, rng: np.random.Generator) -> int | None:
         """Draw a step at which an event may begin and ego is not slow, or return None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
-        steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
+        steps = steps[self.motion.speed[0, steps] > SLOWEST_MPS]
         return int(rng.choice(steps)) if len(steps) else None
 
     @cached_property

@@ -11,7 +11,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, along_track, brake_to_halt, speed_change
 from drivax.synthetic.events.adversary import severity
 from drivax.synthetic.events.destinations import Destination, open_road
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED, NOTICED_S, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED, NOTICED_S, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
@@ -19,6 +19,8 @@ from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
 #: Lowest speed limit of the road, m/s; on slower roads a braking leader requires little of ego.
 _LEAST_MPS = 10.0
+#: Speed above which an existing leader may brake, m/s.
+_LEADER_MPS = 3.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
 #: Time that a leader stands after ego would have reached it at constant speed, s.
@@ -115,7 +117,7 @@ class LeadBrakes(EventScript):
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         leader_mps = float(motion.speed[leader, step])
-        draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > 3.0 else None
+        draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > _LEADER_MPS else None
         if draft is None:
             return None
         braking, requested = draft
@@ -270,7 +272,7 @@ class CutIn(EventScript):
         # The merge and its gap take about three seconds, and it ends within ``before_end_m`` of the lane's end.
         remaining_m = station - view.track.at[steps] - 3.0 * speed[steps]
         is_timely = (remaining_m > 0.0) & (remaining_m < self.before_end_m)
-        candidates = steps[is_timely & (speed[steps] > 4.0)]
+        candidates = steps[is_timely & (speed[steps] > SLOWEST_MPS)]
         return (int(rng.choice(candidates)) if len(candidates) else None), side
 
     def _adjacent_lane(

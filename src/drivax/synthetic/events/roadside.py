@@ -10,7 +10,7 @@ import numpy as np
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, gait, scripted_motion, travel_s
 from drivax.synthetic.events.adversary import waiting_room
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
@@ -149,7 +149,7 @@ class Jaywalker(_StreetScript):
             front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
             rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
             rooms = [math.inf if room is None else room for room in rooms]
-            error = np.where(speed > 4.0, rooms, math.inf) - (line - front)
+            error = np.where(speed > SLOWEST_MPS, rooms, math.inf) - (line - front)
             best = int(np.argmin(np.abs(error)))
             if abs(error[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset

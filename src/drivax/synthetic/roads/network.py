@@ -56,7 +56,7 @@ class Lane:
         left, right: Neighbours of the same direction.
         connector: Whether the lane leads across a junction; connectors may cross, and have rules at the entry.
         control: Rule at the entry of a connector; the stop line is where it begins.
-        yields_to: Conflicting connectors with right of way; empty at all-way stops.
+        yields_to: Conflicting connectors with right of way, at lights only of the same phase; empty at all-way stops.
         ends: Whether the lane ends without a successor while the road continues (lane drops, acceleration lanes).
         exit_only: Whether the lane leads off the road (deceleration lanes and off-ramps).
         kind: Type of the lane: for cars, or for bicycles only.

@@ -30,7 +30,7 @@ class LightGroup:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Fixed-time plan of all junctions of a network: a phase is green, then yellow, then the junction all red.
+    """Fixed-time plan of all junctions of a network: each phase is green, then yellow, then its junction is all red.
 
     Attributes:
         phases: Indices of the groups that are green, per phase.
@@ -114,7 +114,7 @@ class SignalPlan:
 
 
 def yellow_time_s(limit_mps: float) -> float:
-    """Duration of yellow: after a second at the limit a vehicle passes or can stop at 3.05 m/s2; at least 3 s.
+    """Duration of yellow: 1 s of reaction and half the time of a stop from the limit at 3.05 m/s2; at least 3 s.
 
     Kinematic formula ``t + v / (2 a)`` of the Institute of Transportation Engineers (Guidelines for Determining
     Traffic Signal Change and Clearance Intervals, 2020) on level ground.

@@ -215,7 +215,7 @@ class TJunction:
 class AllWayStop:
     """Settings of the family ``all_way_stop``: two streets with stop signs on all approaches.
 
-    Limits are at most ``fastest_mps``, unless the domain has only higher ones.
+    Limits are at most ``fastest_mps``; a style with only higher ones gets its lowest.
     """
 
     geometry: Geometry = field(default_factory=lambda: Geometry(corner_m=(5.0, 9.0)))
