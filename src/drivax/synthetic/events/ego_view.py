@@ -15,7 +15,7 @@ from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate
 from drivax.synthetic.traffic.roles import Motion, Roles
 
-#: Steps of the recording: earliest and latest first one of an event, and that before which its actor blocks the path.
+#: Steps after the recording's first: earliest and latest start of an event; its actor blocks the path before the third.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
 #: Steps from an event's first one until the actor's behaviour is visible, and the time, s.
 NOTICED = 4

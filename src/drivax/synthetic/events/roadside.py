@@ -101,7 +101,7 @@ class Jaywalker(_StreetScript):
     ) -> float | None:
         """Return the distance from ego's front to the pedestrian's line at the first step.
 
-        None if ego at its speed is there, or within 0.5 m, when the pedestrian enters its lane.
+        None if ego, at its speed, is past the line or less than 0.5 m before it when the pedestrian enters its lane.
         """
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
