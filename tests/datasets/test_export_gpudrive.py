@@ -11,11 +11,11 @@ from datasets.samples import womd_scenario
 from datasets.test_export_recording import assert_same_map
 from drivax.datasets import gpudrive
 from drivax.datasets.export.recording import restore
-from drivax.datasets.gpudrive import file_name, gpudrive_scene
+from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd import scenario_reader as protos
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
-from scenario.recordings import FAR, driving, make_recording, make_tracks, moved
+from scenario.recordings import FAR, driving, light, make_recording, make_tracks, moved
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def source():
 @pytest.fixture(scope="module")
 def scene(source):
     """The scene after a round trip through strict JSON text."""
-    text = json.dumps(gpudrive_scene(assemble(source), "x.json"), allow_nan=False)
+    text = json.dumps(gpudrive_content(assemble(source), "x.json"), allow_nan=False)
     return json.loads(text)
 
 
@@ -73,10 +73,17 @@ def test_roads_and_lights(scene):
     )
     assert len(codes) == len(scene["roads"]) == 11  # ids are unique
     assert scene["tl_states"].keys() == {"2", "4"}
-    light = scene["tl_states"]["4"]
-    assert light["time_index"] == list(range(20, 91)) and set(light["state"]) == {"arrow_stop"}
-    assert light["x"] == [pytest.approx(womd_scenario.X0 - 60, abs=1e-3)] * 71
+    states = scene["tl_states"]["4"]
+    assert states["time_index"] == list(range(20, 91)) and set(states["state"]) == {"arrow_stop"}
+    assert states["x"] == [pytest.approx(womd_scenario.X0 - 60, abs=1e-3)] * 71
     assert scene["tl_states"]["2"]["state"] == ["stop"] * 50 + ["go"] * 41
+
+
+def test_of_two_lights_of_a_lane_the_nearest_to_the_log_is_written():
+    lights = light(1, 120.0, 0.0, [6] * 91), light(1, 50.0, 0.0, [4] * 91)
+    stored = assemble(make_recording(lights=lights))
+    assert [one.lane_id for one in restore(stored).lights] == [1, 1]
+    assert gpudrive_content(stored, "x.json")["tl_states"]["1"]["state"] == ["stop"] * 91
 
 
 def test_file_names_have_the_prefix_that_the_loader_expects():
@@ -85,7 +92,7 @@ def test_file_names_have_the_prefix_that_the_loader_expects():
 
 def round_trip(recording):
     stored = assemble(recording)
-    back = gpudrive.decode(json.loads(json.dumps(gpudrive_scene(stored, "x.json"))))
+    back = gpudrive.decode(json.loads(json.dumps(gpudrive_content(stored, "x.json"))))
     kept = restore(stored)
     rows = [kept.tracks.track_id.tolist().index(number) for number in back.tracks.track_id]
     assert sorted(rows) == list(range(len(kept.tracks.kind)))

@@ -242,6 +242,11 @@ def broken(scene, *path, value):
         (("tl_states",), [1], "not a dictionary"),
         (("tl_states",), {"x": {}}, "not an id"),
         (("tl_states",), {"1": {"state": []}}, "no lists"),
+        (
+            ("tl_states",),
+            {"1": {"state": ["go"], "time_index": [91], "x": [0], "y": [0], "z": [0]}},
+            "names step 91, there are 91",
+        ),
     ],
 )
 def test_contradictions_are_refused_in_one_line(tmp_path, path, value, said):

@@ -122,10 +122,7 @@ def test_objects_of_classes_are_refused():
 
 def array_pickle(shape: tuple[int, ...], content: bytes) -> bytes:
     """An array that claims a shape, over some bytes."""
-    text = pickle.dumps(np.zeros(3), 2)
-    data = np.zeros(3).tobytes()
-    assert struct.pack("<B", 3) in text
-    return pickle.dumps(_Array(shape, content), 2) if data else b""
+    return pickle.dumps(_Array(shape, content), 2)
 
 
 class _Array:

@@ -47,8 +47,8 @@ _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
 #: Kinds of JSON files by words at their beginning, and cures.
 _JSON = {
     rb'"(objects|roads)"': (
-        "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
-        "convert the scenes again with a GPUDrive that writes metadata",
+        "JSON with objects or roads, but without GPUDrive's positions or geometries at its beginning",
+        "give files of GPUDrive's present converter",
     ),
     rb'"(lane_segments|drivable_areas)"': (
         "a map of Argoverse 2 without its recording",
