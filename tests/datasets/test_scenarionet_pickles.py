@@ -200,6 +200,10 @@ def test_18_sizes_have_limits(monkeypatch):
     monkeypatch.setattr(pickles, "MOST_OPERATIONS", 50)
     with pytest.raises(DataError, match="too many parts"):
         pickles.load(pickle.dumps(list(range(100))))
+    monkeypatch.setattr(pickles, "MOST_NUMBERS", 3)
+    for value in ([0, 1, 2, 3], np.zeros((4, 2))):
+        with pytest.raises(DataError, match="heading: 4 rows, more than 3"):
+            pickles.floats(value, "heading")
 
 
 @given(st.data())

@@ -24,7 +24,7 @@ MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
 #: A local map spans some hundred metres; a point this far from the others is damage.
 _SPREAD_M = 20_000.0
-#: Spacing of points on centre lines, at most, and the length below which a line has none.
+#: Largest spacing of points on a centre line between boundaries, and length of the shortest line that is used.
 _SPACING_M, _SHORTEST_M = 2.0, 1e-3
 #: Ids are below this, so that those of edges and lines, which follow the largest, fit into 64 bits.
 _ID_END = 2**62
