@@ -468,7 +468,7 @@ def test_round_trip(source):
     assert again.overflow == stored.overflow
 
 
-def test_round_trip_of_a_real_scene(real_data):
+def test_round_trip_of_a_real_scenario(real_data):
     """And against the proto itself: moving agents to a millimetre, parked ones within the 0.3 m of their one pose."""
     (source,) = protos.WomdScenario().read(real_data / "womd" / "motion_data_one_scenario.tfrecord")
     stored, back = round_trip(source)
