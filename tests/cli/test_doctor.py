@@ -237,6 +237,11 @@ def test_many_gaps_are_counted_only():
     assert gaps(paths) == ["t.tfrecord: 50 of 100 shards"]
 
 
+def test_families_of_one_name_are_named_with_their_folder():
+    paths = [Path(split, "t.tfrecord-00000-of-00001") for split in ("train", "val")]
+    assert gaps(paths) == ["train/t.tfrecord: all 1 shards", "val/t.tfrecord: all 1 shards"]
+
+
 def test_shards_are_grouped_by_folder(tmp_path, capsys):
     for split in ("training", "validation"):
         (tmp_path / split).mkdir()

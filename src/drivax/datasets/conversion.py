@@ -64,7 +64,7 @@ class Conversion:
             training with `egos: moving` drives.
         stride: Steps between the starts of two windows of a longer recording.
         split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
-        workers: Processes that read; 1 reads in the main process.
+        workers: Processes that read, each a file at a time; 1 reads in the main process.
         strict: Stop at the first unreadable record instead of skipping it.
         overwrite: Replace an existing scenario set, or start again after another, interrupted conversion.
         shard_size: Scenarios per shard of the set, the unit of resume.

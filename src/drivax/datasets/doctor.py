@@ -150,7 +150,7 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Return a sentence per family of numbered shards (``NAME-00003-of-00150``): how many of them are there.
+    """Return a sentence per folder and family of numbered shards (``NAME-00003-of-00150``): how many are there.
 
     Missing numbers are named if they form at most 8 runs.
     """
@@ -158,16 +158,17 @@ def gaps(paths: Sequence[Path]) -> list[str]:
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
             families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
-    sentences = []
-    for (_, prefix, total), numbers in sorted(families.items()):
+    sentences, folders = [], Counter(prefix for _, prefix, _ in families)
+    for (folder, prefix, total), numbers in sorted(families.items()):
+        name = prefix if folders[prefix] == 1 else f"{folder.name}/{prefix}"
         missing = sorted(set(range(total)) - numbers)
         if not missing:
-            sentences.append(f"{prefix}: all {total:,} shards")
+            sentences.append(f"{name}: all {total:,} shards")
             continue
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
         names_text = f", missing {', '.join(names)}" if len(runs) <= _RUNS else ""
-        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{names_text}")
+        sentences.append(f"{name}: {total - len(missing):,} of {total:,} shards{names_text}")
     return sentences
 
 

@@ -66,7 +66,7 @@ def segment_of(scenario_id: str) -> str:
 
 
 class Lights:
-    """Collects light states by lane over some steps; slots and list positions move between steps, lanes do not."""
+    """Collects light states by lane over some steps; a source's slots may hold different lanes at different steps."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps

@@ -138,7 +138,7 @@ def explain_folder(folder: Path) -> DataError | None:
 
 
 def explain_own(folder: Path) -> DataError | None:
-    """Return the error for a folder that drivax wrote, whatever files are in it; None for others."""
+    """Return the error for a scenario set or run folder of drivax, whatever files are in it; None for others."""
     return _first_match(folder, _OWN_FOLDERS)
 
 

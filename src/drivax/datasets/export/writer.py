@@ -1,4 +1,4 @@
-"""Export of scenario sets: a part of a set as a set, tf.Examples or GPUDrive JSON."""
+"""Export of a scenario set, or a part of it, as a set, tf.Examples or GPUDrive JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Export:
         format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
         filters: Conditions that all must hold (``scenario.select.selection``).
         ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None: all.
-        limit: Write only the first of the selected scenarios; None: all.
+        limit: Write only the first N of the selected scenarios; None: all.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.
         overwrite: Replace an existing set (by a set) or export (by another format); other folders are never replaced.
