@@ -99,7 +99,7 @@ class Reader(Protocol):
         ...
 
     def recognise(self, path: Path) -> bool:
-        """Whether a file is of this format, by its name, its first bytes, or its first record; never raises."""
+        """Whether a file is of this format, by its name, first bytes, tables or first record; never raises."""
         ...
 
     def describe(self, path: Path) -> Description:

@@ -29,7 +29,8 @@ _SPACING_M, _SHORTEST_M = 2.0, 1e-3
 #: Ids are below this, so that those of edges and lines, which follow the largest, fit into 64 bits.
 _ID_END = 2**62
 _LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
-#: WOMD has no white lines that are dashed on one side and solid on the other: they become double solid.
+#: WOMD has no white lines that are dashed on one side and solid on the other, which become double solid, and no double
+#: dashed ones, which become single.
 _MARKS = {
     "DASHED_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
     "DOUBLE_DASH_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,

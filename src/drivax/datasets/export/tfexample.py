@@ -196,7 +196,7 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
 
 
 def _numbers(recording: Recording) -> dict[int, int]:
-    """Return written ids of map features by their ids."""
+    """Return the written id of each map feature and lane of a light by its id: the same if all fit, else its number."""
     ids = [feature.feature_id for feature in recording.features]
     numbers = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in numbers)
