@@ -134,7 +134,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
 
 def _key(scenario: Scenario) -> tuple[str, str]:
-    """Return data set and id, of which a set holds no two scenarios with the same."""
+    """Return data set and id of a scenario, which no two scenarios of a set share."""
     return scenario.text("dataset"), scenario.id
 
 

@@ -18,8 +18,8 @@ from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError, did_you_mean
 
-#: Every reader; a new format is one module and one entry here. Of readers whose patterns match a file (or of those
-#: whose do not), the first is asked first, so readers that look at a name or a few bytes come first.
+#: Every reader; a new format is one module and one entry here. A file goes to the readers whose patterns it matches, then
+#: to the others, both in this order: those that look at a name or a few bytes come first.
 READERS: tuple[Reader, ...] = (
     ArgoverseMotion(),
     ArgoverseSensor(),
@@ -32,7 +32,7 @@ READERS: tuple[Reader, ...] = (
     ScenarioMax(),
 )
 AUTO = "auto"
-#: Endings of sensor data and texts, of which folders hold hundreds of thousands: there such files are never opened.
+#: Endings of sensor data and texts, which data sets hold by the hundred thousand: in folders they are never opened.
 _NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
 
