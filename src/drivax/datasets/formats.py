@@ -18,8 +18,8 @@ from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError, did_you_mean
 
-#: Every reader; a new format is one module and one entry here. A file goes to the readers whose patterns it matches, then
-#: to the others, both in this order: those that look at a name or a few bytes come first.
+#: Every reader; a new format is one module and one entry here. A file goes to the readers whose patterns it matches,
+#: then to the others, both in this order: those that look at a name or a few bytes come first.
 READERS: tuple[Reader, ...] = (
     ArgoverseMotion(),
     ArgoverseSensor(),
