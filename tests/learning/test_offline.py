@@ -452,16 +452,21 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
     """Adam's step under a constant gradient is its rate, whatever moves how often."""
     config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
-    learner = config.build(Logged(), arms([0.0], [0.0]), 4)
-    adam = learner.adam(config.policy_rate, every)
     weights = jnp.zeros(1)
 
-    def move(state, _):
-        change, state = adam.update(jnp.ones(1), state, weights)
-        return state, change[0]
+    def rates(config, count):
+        adam = config.build(Logged(), arms([0.0], [0.0]), 4).adam(config.policy_rate, every)
 
-    moves = -np.asarray(jax.lax.scan(move, adam.init(weights), None, 40 // every + 1)[1])
-    fallen = np.minimum(np.arange(len(moves)) / (falling * 40 // every), 1.0)
-    np.testing.assert_allclose(moves, 1e-3 - 0.75e-3 * fallen, rtol=1e-4)
+        def move(state, _):
+            change, state = adam.update(jnp.ones(1), state, weights)
+            return state, change[0]
+
+        return -np.asarray(jax.lax.scan(move, adam.init(weights), None, count)[1])
+
+    count = 40 // every + 1
+    share = np.minimum(np.arange(count) / (falling * 40 // every), 1.0)
+    np.testing.assert_allclose(rates(config, count), 1e-3 - 0.75e-3 * share, rtol=1e-4)
+    # A share of less than one update is one update.
+    np.testing.assert_allclose(rates(replace(config, falling=1e-3), 2), [1e-3, 0.25e-3], rtol=1e-4)
     with pytest.raises(UsageError, match=r"falling is 0\.0; use more than 0"):
         replace(config, falling=0.0)

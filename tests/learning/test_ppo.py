@@ -187,6 +187,12 @@ def test_networks_are_clipped_by_their_own_norms():
     np.testing.assert_array_equal(nothing["policy"], [0.0, 0.0])
 
 
+@pytest.mark.parametrize("name", ["environments", "unroll", "epochs", "minibatches"])
+def test_settings_of_zero_are_refused(name):
+    with pytest.raises(ValueError, match="are at least 1"):
+        PpoConfig(**{name: 0})
+
+
 def test_learning_rate_falls_to_a_tenth():
     """The first step of Adam is the rate itself, whatever the gradient; and so are all, if it stays the same."""
     optimiser = clipped_adam(0.5, 1.0, updates=10, eps=0.0)

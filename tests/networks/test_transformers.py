@@ -233,6 +233,7 @@ def test_encoders_accept_sets_only_or_ego_only(name, missing):
     [
         (lambda: LqConfig(width=10, heads=4), "width 10 is not a multiple of 4 heads"),
         (lambda: LqConfig(latents=0), "must be at least 1"),
+        (lambda: LqhConfig(local_layers=0), "local_layers must be at least 1"),
         (lambda: MtrConfig(layers=0), "must be at least 1"),
         (lambda: EntityConfig(width=6), "width 6 is not a multiple of 4 heads"),
     ],

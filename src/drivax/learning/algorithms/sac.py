@@ -61,7 +61,7 @@ class SacConfig:
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
         steps: Steps of the n-step returns; their actions are not corrected for later changes of the policy.
-        demonstrations: Share of each batch with the log's expert (Ball et al. 2023, arXiv 2302.02948).
+        demonstrations: Share of each batch drawn from the log's expert (Ball et al. 2023, arXiv 2302.02948).
         warm_up: Steps before the first update.
         explore: Actions before the first update: ``uniform``, or sampled from the ``policy``.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
@@ -69,7 +69,7 @@ class SacConfig:
         tau: Polyak averaging rate of the target critics.
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
-        gradient_norm: Maximum global norm of the gradients of policy and critics; None: no clipping.
+        gradient_norm: Maximum global norm of each gradient, of policy and of both critics; None: no clipping.
         average: Decay per iteration of an exponential moving average of the policy's parameters, which is validated
             and exported in place of the newest ones; 0: no average.
     """
@@ -144,8 +144,8 @@ class SacParameters:
 class SacState:
     """State of a run.
 
-    ``parameters`` are those of the planner: the average, if there is one, of the policy's that are ``trained`` (else
-    None).
+    ``parameters`` are those of the planner: with ``average``, the moving average of the policy's, which are
+    ``trained``; without, the policy's, and ``trained`` is None.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
@@ -299,7 +299,7 @@ class Sac(OffPolicy[SacConfig]):
     def gradient(
         self, trained: SacParameters, target: dict[str, Any], *batch: Any
     ) -> tuple[dict[str, Array], SacParameters]:
-        """Return values to log, and the gradient of :meth:`loss` in chunks, and of the auxiliary loss.
+        """Return values to log, and the sum of the gradients of :meth:`loss`, in chunks, and of the auxiliary loss.
 
         ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
         """
