@@ -195,6 +195,7 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
+        At a step where the ego is not valid, step 10 is taken instead.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
