@@ -91,6 +91,8 @@ class TrainConfig:
         if isinstance(self.task.actions, DirectState | Trajectory):
             kind = kind_of(type(self.task.actions))
             raise UsageError(f"policies cannot learn in {kind}", cure="choose a space in [-1, 1]")
+        if self.total_steps < 1:
+            raise UsageError(f"total_steps is {self.total_steps}", cure="use 1 or more")
         if self.evaluate_every < 0 or min(self.checkpoint_every, self.keep) < 1 or self.patience < 0:
             problem = "evaluate_every and patience are at least 0, checkpoint_every and keep at least 1"
             raise UsageError(problem, cure="use patience 0 to train to the end")

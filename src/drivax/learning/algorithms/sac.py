@@ -248,7 +248,7 @@ class Sac(OffPolicy[SacConfig]):
         """
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
-        before = state.iteration * config.steps_per_iteration
+        steps_before = state.iteration * config.steps_per_iteration
         trained = SacParameters(trained_parameters(state), state.critic, state.log_temperature)
         first: Carry = (trained, {"critic": state.target}, state.optimiser)
 
@@ -265,7 +265,7 @@ class Sac(OffPolicy[SacConfig]):
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
-        warm = any_across_learners(before + config.steps_per_iteration >= config.warm_up)
+        warm = any_across_learners(steps_before + config.steps_per_iteration >= config.warm_up)
         (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
         after = replace(
             state,
