@@ -213,6 +213,9 @@ def test_settling_fits_critics_to_a_fixed_policy(logged):
 def test_impossible_settings_are_refused():
     with pytest.raises(UsageError, match="demonstrations is 1"):
         SacConfig(network=NETWORK, demonstrations=1)
+    for share, count in ((0.03, 0), (0.97, 16)):
+        with pytest.raises(UsageError, match=f"demonstrations are {count} of 16 steps of a batch"):
+            replace(CONFIG, demonstrations=share)
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
     with pytest.raises(UsageError, match=r"raise replay\.capacity"):

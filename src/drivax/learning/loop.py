@@ -508,7 +508,7 @@ class PretrainedRun:
     def networks(self, state: Any) -> dict[str, Any]:
         """Return the stored networks by their paths in the initial state of one seed (or its shapes).
 
-        Networks that the checkpoint lacks are omitted, but not ``parameters``. Raises DataError for the first array that
+        Networks that the checkpoint lacks are omitted, except ``parameters``. Raises DataError for the first array that
         is missing or does not fit.
         """
         checkpoints = Checkpoints(RunFolder.open(self.run).checkpoints)

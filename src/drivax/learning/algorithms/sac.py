@@ -101,6 +101,9 @@ class SacConfig:
             raise ValueError("environments, unroll, updates_per_step, batch and steps are at least 1")
         if not 0.0 <= self.demonstrations < 1.0:
             raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
+        if self.demonstrations and not 0 < self.logged_batch < self.batch:
+            problem = f"demonstrations are {self.logged_batch} of {self.batch} steps of a batch"
+            raise UsageError(problem, cure="use a share of at least one step, and less than all")
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
@@ -111,6 +114,11 @@ class SacConfig:
         if self.network.distribution not in REPARAMETRISED:
             cure = "set distribution to gaussian or beta"
             raise UsageError("SAC needs a policy with reparameterised samples", cure=cure)
+
+    @property
+    def logged_batch(self) -> int:
+        """Number of logged steps in each batch."""
+        return round(self.demonstrations * self.batch)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -281,7 +289,7 @@ class Sac(OffPolicy[SacConfig]):
 
     def _draw(self, data: Any, replay: Replay, key: Array, updates: int) -> _BatchIndex:
         """Draw steps of the buffer and, with ``demonstrations``, of the log for all updates."""
-        logged = round(self.config.demonstrations * self.config.batch)
+        logged = self.config.logged_batch
         index = self.buffer.draw(replay, key, (updates, self.config.batch - logged))
         if not logged:
             return index, None
