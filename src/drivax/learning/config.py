@@ -43,7 +43,7 @@ _ROUNDING = 1e-3
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of ``drivax train``; every preset in ``configs/`` is one of these.
+    """Settings of ``drivax train``; every preset in ``configs/`` is one of these, except ``studies/``.
 
     Attributes:
         total_steps: Decisions in all environments (``task.hold`` steps each), or logged steps that offline algorithms

@@ -33,7 +33,7 @@ def trained_parameters(state: Any) -> Any:
 def average(state: Any, trained: Any, decay: float) -> dict[str, Any]:
     """Return ``parameters`` and ``trained`` after an iteration that begins in ``state`` and ends with ``trained``.
 
-    The average is the mean over all iterations for the first ``1 / (1 - decay)``, then it decays exponentially.
+    The average is the mean over all iterations for the first ``1 / (1 - decay)`` of them, then exponential.
     """
     if state.trained is None:
         return {"parameters": trained, "trained": None}

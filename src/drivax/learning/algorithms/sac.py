@@ -69,7 +69,7 @@ class SacConfig:
         tau: Polyak averaging rate of the target critics.
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
-        gradient_norm: Maximum global norm of each gradient, of policy and of both critics; None: no clipping.
+        gradient_norm: Maximum global norm of the policy's gradient, and of that of both critics; None: no clipping.
         average: Decay per iteration of an exponential moving average of the policy's parameters, which is validated
             and exported in place of the newest ones; 0: no average.
     """
