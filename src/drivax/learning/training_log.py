@@ -119,7 +119,7 @@ class Preempted(DrivaxError):
 class StopSignal:
     """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
 
-    Batch systems send it some seconds before they take a machine away. The context does nothing outside of the main thread.
+    Batch systems send it some seconds before they take a machine away. Outside of the main thread it is not noted.
     """
 
     def __init__(self) -> None:
