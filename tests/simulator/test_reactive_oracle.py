@@ -39,7 +39,7 @@ def test_every_vehicle_follows_idm(bank, runs):
     found = np.concatenate([compare(bank, index, *run) for index, run in enumerate(runs)])
     away, acceleration = found.T
     assert len(found) > 300 and (acceleration < 0).sum() > 60
-    # The path ahead is straight pieces there and all its points here, so gaps differ by some centimetres.
+    # The oracle measures along all points of the path, the simulator along straight pieces: gaps differ by centimetres.
     assert np.quantile(away, 0.99) < 1e-3 and away.max() < 5e-3
 
 

@@ -1,4 +1,4 @@
-"""Features chosen one by one: values worked out on paper, columns in the order of the table, presets, mistakes."""
+"""Optional features: values by hand, columns in the order of the table, presets, error messages."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def bend(cars, **more):
 
 @pytest.fixture(scope="module")
 def seen():
-    """What is seen of one context under every configuration of this file, in one program, at three places."""
+    """Observations at three poses under every configuration of this file, by one program."""
     cars = [car(0, 0, 0, 9), car(20, 0.5, np.pi / 2, 6, 5.0, 2.0), car(-12, 3.7, 0, 3)]
     bank = bank_of(bend(cars))
     configs = {"everything": EVERYTHING, "few": FEW, "cut": CUT, "uncut": UNCUT}
@@ -76,7 +76,7 @@ def seen():
             results[name] = simulator.observe(bank, context)
         return results
 
-    # Where the log has ego; on the arc, 20 m behind its begin, 1 m left of the lane; and facing across the road.
+    # The logged pose; 20 m along the arc, 1 m left of the lane; and facing across the road.
     angle = 20.0 / RADIUS_M
     on_arc = STRAIGHT_M + (RADIUS_M - 1) * np.sin(angle), RADIUS_M - (RADIUS_M - 1) * np.cos(angle)
     places = np.array([(0, 0, 0, 0), (*on_arc, angle, 60.0), (0, 0, np.pi / 2, 0)], np.float32)
@@ -108,7 +108,7 @@ def test_optional_features_of_ego_and_agents(seen):
 
 
 def test_agents_relate_to_the_route_and_approach(seen):
-    """The car behind loses 6 m/s; the one that crosses reaches ego's lane at once, too late to be hit."""
+    """The car behind is 6 m/s slower; the one that crosses leaves ego's path before ego arrives."""
     along, left = (column(seen, "agents", f"route {part}")[:2, -1] for part in ("along", "left"))
     np.testing.assert_allclose(along * 50, [-12, 20], atol=0.05)
     np.testing.assert_allclose(left * 5, [3.7, 0.5], atol=0.05)
@@ -259,7 +259,7 @@ def test_presets_by_name_in_yaml():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (
             "{preset: minimum}",
@@ -276,8 +276,8 @@ def test_presets_by_name_in_yaml():
         ("{perception: {noise_m: -1}}", r"noise_m is -1\.0; use 0 or a positive"),
     ],
 )
-def test_mistakes_are_reported_in_one_line(text, said):
-    with pytest.raises(UsageError, match=said) as error:
+def test_mistakes_are_reported_in_one_line(text, message):
+    with pytest.raises(UsageError, match=message) as error:
         load(text)
     assert "\n" not in str(error.value)
 

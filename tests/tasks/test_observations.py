@@ -1,4 +1,4 @@
-"""Observations: layout, masks, frame, and what may not matter."""
+"""Observations: layout, masks, frame, invariances."""
 
 from functools import partial
 
@@ -50,7 +50,7 @@ def test_values_of_a_known_scene():
     cars = [car(0, 0, 0, 9), car(20, 1.0, np.pi / 2, 6), car(-10, 3.7, 0, 3, 0.6, 0.6, AgentKind.PEDESTRIAN)]
     seen = look(bank_of(straight_road(cars, light=RED)))
     ego, agents = np.asarray(seen["ego"]), np.asarray(seen["agents"])
-    # The last row is now: at the origin, straight ahead, 9 m/s; half a second ago 3.6 m behind (four steps).
+    # The last row is now: at the origin, straight ahead, 9 m/s; four steps ago ego was 3.6 m behind.
     np.testing.assert_allclose(ego[-1], [0, 0, 0, 1, 9 / 15, 0], atol=1e-5)
     np.testing.assert_allclose(ego[0, :2], [-3.6 / 50, 0], atol=1e-5)
     # Nearest first: the pedestrian at 10.7 m, then the crossing car at 20.0 m.

@@ -75,8 +75,8 @@ def test_lines_of_sight_by_hand():
     eye, blocks = jnp.zeros(2), jnp.ones(3, bool)
     bus = shown(10, 0, 0, 10.0, 3.0)
     behind = jnp.stack([bus, shown(25, 0, 0, 4.0, 2.0), shown(25, 3.0, 0, 4.0, 2.0)])
-    # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x: beyond the corners of the second car
-    # (y up to 4 at x = 27, where it reaches 8.1), so both are hidden; one as far off as y = 7 shows a corner.
+    # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x, at x = 23 at 6.9, beyond all corners of
+    # the two cars (|y| at most 4). With its centre at y = 7 the last car shows a corner.
     assert in_view(eye, behind, blocks).tolist() == [True, False, False]
     behind = behind.at[2, 1].set(7.0)
     assert in_view(eye, behind, blocks).tolist() == [True, False, True]
