@@ -32,7 +32,7 @@ from drivax.simulator.types import (
     Transition,
 )
 
-#: Elements that :func:`map_where` computes at a time: few steps start more episodes, and 8 floats fill a vector.
+#: Elements that :func:`map_where` computes at a time: more episodes rarely start in a step; 8 floats fill a vector.
 AT_ONCE = 8
 #: The next state, and the transition to it.
 Step = tuple[SimState, Transition]
