@@ -1,4 +1,4 @@
-"""Optional features: values by hand, columns in the order of the table, presets, error messages."""
+"""Optional features: values by hand, columns in the order of ``COLUMNS``, presets, error messages."""
 
 from dataclasses import replace
 

@@ -38,7 +38,7 @@ _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 FREE_M = 1e4
 #: Lower bound of the gap of overlapping agents, m.
 LEAST_GAP_M = -50.0
-#: Low bits of a squared distance that store the slot or piece; the rest is exact to 0.03 % (of at least 1 m2).
+#: Low bits of a squared distance that store the slot or piece; the rest is exact to 0.013 % (of at least 1 m2).
 _SLOT_BITS, _PIECE_BITS = 10, 4
 
 
