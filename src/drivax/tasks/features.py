@@ -147,7 +147,7 @@ class Features:
 def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
     """Return a name per column of each group, such as ``velocity ahead``, without masks.
 
-    ``shapes`` are those of one observation, by group. Columns of the user's groups are numbered.
+    ``shapes`` are those of one observation, by group. Columns of ``conditions`` and the user's groups are numbered.
     """
     names = {}
     for group, shape in shapes.items():

@@ -44,7 +44,7 @@ class OverrideTraffic:
 
     @property
     def name(self) -> str:
-        """``override``, or ``override+idm``."""
+        """``override``, followed by the name of another base than the log (``override+idm``)."""
         return "override" if self.base.name == "log" else f"override+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
