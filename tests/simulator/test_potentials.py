@@ -112,15 +112,15 @@ def test_collision_is_positive_on_overlap_and_zero_beyond_the_margin():
 
 def test_absent_agents_and_other_levels_have_no_potential_and_no_gradient():
     rows = np.array([[0, 0, 1, 0, 4.8, 2.0], [1, 0.3, 0, 1, 4.8, 2.0]])
-    frame = frame_of_boxes(rows)
-    absent = replace(frame, valid=jnp.array([True, False]))
+    present = frame_of_boxes(rows)
+    absent = replace(present, valid=jnp.array([True, False]))
 
     def total(pose, frame):
         frame = replace(frame, box=frame.box.at[0].set(posed(pose)))
         return collision_potential(frame, jnp.int32(0)).sum()
 
     sloped = jax.jit(jax.value_and_grad(total))
-    for frame, empty in ((frame, False), (absent, True), (frame_of_boxes(rows, 6.0), True)):
+    for frame, empty in ((present, False), (absent, True), (frame_of_boxes(rows, 6.0), True)):
         value, slope = sloped(jnp.zeros(3), frame)
         assert (float(value) == 0.0) is empty and np.isfinite(slope).all()
         assert (np.asarray(slope) == 0.0).all() == empty
