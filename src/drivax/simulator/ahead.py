@@ -165,9 +165,10 @@ def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) ->
 
 
 def offset_to_steer(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
-    """Return the offset for which :func:`follow_route` returns a curvature, m; a finite number if none does.
+    """Return the offset for which :func:`follow_route` returns a curvature, m.
 
-    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``.
+    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``. If it does
+    not, or if the car heads across the route, the result is finite but no such offset.
     """
     point, left = _pursuit_point(bank, context)
     linear = 2.0 * (curvature * jnp.sum(point * left) - left[1])
