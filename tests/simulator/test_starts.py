@@ -68,8 +68,8 @@ def test_draws_are_distributed_as_published(speed):
 
 @pytest.mark.slow
 def test_perturbed_history_uses_one_action(open_road):
-    scenes = noisy(open_road, 10, keys(64))
-    history = scenes.history
+    contexts = noisy(open_road, 10, keys(64))
+    history = contexts.history
     logged = LogStart().begin(open_road, jnp.int32(0), jnp.int32(0), jnp.int32(0), None)[0]
     np.testing.assert_allclose(history[:, :-10], np.broadcast_to(logged[-13:], (64, 13, 4)), atol=1e-4)
     between = jax.vmap(jax.vmap(command_between))(history[:, -11:-1], history[:, -10:])
@@ -79,9 +79,9 @@ def test_perturbed_history_uses_one_action(open_road):
     free = (np.abs(curvature) < 0.95 * grip).all(axis=1)
     assert free.sum() > 32 and np.ptp(curvature[free], axis=1).max() < 1e-3
     # All are at step 10 of the log, at most 0.3 m behind the logged position (some turn), and differ.
-    assert (np.asarray(scenes.step) == 10).all()
+    assert (np.asarray(contexts.step) == 10).all()
     assert (history[:, -1, 0] >= -0.3).all() and len(np.unique(np.asarray(history[:, -1, 1]))) > 48
-    travelled = np.asarray(scenes.route_m - open_road.log_progress[0, 0])
+    travelled = np.asarray(contexts.route_m - open_road.log_progress[0, 0])
     np.testing.assert_allclose(travelled, np.asarray(history[:, -1, 0] - logged[-1, 0]), atol=0.3)
 
 
