@@ -2,8 +2,8 @@
 
     python native/build.py [--sanitize]
 
-Each kernel is compiled once per instruction set, and once for its binding to XLA. Options allow no change of results: no fast-math, no
-code for this processor only. ``--sanitize`` builds with AddressSanitizer and UndefinedBehaviorSanitizer, for tests.
+Each kernel is compiled once per instruction set, and once for its binding to XLA. No option allows other results
+(fast-math) or needs this processor. ``--sanitize`` builds with AddressSanitizer and UndefinedBehaviorSanitizer.
 """
 
 from __future__ import annotations

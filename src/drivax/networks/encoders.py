@@ -53,7 +53,7 @@ class Encoder(Protocol):
 
 @runtime_checkable
 class EncoderConfig(Protocol):
-    """Settings of an encoder; yours is a frozen dataclass, in YAML ``kind: package.module:Name``."""
+    """Settings of an encoder; your own are frozen dataclasses, named in YAML as ``package.module:Name``."""
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> Encoder:
         """Return an encoder of observations with these groups."""
@@ -225,7 +225,7 @@ def _dense_and_max_forward(
 def _dense_and_max_backward(
     activation: Activation, residuals: Any, gradient: Array
 ) -> tuple[Any, Array | None, None]:
-    """Differentiate all rows as one matrix: on CPUs, XLA's gathers and scatters are slower than its zeros."""
+    """Differentiate all rows as one matrix: on CPUs, XLA multiplies zeros faster than it gathers and scatters."""
     if isinstance(residuals, _NativeResiduals):
         return set_encoder.differentiate(*residuals, gradient), None, None
     layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
