@@ -17,12 +17,12 @@ JAX := $(shell sed -n 's/^jax==\([^ ]*\).*/\1/p' requirements.lock)
 # Each process takes neighbouring files, because the tests of a file share compiled programs.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test test-all soak coverage lint docs bench setup lock hooks clean
+.PHONY: help demo native test test-all soak coverage lint docs bench setup lock hooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
-	@echo "targets: demo  test  test-all  soak  coverage  lint  docs  bench  setup  lock  hooks  clean"
+	@echo "targets: demo  native  test  test-all  soak  coverage  lint  docs  bench  setup  lock  hooks  clean"
 
 setup: $(STAMP)
 
@@ -40,13 +40,19 @@ endif
 demo: $(STAMP)
 	$(BIN)/drivax demo --overwrite $(ARGS)
 
+# Optional: a C++ compiler is all that it needs.
+native: $(STAMP)
+	$(BIN)/python native/build.py $(ARGS)
+
 bench: $(STAMP)
 	$(BIN)/drivax bench $(ARGS)
 
 test: $(STAMP)
 	$(PYTEST) -m "not slow" $(ARGS)
 
+# Includes the native kernels, if there is a C++ compiler.
 test-all: $(STAMP)
+	if command -v $${CXX:-c++} > /dev/null; then $(BIN)/python native/build.py; fi
 	DRIVAX_OPTIMISED=1 $(PYTEST) $(ARGS)
 
 MINUTES ?= 60

@@ -85,7 +85,7 @@ def _parts_text(result: dict[str, Any]) -> str:
         f"{result['devices']} device(s), {result['scenarios']:,} scenarios, "
         f"{result['traffic']} traffic, with resets, observation, reward, metrics)",
         f"state {result['state_bytes']:,} B, scenario {result['bank_bytes_per_scenario']:,} B, "
-        f"compiled in {result['compile_seconds']} s",
+        f"compiled in {result['compile_seconds']} s; native kernels: {result['kernels']}",
         f"map queries {result['brute_force_ratio']}x faster than brute force over the same segments",
         "per environment and step, each part alone:    us  operations     bytes",
     ]

@@ -18,6 +18,7 @@ import tyro
 from rich.table import Table
 from rich.text import Text
 
+from drivax import kernels
 from drivax.cli import console
 from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
 from drivax.errors import UsageError
@@ -77,6 +78,7 @@ def machine() -> Iterator[tuple[str, str]]:
     yield "python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     yield "jax", metadata.version("jax")
     yield "devices", devices()
+    yield "native kernels", kernels.state()
     for extra, (modules, purpose) in _EXTRAS.items():
         missing = [module for module in modules if not _is_installed(module)]
         state = "installed" if not missing else f"{', '.join(missing)} missing: pip install 'drivax[{extra}]'"

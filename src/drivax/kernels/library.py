@@ -50,7 +50,7 @@ def state() -> str:
     """Return what is in use, as in ``drivax doctor``."""
     library = _library()
     if library is not None:
-        return f"native kernels {library.drivax_hash().decode()}, {library.drivax_target().decode()}"
+        return f"{library.drivax_target().decode()}, build {library.drivax_hash().decode()}"
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
     return "none: make native" if not PATH.exists() else f"none: {PATH.name} does not load here"

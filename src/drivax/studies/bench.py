@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.learning.policies import find_traffic
@@ -109,6 +110,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
         "brute_force_ratio": round(brute_force / (times_us["edges"] + times_us["lanes"]), 2),
         "by_part": {name: round(value, 3) for name, value in times_us.items()},
         "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
+        "kernels": kernels.state(),
         "versions": versions(),
     }
 

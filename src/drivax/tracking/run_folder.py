@@ -22,7 +22,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drivax import settings
+from drivax import kernels, settings
 from drivax.errors import DataError, UsageError
 from drivax.files import check_output, refuse_link, replace_folder, restore_folder, write_text
 from drivax.reading import explain_damage, read_json, read_text
@@ -334,6 +334,7 @@ def machine() -> dict[str, Any]:
         "device": devices[0].device_kind,
         "devices": len(devices),
         "backend": jax.default_backend(),
+        "kernels": kernels.state(),
     }
 
 
