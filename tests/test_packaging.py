@@ -55,7 +55,8 @@ def test_content(wheel: Path, repository: Path):
     names = set(zipfile.ZipFile(wheel).namelist())
     package = repository / "src" / "drivax"
     files = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    sources = {str(path.relative_to(package.parent)) for path in files}
+    # `make native` may have left a library, which only wheels of one platform contain.
+    sources = {str(path.relative_to(package.parent)) for path in files if path.suffix != ".so"}
     assert sources <= names
     presets = {f"drivax/configs/{path.relative_to(repository / 'configs')}"
                for path in (repository / "configs").rglob("*.yaml")}  # fmt: skip
@@ -76,6 +77,7 @@ def test_wheel_and_sdist_are_reproducible_byte_for_byte(wheel: Path, repository:
         "examples",
         "experiments",
         "docs",
+        "native",
         "pyproject.toml",
         "requirements.lock",
     ]
@@ -103,6 +105,17 @@ def test_wheel_and_sdist_are_reproducible_byte_for_byte(wheel: Path, repository:
     assert len({hashlib.sha256(path.read_bytes()).hexdigest() for path in [wheel, *wheels]}) == 1
     with tarfile.open(archives[0]) as archive:
         assert any(name.endswith("/src/drivax/__init__.py") for name in archive.getnames())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "c++")) is None, reason="no C++ compiler")
+def test_a_wheel_for_one_platform_contains_the_native_kernels(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("DRIVAX_WHEEL_TAG", "linux_x86_64")
+    wheel = build(repository, tmp_path, "--wheel")
+    assert wheel.name.endswith("-py3-none-linux_x86_64.whl")
+    assert "drivax/kernels/libdrivax.so" in zipfile.ZipFile(wheel).namelist()
 
 
 def test_metadata(wheel: Path):
