@@ -1,6 +1,6 @@
 """Compile the kernels into ``src/drivax/kernels``; a C++17 compiler (``CXX``, default ``c++``) for x86-64 Linux.
 
-    python native/build.py [--sanitize]
+    python native/build.py [--out PATH] [--sanitize]
 
 Each kernel is compiled once per instruction set, and once for its binding to XLA. No option allows other results
 (fast-math) or needs this processor. ``--sanitize`` builds with AddressSanitizer and UndefinedBehaviorSanitizer.
@@ -79,15 +79,15 @@ def build_hash(flags: list[str]) -> str:
     return digest.hexdigest()[:12]
 
 
-def build(sanitize: bool = False) -> None:
+def build(output: Path = LIBRARY, sanitize: bool = False) -> None:
     """Compile all sources and link them; the library appears under its name when it is complete."""
-    with tempfile.TemporaryDirectory(dir=LIBRARY.parent) as folder:
+    with tempfile.TemporaryDirectory(dir=output.parent) as folder:
         steps = commands(Path(folder), sanitize)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             if any(pool.map(lambda step: subprocess.run(step, check=False).returncode, steps)):
                 sys.exit("make native: the compiler failed; its message is above")
         objects = [step[-1] for step in steps]
-        library = Path(folder) / LIBRARY.name
+        library = Path(folder) / output.name
         link = [
             compiler(),
             "-shared",
@@ -98,13 +98,15 @@ def build(sanitize: bool = False) -> None:
             str(library),
         ]
         subprocess.run(link, check=True)
-        library.replace(LIBRARY)
-    print(f"wrote {LIBRARY.relative_to(SOURCES.parent)}")
+        library.replace(output)
+    print(f"wrote {output}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--out", type=Path, default=LIBRARY)
     parser.add_argument("--sanitize", action="store_true", help="for the tests of memory errors")
-    build(parser.parse_args().sanitize)
+    args = parser.parse_args()
+    build(args.out, args.sanitize)

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jax.sharding import AxisType, PartitionSpec
 
-#: ``make native`` and the wheels for Linux on x86-64 put it here.
-PATH = Path(__file__).parent / "libdrivax.so"
+#: ``make native`` and the wheels for Linux on x86-64 put it here; tests build others.
+PATH = Path(os.environ.get("DRIVAX_NATIVE_LIBRARY", Path(__file__).parent / "libdrivax.so"))
 #: 0: no kernels; a target: the best one up to it; anything else, or not set: the best one.
 VARIABLE = "DRIVAX_NATIVE"
 

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jax.tree_util import keystr
 from jaxtyping import Array, Bool
 
@@ -120,15 +120,21 @@ class Program:
             )  # fmt: skip
         self.data, self.shapes = data, shapes
         outputs = None if self._layout is None else (self._layout, None)
-        iterate = jax.jit(seeds.iterate, donate_argnums=1, out_shardings=outputs)
-        # Learners divide their work among devices unless whole seeds are divided.
-        within_seeds = len(self.devices) > 1 and len(seeds.seeds) % len(self.devices)
-        with jax.set_mesh(self._mesh) if within_seeds else contextlib.nullcontext():
+        iterate = jax.jit(self._iterate, donate_argnums=1, out_shardings=outputs)
+        with contextlib.nullcontext() if self._layout is None else jax.set_mesh(self._mesh):
             self.compiled = iterate.lower(data, shapes).compile()
         trained = trained_leaves(shapes)
         self._is_trained = [keystr(path) in trained for path, _ in jax.tree.leaves_with_path(shapes)]
         # A program of its own, because fusions with it could round the parameters differently.
         self._all_finite = jax.jit(seeds.all_finite).lower(list(trained.values())).compile()
+
+    def _iterate(self, data: Any, state: Any) -> tuple[Any, Any]:
+        """Iterate whole seeds on each device; learners divide their work themselves if seeds cannot be divided."""
+        if self._layout is None or len(self.seeds.seeds) % len(self.devices):
+            return self.seeds.iterate(data, state)
+        specs = (PartitionSpec(), PartitionSpec(_AXIS))
+        run = jax.shard_map(self.seeds.iterate, in_specs=specs, out_specs=specs[1], check_vma=False)
+        return run(data, state)
 
     def account(self, validation: Any = None) -> MemoryAccount:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
@@ -215,7 +221,7 @@ def shard_axis(tree: Any, axis: int) -> Any:
 def device_count() -> int:
     """Return the number of devices that one seed is divided among, while its iteration is traced."""
     mesh = jax.sharding.get_abstract_mesh()
-    return 1 if mesh.empty else mesh.size
+    return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
 def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:

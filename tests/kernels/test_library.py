@@ -1,0 +1,119 @@
+import os
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from drivax import kernels
+from kernels.compare import needs_kernels
+
+
+def run(program, **variables):
+    environment = os.environ | variables
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+PRINT_STATE = "from drivax import kernels; print(kernels.in_use(), kernels.state())"
+
+
+def test_zero_switches_the_kernels_off():
+    expected = "none, since DRIVAX_NATIVE=0"
+    assert run(PRINT_STATE, DRIVAX_NATIVE="0") == f"False {expected}"
+
+
+def test_a_missing_or_damaged_library_is_not_used(tmp_path):
+    program = f"from pathlib import Path; from drivax.kernels import library; library.PATH = Path({{}}); {PRINT_STATE}"
+    assert run(program.format(repr(str(tmp_path / "libdrivax.so")))) == "False none: make native"
+    damaged = tmp_path / "libdrivax.so"
+    damaged.write_bytes(b"\x7fELF" + b"no library" * 50)
+    assert run(program.format(repr(str(damaged)))) == "False none: libdrivax.so does not load here"
+
+
+@needs_kernels
+def test_the_target_can_be_lowered():
+    assert run(PRINT_STATE, DRIVAX_NATIVE="sse4.2").startswith("True SSE4.2, build ")
+
+
+@needs_kernels
+def test_kernels_are_not_traced_where_they_are_excluded():
+    assert kernels.in_use()
+    with kernels.without_kernels():
+        assert not kernels.in_use()
+    assert kernels.in_use()
+
+
+DIVIDE = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from drivax.kernels import set_encoder
+
+rng = np.random.default_rng(0)
+layer = lambda inputs: (jnp.asarray(rng.normal(size=(inputs, 32)), jnp.float32), jnp.zeros(32))
+layers = layer(5), layer(32)
+rows, valid = jnp.asarray(rng.normal(size=(8, 6, 5)), jnp.float32), jnp.asarray(rng.random((8, 6)) < 0.5)
+encode = jax.jit(jax.vmap(lambda rows, valid: set_encoder.encode(layers, rows, valid)[0]))
+expected = encode(rows, valid)
+mesh = Mesh(np.array(jax.devices()), ("devices",))
+arguments = jax.device_put((rows, valid), NamedSharding(mesh, PartitionSpec("devices")))
+with jax.set_mesh(mesh):
+    program = encode.lower(*arguments).compile()
+np.testing.assert_array_equal(program(*arguments), expected)
+text = program.as_text()
+print("f32[4,32]" in text, "all-gather" in text)
+"""
+
+
+@needs_kernels
+def test_devices_divide_a_batch():
+    assert run(DIVIDE, XLA_FLAGS="--xla_force_host_platform_device_count=2") == "True False"
+
+
+@needs_kernels
+def test_compiled_programs_name_the_build():
+    from drivax.kernels import set_encoder
+
+    layers = [(jnp.ones((3, 32)), jnp.zeros(32)), (jnp.ones((32, 32)), jnp.zeros(32))]
+    text = jax.jit(set_encoder.encode).lower(layers, jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)).as_text()
+    digest = kernels.state().split()[-1]
+    assert f"drivax_encode_sets_{digest}" in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "c++")) is None, reason="no C++ compiler")
+def test_sanitizers_find_no_error_in_the_kernels(repository, tmp_path):
+    """AddressSanitizer and UndefinedBehaviorSanitizer, over the tests of all kernels."""
+    built = tmp_path / "libdrivax.so"
+    command = [sys.executable, str(repository / "native" / "build.py"), "--sanitize", "--out", str(built)]
+    subprocess.run(command, check=True)
+    runtime = subprocess.run(
+        ["c++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
+    )
+    environment = os.environ | {
+        "LD_PRELOAD": runtime.stdout.strip(), "ASAN_OPTIONS": "detect_leaks=0", "DRIVAX_NATIVE_LIBRARY": str(built),
+    }  # fmt: skip
+    tests = repository / "tests" / "kernels"
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "-k",
+        "not sanitizers",
+    ]
+    done = subprocess.run(
+        [*command, str(tests)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert "passed" in done.stdout
