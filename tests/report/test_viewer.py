@@ -12,7 +12,7 @@ from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.curation.scores import Combination, ScoreTable, write_scores
 from drivax.errors import UsageError
-from drivax.report.pages.viewer import findings, select, write_player
+from drivax.report.pages.viewer import findings, select_rows, write_player
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -78,14 +78,14 @@ def test_findings_are_words(data):
 
 
 def test_select_by_id_and_limit(data):
-    assert [scenario.id for scenario in select(data)] == ["calm", "bad", "new"]
-    assert [scenario.id for scenario in select(data, limit=2)] == ["calm", "bad"]
-    assert [scenario.id for scenario in select(data, ids=("new", "calm"))] == ["new", "calm"]
+    assert select_rows(data) == [0, 1, 2] and select_rows(data, limit=2) == [0, 1]
+    assert select_rows(data, ids=("new", "calm"), order=[1, 0, 2]) == [2, 0]
+    assert select_rows(data, limit=2, order=[1, 2, 0]) == [1, 2]
     with pytest.raises(UsageError) as error:
-        select(data, ids=("clam",))
+        select_rows(data, ids=("clam",))
     assert str(error.value) == f"{data.path}: record clam: is not in the set; did you mean 'calm'?"
     with pytest.raises(UsageError, match="use 1 or more"):
-        select(data, limit=0)
+        select_rows(data, limit=0)
 
 
 def test_existing_page_and_empty_selection_are_refused(page, data, tmp_path):
@@ -137,6 +137,33 @@ def test_critical_scenarios_come_first_with_their_components(data, tmp_path, cap
     capsys.readouterr()
     assert main(["view", str(data.path), "--scores", str(tmp_path / "none.npz"), "--out", str(out)]) == 1
     assert "score table not found" in capsys.readouterr().err
+
+
+def test_scores_are_those_of_the_scenario_if_data_sets_share_an_id(tmp_path):
+    with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
+        for name, speed in (("first", 4.0), ("second", 9.0)):
+            recording = replace(straight_road([car(speed=speed)]), scenario_id="same", dataset=name)
+            writer.add(assemble(recording))
+    both = ScenarioSet.open(tmp_path / "set")
+    valid = np.array([scenario.agent_valid[:, 0] for scenario in both])
+    urgency = np.where(valid, [[0.2], [0.9]], 0.0)
+    table = ScoreTable(
+        "kinematic", {}, both.hash, ("same", "same"), valid, urgency, urgency[:, 0], {"urgency": urgency}
+    )
+    write_scores(table.recombine(Combination({"urgency": 1.0})), tmp_path / "scores.npz")
+    out = tmp_path / "both.html"
+    assert main(["view", str(both.path), "--scores", str(tmp_path / "scores.npz"), "--out", str(out)]) == 0
+    text = out.read_text()
+    assert re.findall(r"score (\S+), rank (\d) of 2", text) == [("0.900", "1"), ("0.200", "2")]
+    speeds = [
+        json.loads(one)["rollouts"][0]["speed"] for one in re.findall(r'class="episode">(.*?)</script>', text)
+    ]
+    assert [np.frombuffer(base64.b64decode(speed), "<i2")[10] for speed in speeds] == [900, 400]
+
+
+def test_each_scenario_has_its_details(data, tmp_path):
+    with pytest.raises(ValueError, match="shorter"):
+        write_player(list(data), tmp_path / "page.html", details=["only one"])
 
 
 @needs_browser

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby
 from operator import getitem
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
 from drivax.report.charts import short
+from drivax.report.runs import path_end
 from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
@@ -101,7 +102,7 @@ class Inspection:
 
     @property
     def hours(self) -> float:
-        """Driving time of all scenarios; overlapping windows of one recording count in full."""
+        """Driving time of the selected scenarios; overlapping windows of one recording count in full."""
         return sum(max(entry["source"]["steps"] - 1, 0) for entry in self.entries) * DT_S / 3600
 
     @property
@@ -145,7 +146,7 @@ class Inspection:
         return {name: (counts[name], scenarios[name]) for name in sorted(counts)}
 
     def findings(self) -> list[str]:
-        """Return the names of the audit's findings, in the order of ``scenario.select.selection.FINDINGS``."""
+        """Return the names of the audit's defined findings: those of ``FINDINGS`` in its order, then others by name."""
         names = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
         return [*(name for name in FINDINGS if name in names), *sorted(names - set(FINDINGS))]
 
@@ -170,7 +171,7 @@ class Quantity:
         return cls(label, unit, lambda entry: reduce(getitem, path, entry).get(name, default))
 
 
-#: Numbers of every scenario: of its source, before cropping and capping, and of its audit.
+#: Numbers of every scenario: of its source, before cropping and capping; its stored segments; and of its audit.
 QUANTITIES = (
     Quantity.of("agents now", "source", "tracks_valid_now"),
     Quantity.of("tracks", "source", "tracks"),
@@ -304,8 +305,17 @@ def _counts(entry: Entry) -> tuple[int, ...]:
     return (*track_counts, *feature_counts, others, source["map_points"], source["lights"], entry["segments"])
 
 
+def with_distinct_names(inspections: Sequence[Inspection]) -> list[Inspection]:
+    """Return the sets, each of a repeated name with the shortest end of its path that distinguishes it."""
+    paths = [inspection.scenarios.path.resolve() for inspection in inspections]
+    others = [[other for other in paths if other.name == path.name and other != path] for path in paths]
+    triples = zip(inspections, paths, others, strict=True)
+    return [replace(inspection, name=path_end(path, namesakes)) for inspection, path, namesakes in triples]
+
+
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Return tables of several sets side by side: sizes, averages per scenario, shares of tags."""
+    """Return tables of four sets each: sizes, averages per scenario, shares of audit findings, tags and flags."""
+    inspections = with_distinct_names(inspections)
     groups = [
         inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)
     ]
@@ -345,7 +355,10 @@ def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **options: A
 
 
 def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
-    """Return the shares of scenarios by audit finding, tag value and flag; tags of many values only have a count."""
+    """Return the shares of scenarios by audit finding, tag value and flag.
+
+    Tags with more than 12 values have the number of their values instead; ``place`` is in :data:`_CONTENT`.
+    """
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
     tags_by_set = [inspection.tags() for inspection in inspections]
