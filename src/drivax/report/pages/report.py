@@ -189,7 +189,7 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
-    """Return the kinds of the first collision with their meanings, or "" if no kind is known."""
+    """Return the kinds of the first collision with their meanings, or "" without a collision of a known kind."""
     table = result_tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""

@@ -164,9 +164,9 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
 Array = np.ndarray[Any, Any]
 #: Red, green, blue and an unused alpha: four bytes are copied faster than three.
 Picture = UInt8[Array, "_ _ 4"]
-#: Metres across the shorter edge of a picture.
+#: Metres across the shorter edge of a picture without its bar.
 VIEW_M = 70.0
-#: Heights of the bar at the top of a picture and of a line of the legend, pixels.
+#: Heights of the bar at the top of a picture, and of a line of the legend, pixels.
 _BAR, _LINE = 30, 22
 
 
