@@ -1,4 +1,4 @@
-"""The Python interface: one function per command of the command line."""
+"""Functions of the Python interface: load, simulate, evaluate, generate, convert, compare and curate."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def compare(
     a: str | Path, b: str | Path, plan: ComparisonPlan | None = None, data: Path | None = None,
     **settings: Any,
 ) -> Comparison:  # fmt: skip
-    """Compare two evaluations.
+    """Compare two planners by their evaluations.
 
     Args:
         a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.

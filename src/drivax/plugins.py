@@ -25,7 +25,7 @@ from drivax.errors import UsageError, did_you_mean
 _FORM = re.compile(r"(?!zoo:)[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 #: First arguments of reward terms and of features.
 _TERM_ARGUMENTS = (("before", "now", "around"), ("bank", "context", "frames"))
-#: Packages that were found in the current folder; their other modules may import their neighbours too.
+#: Packages that are not on Python's path: the current folder is searched for their modules and what these import.
 _local_packages: set[str] = set()
 
 

@@ -25,11 +25,11 @@ _OBSERVED_SCENARIOS = 256
 class Inspect:
     """Summarise a scenario set: sources, sizes, tags, flags, audit, integrity.
 
-    Compares several sets in one table.
+    Compares several sets side by side.
 
     Example: drivax inspect sets/womd sets/nuplan --filter agents>=20 --html sets.html
 
-    Example: drivax inspect sets/womd --observations --planner runs/ppo --draw seen.png
+    Example: drivax inspect sets/womd --observations --planner runs/ppo --draw observation.png
     """
 
     sets: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
@@ -59,7 +59,7 @@ class Inspect:
 
 
 def run(args: Inspect) -> int:
-    """Verify the sets, then print tables or JSON, or write a page."""
+    """Verify the sets, then print tables or JSON, write a page, or describe observations."""
     from drivax.errors import UsageError
     from drivax.report.inspection import Inspection
     from drivax.scenario.select.selection import Selection

@@ -36,7 +36,10 @@ class Forecast:
         cls, frame: Frame, slot: Integer, is_ignored: Bool[Array, " S"], path: Float[Array, "M 2"],
         count: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Select ``count`` agents within ``radius_m`` that come nearest to ego's path in five seconds."""
+        """Select up to ``count`` agents within ``radius_m`` of ego that come nearest to its path in five seconds.
+
+        Of agents as near to the path, those near ego now come first; missing ones are not ``valid``.
+        """
         distance = norm(frame.box[:, :2] - frame.box[slot, :2])
         is_eligible = others_on_level(frame, slot) & ~is_ignored & (distance <= radius_m)
         times = jnp.arange(_SAMPLES)[:, None] * _SAMPLE_S
