@@ -88,9 +88,9 @@ def make_simulator(
     Args:
         task: Action space, observation, reward and termination; the default task if None.
         traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
-            ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
-            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
-        trust: Modules outside drivax whose code that policy may name.
+            ``zoo:NAME``), or a traffic object. All but ``log`` may need a bank that
+            :func:`drivax.simulator.traffic.bank_data.prepare_bank` prepares for the simulator's ``traffic``.
+        trust: Modules outside drivax whose code the policy may name.
     """
     return Simulator(task or Task(), as_traffic(traffic, trust))
 
@@ -173,10 +173,10 @@ def generate(
         out: Folder to write.
         scenarios: Number of scenarios.
         seed: Scenario ``i`` of a seed is the same in every set.
-        options: World, workers and capacity.
+        options: World, workers, capacity, length, egos, and whether to overwrite ``out``.
 
     Raises:
-        UsageError: ``out`` exists, or an option is impossible.
+        UsageError: ``out`` exists without ``options.overwrite``, or an option is impossible.
     """
     from drivax.synthetic.generate import generate as generate_set
 

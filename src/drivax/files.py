@@ -110,8 +110,8 @@ def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost names the output; the size
-    is that of the outermost block that has one. Other errors of the system get the name if they have none, or a hidden
-    one.
+    is that of the outermost block that has one. Other system errors get the name ``path`` if they name no file, or a
+    hidden one.
     """
     try:
         yield
@@ -139,8 +139,8 @@ def _is_full_disk(error: Exception) -> bool:
 def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
 
-    A full disk is reported with the space that is free without the part that did fit, and the ``size`` in bytes. With
-    ``follow``, a symbolic link stays, and the file that it leads to is written.
+    A full disk is reported with ``size`` in bytes, and with the space that is free once the incomplete file is deleted.
+    With ``follow``, a symbolic link stays, and the file that it leads to is written.
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)

@@ -28,7 +28,7 @@ Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
 
 _SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights", "lost")
-#: Number of scenarios whose records are read; all others are described by the manifest.
+#: Maximum number of scenarios whose records are read for speeds and rates.
 SAMPLE = 1000
 
 
@@ -211,8 +211,10 @@ def read_speeds(inspection: Inspection) -> Speeds:
     return Speeds(ego_mps, vehicles_mps, len(ego))
 
 
-#: Maximum numbers of listed scenarios, listed values of a tag, sets per table, and causes of unreadable records.
-MAX_LISTED, MAX_NAMED, SETS_PER_TABLE, _MAX_CAUSES = 30, 6, 4, 3
+#: Maximum numbers of listed scenarios, sets per table, and causes of unreadable records.
+MAX_LISTED, SETS_PER_TABLE, _MAX_CAUSES = 30, 4, 3
+#: Maximum numbers of listed values of a tag or flag, and of places of a set.
+_MAX_VALUES, _MAX_PLACES = 12, 6
 #: A label and one text per set.
 Row = tuple[str, list[str]]
 
@@ -357,7 +359,8 @@ def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **options: A
 def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
     """Return the shares of scenarios by audit finding, tag value and flag.
 
-    Tags with more than 12 values have the number of their values instead; ``place`` is in :data:`_CONTENT`.
+    Tags of more than :data:`_MAX_VALUES` values have the number of their values instead; ``place`` is in
+    :data:`_CONTENT`.
     """
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
@@ -365,7 +368,7 @@ def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
     for name in dict.fromkeys(name for tags in tags_by_set for name in tags if name != "place"):
         counts = [tags.get(name, {}) for tags in tags_by_set]
         shares = with_sizes(counts, sizes)
-        if len(shares) > 2 * MAX_NAMED:
+        if len(shares) > _MAX_VALUES:
             rows.append((name, [f"{len(values):,} values" if values else MISSING for values in counts]))
         else:
             rows += _percents(f"{name} ", shares)
@@ -423,12 +426,12 @@ def _places_text(inspection: Inspection) -> str:
     places = inspection.value_counts(
         lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else []
     )
-    suffix = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
-    return ", ".join(list(places)[:MAX_NAMED]) + suffix if places else MISSING
+    suffix = f" and {len(places) - _MAX_PLACES} more" if len(places) > _MAX_PLACES else ""
+    return ", ".join(list(places)[:_MAX_PLACES]) + suffix if places else MISSING
 
 
 def _counts_text(counts: Mapping[str, int], total: int) -> str:
-    first = list(counts.items())[: 2 * MAX_NAMED]
+    first = list(counts.items())[:_MAX_VALUES]
     texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in first]
     hidden = len(counts) - len(texts)
     return ", ".join(texts) + (f" and {hidden:,} more" if hidden else "") or "none"
