@@ -111,6 +111,7 @@ def _print(inspections: list[Inspection]) -> None:
 def _check_flags(args: Inspect) -> None:
     """Refuse flags that exclude each other, and an existing picture."""
     from drivax.errors import UsageError
+    from drivax.files import check_output
     from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
@@ -122,10 +123,8 @@ def _check_flags(args: Inspect) -> None:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
         raise UsageError("a trained policy has its own task", cure="leave out --task")
-    if args.draw is not None and args.draw.exists() and not args.overwrite:
-        raise UsageError(
-            "output file already exists", file=args.draw, cure="choose another name or pass --overwrite"
-        )
+    if args.draw is not None:
+        check_output(args.draw, args.overwrite)
 
 
 def _observe(args: Inspect, inspection: Inspection) -> None:

@@ -102,6 +102,7 @@ class Contacts:
             is_unlawful: bool, boxes: Array, kind: Array, speed: Array, other_speed: Array
         ) -> Array:
             """Return whether ego, the first of two boxes, is at fault in its contact with the other."""
+            # A frame of two; height, velocities, lights and ego's kind do not matter.
             zeros, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
             kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
             frame = Frame(boxes, jnp.zeros((2, 2)), zeros, zeros == 0.0, kinds, lights)

@@ -213,7 +213,7 @@ def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False)
     """Write the page of a comparison to the HTML file ``out``.
 
     Raises:
-        UsageError: ``out`` exists.
+        UsageError: ``out`` exists without ``overwrite``, or is a folder.
     """
     check_output(out, overwrite)
     names = f"{comparison.names[0]} against {comparison.names[1]}"
@@ -268,5 +268,5 @@ def _origin(comparison: Comparison) -> str:
         "How this was made",
         facts_html(["", ""], rows),
         f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>",
-        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs.",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of the runs.",
     )

@@ -30,7 +30,7 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
     """Write a page about scenario sets to the HTML file ``out``.
 
     Raises:
-        UsageError: ``out`` exists.
+        UsageError: ``out`` exists without ``overwrite``, or is a folder.
     """
     check_output(out, overwrite)
     inspections = with_distinct_names(inspections)

@@ -58,7 +58,7 @@ def write_player(
     ``details`` has HTML for each scenario, or none at all, shown above its facts.
 
     Raises:
-        UsageError: ``out`` exists or is a folder, or there is no scenario.
+        UsageError: ``out`` exists without ``overwrite`` or is a folder, or there is no scenario.
     """
     check_output(out, overwrite)
     if not scenarios:

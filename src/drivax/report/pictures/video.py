@@ -53,7 +53,7 @@ def write_videos(
         runs: Run folders; the last evaluation is the policy, whose episodes are ranked.
         out: Folder for the files.
         which: ``worst:N``, ``all``, or the id of a scenario.
-        side_by_side: Draw every run with an episode of the scenario in one picture, not only the policy.
+        side_by_side: Draw every comparable run with an episode of the scenario in one picture, not only the policy.
         data: Path of the policy's scenario set, if it has moved.
         theme: ``light`` or ``dark``.
         overwrite: Replace existing files.
