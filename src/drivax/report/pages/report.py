@@ -53,8 +53,8 @@ def write_report(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: ``out`` exists without ``overwrite`` or is a folder, no run is given or one twice, or ``episodes`` is
-            negative.
+        UsageError: ``out`` exists without ``overwrite`` or is a folder, no run is given or one twice, or ``episodes``
+            is negative.
     """
     check_output(out, overwrite)
     if episodes < 0:
@@ -282,8 +282,8 @@ def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
         "How this was made",
         facts_html(["run", "command", "data", "versions"], rows),
         f"<details><summary>all settings</summary>{settings}</details>",
-        note=f"drivax {escape(metadata.version('drivax'))}. The numbers of an evaluation come from its episodes.csv, those "
-        "of rollouts from trajectories.npz, learning curves from metrics.jsonl.",
+        note=f"drivax {escape(metadata.version('drivax'))}. The numbers of an evaluation come from its episodes.csv, "
+        "those of rollouts from trajectories.npz, learning curves from metrics.jsonl.",
     )
 
 
