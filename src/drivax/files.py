@@ -24,7 +24,7 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -76,6 +76,13 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
     if not overwrite:
         cure = "choose another or pass --overwrite"
         raise UsageError(f"output {kind} already exists", file=path, cure=cure)
+
+
+def path_end(path: Path, others: Iterable[Path]) -> str:
+    """Return the shortest end of a path that no other path has, or all of it."""
+    parts, other_parts = path.parts, [other.parts for other in others]
+    lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in other_parts))
+    return str(Path(*parts[-next(lengths, len(parts)) :]))
 
 
 def free_bytes(path: Path) -> int:

@@ -85,6 +85,14 @@ def test_equal_means_are_not_called_lower(runs, tmp_path, capsys):
     )
 
 
+def test_runs_in_folders_of_the_same_name_have_distinct_names(runs, plan, tmp_path, capsys):
+    copies = [tmp_path / name / "test" for name in ("a", "b")]
+    for copy in copies:
+        shutil.copytree(runs[2], copy)
+    _, out, _ = called(capsys, *copies, "--config", plan, "--json")
+    assert json.loads(out)["names"] == ["policy (a/test)", "policy (b/test)"]
+
+
 def test_json_equals_the_csv_files(runs, plan, capsys):
     status, out, _ = called(capsys, runs[2], runs[1], "--config", plan, "--json")
     found = json.loads(out)

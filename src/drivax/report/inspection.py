@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
+from drivax.files import path_end
 from drivax.report.charts import short
-from drivax.report.runs import path_end
 from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet

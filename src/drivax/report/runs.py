@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.files import path_end
 from drivax.seal import edited_files, mark_edited
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
@@ -90,13 +91,6 @@ def _unique_name(name: str, path: Path, namesakes: dict[str, list[Path]]) -> str
     suffix = f" ({path_end(path, earlier)})" if earlier else ""
     earlier.append(path)
     return name + suffix
-
-
-def path_end(path: Path, others: Iterable[Path]) -> str:
-    """Return the shortest end of a path that no other path has; all paths are absolute."""
-    parts, other_parts = path.parts, [other.parts for other in others]
-    lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in other_parts))
-    return str(Path(*parts[-next(lengths, len(parts)) :]))
 
 
 def _curves(run: RunFolder) -> dict[str, Array]:
