@@ -68,6 +68,8 @@ def load(
         DataError: The set is damaged, an id is not in it, or no scenario is left.
         UsageError: A filter or the limit is impossible.
     """
+    if limit is not None and limit < 1:
+        raise UsageError(f"a limit of {limit} leaves no scenario", cure="use 1 or more")
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
         selection = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
