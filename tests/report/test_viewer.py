@@ -19,7 +19,10 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import RED, car, straight_road
 
 CLEAN = {"log_collides": False, "log_offroad_fraction": 0.0, "first_offroad_step": -1, "log_runs_red": None}
-FOUL = {"log_collides": True, "log_offroad_fraction": 0.25, "first_offroad_step": 30, "log_runs_red": True}
+FOUL = CLEAN | {
+    "log_collides": True, "first_collision_step": 40, "log_offroad_fraction": 0.25, "first_offroad_step": 30,
+    "log_runs_red": True,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def test_page_holds_the_logs(page, data):
         np.testing.assert_allclose(xy, scenario.agent_xy[:, 0], atol=0.02)
         speed = np.frombuffer(base64.b64decode(drive["speed"]), "<i2") / 100
         np.testing.assert_allclose(speed, np.linalg.norm(scenario.agent_velocity[:, 0], axis=-1), atol=0.01)
-    assert [one["rollouts"][0]["events"] for one in stored] == [{}, {"offroad": 30}, {}]
+    assert [one["rollouts"][0]["events"] for one in stored] == [{}, {"collision": 40, "offroad": 30}, {}]
     assert [one["rollouts"][0]["outcome"] for one in stored] == ["", "collides, runs red, off-road", ""]
 
 

@@ -102,9 +102,9 @@ def criticality_html(table: ScoreTable, row: int) -> str:
 
 
 def _log(scenario: Scenario) -> Rollout:
-    """Return the log as a rollout; its only known event is the first off-road step."""
-    offroad = scenario.audit.get("first_offroad_step")
-    events = {"offroad": -1 if offroad is None else int(offroad)}
+    """Return the log as a rollout; the audit knows its first collision and off-road step, from the current step on."""
+    steps = {name: scenario.audit.get(f"first_{name}_step") for name in ("collision", "offroad")}
+    events = {name: -1 if step is None else int(step) for name, step in steps.items()}
     return Rollout("log", logged_motion(scenario), 0, events, findings(scenario))
 
 
