@@ -1,6 +1,6 @@
 """Train, curate and judge driving planners on recorded traffic, in one JAX program.
 
-Functions such as :func:`~drivax.api.load`, ``train`` and ``write_report`` do what the commands do. Names are imported
+``generate``, ``train``, ``evaluate``, ``write_report`` and other functions do what the commands do. Names are imported
 on first use: ``import drivax`` is fast, and worker processes that convert data never load JAX.
 """
 
