@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.errors import DataError, DrivaxError
+from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank import scenario_bank
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank, Sizes, as_words
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.roadblocks import lane_count
 from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
@@ -108,6 +109,33 @@ def test_batches_of_scenarios_stack_as_single_scenarios(monkeypatch, batch):
     for name in (field.name for field in fields(ScenarioBank) if not field.metadata):
         each = np.concatenate([np.asarray(getattr(single, name)) for single in alone])
         np.testing.assert_array_equal(np.asarray(getattr(bank, name)), each, err_msg=name)
+
+
+def test_sizes_that_are_too_small_are_refused_by_name():
+    scenario = assemble(generate_recording(4, 0))
+    used, whole = Sizes.used([scenario]), Sizes.whole(scenario.capacity)
+    for sizes in (used, whole):
+        assert not ScenarioBank.from_scenarios([scenario], trim=sizes).trimmed
+    for name in (field.name for field in fields(Sizes) if field.name != "long_ego"):
+        least = getattr(used, name)
+        small = replace(used, **{name: least - 1})
+        with pytest.raises(UsageError, match=rf"too small: {name} {least - 1} < {least}; use Sizes.used"):
+            ScenarioBank.from_scenarios([scenario], trim=small)
+
+
+def test_ids_of_lanes_may_be_negative():
+    recording = straight_road([car(0, 0, 0, 5)])
+
+    def negated(feature):
+        names = ("successors", "predecessors", "left_neighbours", "right_neighbours")
+        links = {name: tuple(-other for other in getattr(feature, name)) for name in names}
+        return replace(feature, feature_id=-feature.feature_id, **links)
+
+    route = tuple(-lane for lane in recording.route_lanes)
+    negative = replace(recording, features=tuple(map(negated, recording.features)), route_lanes=route)
+    lanes, other = (np.asarray(bank_of(each).lanes) for each in (recording, negative))
+    np.testing.assert_array_equal(lanes, other)
+    assert lane_count(assemble(negative)) == lane_count(assemble(recording)) == 3
 
 
 def test_sizes_cover_the_largest_scenario():
