@@ -1,4 +1,4 @@
-"""Further egos: who they are, and that their routes are those of a recording with another ego."""
+"""Further egos: their selection; their routes are those of a recording with another ego."""
 
 from __future__ import annotations
 
@@ -123,11 +123,11 @@ def test_first_egos_of_a_set_keep_their_bank(recordings, scenarios):
 
 
 def test_egos_are_moving_vehicles_near_ego_with_an_unbroken_log():
-    steps, seen = range(91), {step: [*range(step + 1)] for step in (29, 30, 50)}
+    steps, upto = range(91), {step: [*range(step + 1)] for step in (29, 30, 50)}
     cars = [
-        car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10, steps=seen[30]), car(20, 3.7, 0, 10, steps=seen[29]),
+        car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10, steps=upto[30]), car(20, 3.7, 0, 10, steps=upto[29]),
         car(-30, 0, 0, 0.2), car(15, 0, 0, 10, kind=AgentKind.CYCLIST), car(-45, 0, 0, 10, steps=range(11, 91)),
-        car(60, 3.7, 0, 10, steps=[*seen[50], *steps[60:]]), car(150, 0, 0, 30, steps=steps),
+        car(60, 3.7, 0, 10, steps=[*upto[50], *steps[60:]]), car(150, 0, 0, 30, steps=steps),
     ]  # fmt: skip
     scenario = assemble(straight_road(cars), SMALL.with_egos(8))
     # The car that starts at 150 m leaves the surroundings of ego's log (80 m ahead of 80 m) within 2 s.
@@ -140,7 +140,8 @@ def test_egos_are_moving_vehicles_near_ego_with_an_unbroken_log():
 
 
 def test_a_capacity_of_one_ego_stores_what_it_always_did():
-    assert Capacity().with_egos(1) == Capacity()
+    assert Capacity().with_egos(1) == Capacity() and EGOS.with_egos(4) is EGOS
+    assert EGOS.with_egos(1).egos == 1
     # Computed by the version before sets could have further egos.
     table = json.dumps(field_table(Capacity())).encode()
     assert hashlib.sha256(table).hexdigest().startswith("c983bc0aaf54f38f")

@@ -102,7 +102,7 @@ def test_route_follows_a_logged_lane_change_smoothly():
     route = found.routes[0]
     assert list(dict.fromkeys(route.lane.tolist())) == [0, 1]
     check_smooth(route, kink=0.03)
-    _, apart = project(route.xyz, ego.seen[:, :2])
+    _, apart = project(route.xyz, ego.positions[:, :2])
     assert apart[-1] < 0.01
     assert apart.mean() < 1.0
     assert np.abs(np.diff(route.xyz[:, 1])).max() < 0.19  # at most 1.875 x 3.5 m / 36 m
@@ -200,7 +200,7 @@ def test_log_route_follows_the_log_then_its_lane():
     path = driving(speed=10.0)
     path[:, 1] = 0.5 * np.sin(path[:, 0] / 15)
     found, ego, _ = routes_of(two_lanes(), path)
-    _, apart = project(found.routes[1].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[1].xyz, ego.positions[:, :2])
     assert apart.max() < 0.01
     assert len(found.routes[1].xyz) - 1 >= 90 + PAST_GOAL
     check_smooth(found.routes[1], kink=0.1)
@@ -260,7 +260,7 @@ def changing(at_step: int, speed: float = 12.0) -> np.ndarray:
 def test_lane_change_under_way_at_the_current_step_is_continued(at_step):
     path = changing(at_step)
     found, ego, _ = routes_of(two_lanes(), path)
-    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[0].xyz, ego.positions[:, :2])
     assert (apart <= 1.5).mean() >= 0.95
     assert apart[: ego.current + 1].max() <= 1.0 + 0.05  # never more than a metre beside where ego drove
     assert apart[-1] < 0.05  # on its lane in the end
@@ -302,7 +302,7 @@ def test_the_lane_that_fits_the_heading_comes_first():
     path = np.stack([np.interp(60 + np.arange(91) * 0.5, total, curved[:, i]) for i in (0, 1)], axis=-1)
     found, ego, graph = routes_of(crossing_streets(), path)
     assert graph.lane_id[found.routes[0].lane[20]] == 2
-    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[0].xyz, ego.positions[:, :2])
     assert apart.max() < 0.1
 
 
