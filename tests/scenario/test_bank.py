@@ -51,7 +51,7 @@ def both():
 
 @jax.jit
 def moments(bank):
-    """All that is measured where the logs have ego, and what IDM does there."""
+    """Facts at logged poses of ego, and the actions of IDM there."""
     simulator = Simulator(Task(observation=GLIMPSE))
 
     def one(row, step):

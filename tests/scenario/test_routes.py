@@ -31,14 +31,14 @@ ZERO = np.zeros(3)
 
 
 def routes_of(features, path, most_routes=12, style: RouteStyle = "graph", **more):
-    """Routes of one log; ``given`` and ``corridor`` name lanes by id, ``valid`` and ``heading`` are the track's."""
-    given, corridor = more.pop("given", ()), more.pop("corridor", ())
+    """Routes of one log; ``intended`` and ``corridor`` name lanes by id, ``valid`` and ``heading`` are the track's."""
+    intended, corridor = more.pop("intended", ()), more.pop("corridor", ())
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
     tracks = local_tracks(make_tracks([path], **more), 0, ZERO)
     ego = ego_log(tracks, 10)
     index = graph.index()
-    intent = Intent(tuple(index[i] for i in given), tuple(index[i] for i in corridor))
+    intent = Intent(tuple(index[i] for i in intended), tuple(index[i] for i in corridor))
     return find_routes(on, ego, intent, style, most_routes, 400), ego, graph
 
 
@@ -122,15 +122,15 @@ def test_two_lane_changes_share_the_stretch_to_the_goal():
 
 
 def test_intended_route_is_used_unchanged():
-    found, _, graph = routes_of(junction(), driving(speed=3.0), given=(1, 3, 4))
+    found, _, graph = routes_of(junction(), driving(speed=3.0), intended=(1, 3, 4))
     assert found.on_lanes
     assert [graph.lane_id[x] for x in dict.fromkeys(found.routes[0].lane.tolist()) if x >= 0] == [1, 3, 4]
     driven = driving(speed=10.0)  # straight on, although the route turns
-    other, _, graph = routes_of(junction(), driven, given=(1, 3, 4))
+    other, _, graph = routes_of(junction(), driven, intended=(1, 3, 4))
     assert other.on_lanes
     assert other.routes[0].xyz[-1, 1] > 100
     assert other.goal[0] == pytest.approx(65.0, abs=4.0)
-    changing, _, graph = routes_of(two_lanes(), driving(speed=8.0), given=(1, 2))
+    changing, _, graph = routes_of(two_lanes(), driving(speed=8.0), intended=(1, 2))
     assert [graph.lane_id[x] for x in dict.fromkeys(changing.routes[0].lane.tolist())] == [1, 2]
     check_smooth(changing.routes[0], kink=0.04)
 
@@ -350,9 +350,9 @@ def test_candidates_are_as_long_as_speed_and_map_require():
 
 
 def brute_force(search: LaneSearch) -> dict[tuple[int, ...], float]:
-    """The first ten of all ways without a lane twice, up to the first lane that ends 250 m ahead, and their scores.
+    """Scores of the first ten paths that use no lane twice, up to the first lane that ends 250 m ahead.
 
-    First in the order of breadth-first search: fewer lanes, then the earlier branch.
+    The order is that of breadth-first search: fewer lanes, then the earlier branch.
     """
     complete, ended = [], []
 

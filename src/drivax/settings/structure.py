@@ -393,7 +393,7 @@ def parse_yaml(text: str, file: Path | None = None) -> Any:
     """Return the plain values of a YAML text.
 
     Raises:
-        UsageError: Invalid YAML, a duplicate key, or too large a value, with its line.
+        UsageError: Invalid YAML, a duplicate key, or too large a value or text, with its line if known.
     """
     try:
         if len(text) > _MOST_CHARACTERS:

@@ -42,7 +42,7 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the precision among the ``k`` highest scores, where ``k`` is the number of positives.
+    """Return the precision among the ``k`` highest scores, where ``k`` is the number (or weight) of positives.
 
     Ties at the threshold count in proportion. A perfect ranking has 1, a random one the base rate.
     """

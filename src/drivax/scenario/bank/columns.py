@@ -41,8 +41,8 @@ class EdgeRow:
 class LaneRow:
     """Rows of ``ScenarioBank.lanes``: those of :class:`EdgeRow`, half width, limit in m/s (-1 unknown), and lane index.
 
-    The limit of a connector is the highest of the lanes that it joins. The index is raised by a half on lanes of the
-    corridor: the lanes of the route and their same-direction neighbours; by 2^-(k+1) for the route of the k-th ego.
+    The limit of a connector is the highest of the lanes that it joins, if known. The index is raised by a half on lanes
+    of the corridor (the lanes of the route and their same-direction neighbours); by 2^-(k+1) for that of the k-th ego.
     """
 
     X_A, Y_A, X_B, Y_B, Z, HALF_WIDTH, LIMIT, LANE = range(8)
