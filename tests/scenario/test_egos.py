@@ -39,7 +39,7 @@ def scenarios(recordings):
     return [assemble(recording, EGOS) for recording in recordings]
 
 
-def pairs(recordings, scenarios):
+def further_egos(recordings, scenarios):
     """Each further ego: index of its scenario, its number, and the scenario in which it is the recorded ego."""
     for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
         for k, slot in enumerate(scenario.ego_slot.tolist()):
@@ -55,7 +55,7 @@ def ids(lanes, scenario):
 
 def test_routes_are_those_of_a_recording_with_this_ego(recordings, scenarios):
     compared = 0
-    for index, k, own in pairs(recordings, scenarios):
+    for index, k, own in further_egos(recordings, scenarios):
         scenario, count = scenarios[index], int(own.route_points[0])
         shift = (own.origin - scenario.origin)[:2]
         assert count == scenario.ego_route_points[k]
@@ -80,7 +80,7 @@ def test_routes_are_those_of_a_recording_with_this_ego(recordings, scenarios):
 
 def test_light_arcs_and_corridors_are_those_of_the_route(recordings, scenarios):
     bank, at_light = ScenarioBank.from_scenarios(scenarios), 0
-    for index, k, own in pairs(recordings, scenarios):
+    for index, k, own in further_egos(recordings, scenarios):
         alone = ScenarioBank.from_scenarios([own])
         arc, own_arc = bank.light_line[index, LightRow.ARC + k + 1], alone.light_line[0, LightRow.ARC]
         known, own_known = (np.asarray(values[values < 1e5]) for values in (arc, own_arc))

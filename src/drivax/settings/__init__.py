@@ -1,11 +1,12 @@
 """Configuration records: frozen dataclasses to and from YAML, with command-line overrides.
 
-A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
-carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
-presets (a class method ``preset(name)``), the key ``preset`` names the preset to start from. A file may extend a preset
-(``extends: ppo``) or a file relative to it (``extends: base.yaml``): its settings are merged over those of the other.
-An unknown key or a value of the wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest
-valid name. A class variable ``renamed`` maps former keys to present ones.
+A configuration record holds scalars, strings, literals, paths, tuples, mappings, other records, unions of records,
+which carry a ``kind`` key in YAML (:func:`kind_of`), and objects of the user by ``package.module:name``. Missing keys
+keep the defaults of the enclosing record. In a record with presets (a class method ``preset(name)``), the key
+``preset`` names the preset to start from. A file may extend a preset (``extends: ppo``) or a file relative to it
+(``extends: base.yaml``): its settings are merged over those of the other. An unknown key or a value of the wrong type
+is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable ``renamed``
+maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_names(values: Any, trust: Collection[str], file: Path | None = None) -> None:
-    """Check the names in plain values of a file before one of them is used; those of flags are the user's.
+    """Check the dotted names in plain values of a file before one of them is imported; those in flags are trusted.
 
     Raises:
         UsageError: A name leads to a module that is not trusted, or to something that is no component.

@@ -1,7 +1,7 @@
 """Tags of scenarios, for filters and strata.
 
 Every scenario gets the tags of :data:`TAGS` when it is assembled; readers and the built-in world add tags of their own
-(``place``, ``family``, ...). Tags describe the log of the ego; planners do not observe them.
+(``place``, ``family``, ...). Tags describe log and map; planners do not observe them.
 """
 
 from __future__ import annotations
