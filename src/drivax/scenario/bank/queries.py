@@ -1,9 +1,9 @@
 """Map queries: pure, unbatched functions of a pose.
 
 A query of edges or lanes reads the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly
-inside them. Segments beyond its cut-off (edges 3 m from a point, lanes 4 m, or 8 m at the border of the map) never
-change its result, so no result depends on the grid; ``tests/scenario/test_queries.py`` compares with brute force.
-Segments more than 3 m above or below are ignored.
+inside them. Segments beyond its cut-off (edges 3 m from a point, lanes 4 m or half their width, 8 m at the border of
+the map) never change its result, so no result depends on the grid; ``tests/scenario/test_queries.py`` compares with
+brute force. Segments more than 3 m above or below are ignored.
 """
 
 from __future__ import annotations

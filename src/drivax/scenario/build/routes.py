@@ -263,9 +263,9 @@ class _Drawer:
         """Route along a lane path and the straightest successors of its last lane; ``place`` as in :func:`trace`."""
         graph, ego = self.graph, self.ego
         history = ego.history[:, :2]
-        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
-        prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, history)
-        begin = lane_path.s + length - behind  # negative: the lanes begin too late
+        behind_m = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
+        prefix, length = precede(graph, lane_path.lanes[0], behind_m - lane_path.s, history)
+        begin = lane_path.s + length - behind_m  # negative: the lanes begin too late
         ahead_m = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
         lanes = (*prefix, *follow(graph, lane_path.lanes, ahead_m, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
