@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
-from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
+from drivax.settings.structure import Flag, NameAlone, kind_of, parse_yaml, plain, structure, write_yaml
 
 __all__ = ["check_names", "dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
 
@@ -137,11 +137,20 @@ def _find_base(file: Path, name: Any) -> Path:
 
 def _merge(base: Any, values: Any) -> Any:
     """Return settings merged over others by key; a section that names another kind or preset replaces the other."""
-    if not isinstance(base, dict) or not isinstance(values, dict):
+    if not isinstance(values, dict):
         return values
+    base = _section(base)
     if any(name in values and values[name] != base.get(name) for name in ("kind", "preset")):
         return values
     return base | {name: _merge(base.get(name), value) for name, value in values.items()}
+
+
+def _section(value: Any) -> dict[str, Any]:
+    """Return a setting as a section: a mapping as it is, a name as that of its kind, others as an empty section."""
+    content = parse_yaml(value) if isinstance(value, Flag) else value
+    if isinstance(content, str):
+        return {NameAlone("kind"): type(value)(content)}
+    return content if isinstance(content, dict) else {}
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -150,9 +159,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
         *parents, key = path
         section = values
         for name in parents:
-            # A record that is missing, null or set by a flag starts from its defaults.
-            if not isinstance(section.get(name), dict):
-                section[name] = {}
+            section[name] = _section(section.get(name))
             section = section[name]
         if key == "kind" and str(section.get("kind")) != text:
             section.clear()  # Settings of the former kind do not apply.

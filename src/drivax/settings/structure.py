@@ -51,6 +51,12 @@ class Flag(str):
     __slots__ = ()
 
 
+class NameAlone(str):
+    """The key ``kind`` of a section that was a name alone; plain mappings, which have no kind, ignore it."""
+
+    __slots__ = ()
+
+
 def structure(values: Any, cls: Any) -> Any:
     """Return an instance of ``cls`` from plain values.
 
@@ -144,7 +150,8 @@ def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
     if not isinstance(items, Mapping):
         raise _refusal(value, "a mapping")
     item_type = get_args(cls)[1]
-    return {name: _to_item(item, item_type, str(name)) for name, item in items.items()}
+    own_items = {name: item for name, item in items.items() if not isinstance(name, NameAlone)}
+    return {name: _to_item(item, item_type, str(name)) for name, item in own_items.items()}
 
 
 def _to_item(value: Any, cls: Any, place: str) -> Any:
