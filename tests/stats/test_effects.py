@@ -73,6 +73,7 @@ def test_power_at_its_ends():
     [
         lambda: power(1.0, 10, confidence=1.0),
         lambda: scenarios_needed(0.0),
+        lambda: scenarios_needed(math.nan),
         lambda: scenarios_needed(0.1, 1.0),
     ],
 )
