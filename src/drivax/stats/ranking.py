@@ -55,8 +55,8 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
     """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Clusters with and without positives are drawn separately, which keeps the base rate (Davison and Hinkley, Bootstrap
-    Methods, 1997, section 3.8).
+    Clusters with and without positives are drawn separately, so each resample has as many of either (Davison and
+    Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)
