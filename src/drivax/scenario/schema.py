@@ -247,7 +247,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
 
 
 def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return the fields of further egos: slot, last step, and those of the recorded ego's route to the goal."""
+    """Return the fields of further egos: slot, last step, and route to the goal (as of the recorded ego)."""
     return {
         "ego_slot": ("i2", (egos,)), "ego_last_step": ("i2", (egos,)),
         "ego_on_lanes": ("?", (egos,)),  # otherwise the route is the logged path (privileged)

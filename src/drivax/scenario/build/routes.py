@@ -328,8 +328,8 @@ def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
 def log_route(lane_segments: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """Path of the logged ego (privileged), continued along its last lane, else straight on.
 
-    Positions within half a metre of the previous one are jitter; a log that stays within 2 m of its first position has
-    only the last one that is none.
+    Positions within half a metre of the previous one are left out as jitter; of a log that stays within 2 m of its
+    first position, only the last remaining one is kept.
     """
     xyz, heading = ego.positions, ego.heading[ego.valid]
     keep = space_out(xyz[:, :2], STEP_M)
