@@ -76,7 +76,7 @@ class RoadLayer:
 
 
 class StrandColumn:
-    """Columns of ``ScenarioBank.lane_strands``; -1 for none.
+    """Columns of ``ScenarioBank.lane_strands``; -1 for no strand, 1e6 for no point.
 
     The strand of a lane, the strands next to it on the left and the right, the strand that its own one merges onto, and
     the point where it does.
