@@ -11,6 +11,7 @@ from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank import scenario_bank
+from drivax.scenario.bank.columns import LaneRow
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank, Sizes, as_words
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.roadblocks import lane_count
@@ -18,7 +19,7 @@ from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
-from scenes import GLIMPSE, bank_of, car, straight_road
+from scenes import GLIMPSE, SMALL, bank_of, car, straight_road
 
 
 def without_future(scenario: Scenario) -> Scenario:
@@ -121,6 +122,17 @@ def test_sizes_that_are_too_small_are_refused_by_name():
         small = replace(used, **{name: least - 1})
         with pytest.raises(UsageError, match=rf"too small: {name} {least - 1} < {least}; use Sizes.used"):
             ScenarioBank.from_scenarios([scenario], trim=small)
+
+
+def test_segments_of_lanes_that_do_not_fit_have_no_lane():
+    scenario = assemble(straight_road([car(0, 0, 0, 5)]), replace(SMALL, lanes=2))
+    assert scenario.overflow == {"lanes": 1}
+    first, last = scenario.segment_blocks[1:3]
+    lanes = np.asarray(ScenarioBank.from_scenarios([scenario]).lanes)[0, LaneRow.HALF_WIDTH :, : last - first]
+    assert set(np.floor(lanes[2]).tolist()) == {-1.0, 0.0, 1.0}
+    np.testing.assert_allclose(
+        np.unique(lanes[:, scenario.segment_lane[first:last] < 0]), [-1.0, 1.85], rtol=1e-6
+    )
 
 
 def test_ids_of_lanes_may_be_negative():

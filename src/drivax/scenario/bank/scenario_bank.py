@@ -491,7 +491,9 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
     for ego in range(most_egos(records)):
         route = (of_ego(records, f"route_{name}", ego, 0) for name in ("lane", "points"))
         index = index + 0.5 ** (ego + 1) * corridor_lanes(records, *route)[:, lanes]
-    return np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
+    values = np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
+    values[..., -1] = DEFAULT_LANE_WIDTH_M / 2, -1.0, -1.0  # a full table has no empty last row
+    return values
 
 
 def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:
