@@ -1,4 +1,4 @@
-"""Which scenarios of a set are meant."""
+"""Selection of scenarios by filters, names and number."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
