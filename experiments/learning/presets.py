@@ -117,7 +117,7 @@ def learning_curves(trainings: Sequence[Training]) -> dict[str, dict[str, list[l
     """Return quantity -> seed -> points (step, value) of all validations."""
     return {
         metric: {
-            training.name: [
+            training.folder.name: [
                 [int(step), round(float(value), 4)] for step, value in training.curves[f"validation/{metric}"]
             ]
             for training in trainings

@@ -21,6 +21,7 @@ from drivax.evaluation import pairing
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
 from drivax.evaluation.pairing import Pairs, Split
 from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
+from drivax.files import path_end
 from drivax.seal import MARK, mark_edited
 from drivax.stats import effects, significance
 from drivax.stats.clusters import design_effect, drop_undefined
@@ -300,8 +301,10 @@ def compare(
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
     if a.name != b.name:
         return a.name, b.name
-    labels = [side.folder.name if side.folder else arm for side, arm in ((a, "A"), (b, "B"))]
-    return f"{a.name} ({labels[0]})", f"{b.name} ({labels[1]})"
+    if a.folder is None or b.folder is None:
+        return f"{a.name} (A)", f"{b.name} (B)"
+    first, second = a.folder.resolve(), b.folder.resolve()
+    return f"{a.name} ({path_end(first, [second])})", f"{b.name} ({path_end(second, [first])})"
 
 
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:

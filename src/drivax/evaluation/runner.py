@@ -223,7 +223,7 @@ def evaluate(
         options: See :class:`Options`.
 
     Raises:
-        UsageError: Planner, task, start and scenarios are incompatible.
+        UsageError: Planner, task, start and scenarios are incompatible, or ``sizes`` are too small.
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """
