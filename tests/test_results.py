@@ -283,5 +283,6 @@ def test_curves_show_every_seed(script, learning):
 
 def test_speed_page_shows_ratios_against_the_earlier_state(script, stored):
     ratios = script("speed.ratios")
-    table = ratios.table(stored("speed_ratios"))
-    assert f"{ratios.BEGIN}\n\n{table}\n\n{ratios.END}" in ratios.PAGE.read_text()
+    for kernels, (begin, end) in ratios.MARKERS.items():
+        table = ratios.table(stored("speed_ratios")["kernel_rows" if kernels else "rows"], kernels)
+        assert f"{begin}\n\n{table}\n\n{end}" in ratios.PAGE.read_text()

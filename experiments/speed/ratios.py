@@ -2,6 +2,9 @@
 
     git worktree add ../before COMMIT
     python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
+    python -m experiments.speed.ratios --data SET --kernels [--only NAME ...] [--write]
+
+With ``--kernels``, this tree is timed without native kernels against itself with them.
 
 SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
 tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first runs of each, which
@@ -21,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,11 @@ from experiments.speed.machine import HEADINGS, cells, conditions
 
 RESULT = RESULTS / "speed_ratios.json"
 PAGE = DOCS / "results" / "speed.md"
-BEGIN, END = "<!-- ratios.py: begin -->", "<!-- ratios.py: end -->"
+#: Markers around the table of trees and that of kernels.
+MARKERS = {
+    False: ("<!-- ratios.py: begin -->", "<!-- ratios.py: end -->"),
+    True: ("<!-- ratios.py kernels: begin -->", "<!-- ratios.py kernels: end -->"),
+}
 
 #: Setup that several programs share: the first scenarios of the set, as a bank.
 _BANK = """
@@ -67,6 +74,14 @@ def trainer(preset, *overrides):
 
 
 @dataclass(frozen=True)
+class Side:
+    """One of the two sides that are compared: a tree, with variables of the environment."""
+
+    tree: Path
+    variables: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Repeated:
     """A program that defines ``call()``, which returns the amount of work that it did."""
 
@@ -74,6 +89,8 @@ class Repeated:
     program: str
     goal: str
     warm_up: int = 1
+    #: The goal of native kernels.
+    kernels_goal: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,13 +106,24 @@ _EVALUATE = ("evaluate", "--planner", "idm", "--data", "DATA", "--limit", "4", "
 _TRAIN = ("train", "ppo", "--data", "DATA", "--out", "OUT")
 #: What is timed, with the goal: what must be reached, and the aim in parentheses.
 MEASUREMENTS: dict[str, Repeated | Command] = {
-    "PPO training": Repeated("steps/s", _TRAINING + "call = trainer('ppo')", "1.4 x (1.8 x)"),
+    "PPO training": Repeated(
+        "steps/s", _TRAINING + "call = trainer('ppo')", "1.4 x (1.8 x)", kernels_goal="1.8 x (3 x)"
+    ),
+    "PPO training, one core": Repeated(
+        "steps/s",
+        "import os; os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})\n"
+        + _TRAINING
+        + "call = trainer('ppo', '--devices', '1')",
+        "",
+        kernels_goal="2.0 x (3 x)",
+    ),
     # Updates begin after 512 steps instead of 10,000.
     "SAC training": Repeated(
         "steps/s",
         _TRAINING + "call = trainer('sac', '--algorithm.warm_up', '512')",
         "1.2 x (1.5 x)",
         warm_up=3,
+        kernels_goal="2.0 x (3 x)",
     ),
     "simulator, full, log": Repeated(
         "steps/s",
@@ -111,6 +139,7 @@ def call():
     return program.steps
 """,
         "1.1 x (1.3 x)",
+        kernels_goal="1.3 x (3 x)",
     ),
     "PDM-Closed evaluation": Repeated(
         "scenarios/s",
@@ -125,6 +154,7 @@ def call():
     return len(evaluate(planner, bank, names))
 """,
         "3 x (10 x)",
+        kernels_goal="1.3 x (3 x)",
     ),
     "generation, one core": Repeated(
         "scenarios/s",
@@ -166,19 +196,24 @@ for line in sys.stdin:
 """
 
 
-def environment(tree: Path, **variables: str) -> dict[str, str]:
-    """Environment of a process of a tree."""
-    return {**os.environ, "PYTHONPATH": str(tree / "src"), "JAX_PLATFORMS": "cpu", **variables}
+def environment(side: Side, cache: str) -> dict[str, str]:
+    """Return the environment of a process of one side, with its compilation cache."""
+    variables = {
+        "PYTHONPATH": str(side.tree / "src"),
+        "JAX_PLATFORMS": "cpu",
+        "JAX_COMPILATION_CACHE_DIR": cache,
+    }
+    return {**os.environ, **variables, **side.variables}
 
 
 class Worker:
-    """A process of a tree that runs a program again and again."""
+    """A process of one side that runs a program again and again."""
 
-    def __init__(self, tree: Path, program: str, data: Path, cache: str) -> None:
+    def __init__(self, side: Side, program: str, data: Path, cache: str) -> None:
         command = [sys.executable, "-c", f"DATA = {str(data)!r}\n{program}\n{_LOOP}"]
         self._process = subprocess.Popen(
             command,
-            env=environment(tree, JAX_COMPILATION_CACHE_DIR=cache),
+            env=environment(side, cache),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -205,10 +240,10 @@ class Worker:
         self._process.communicate()
 
 
-def repeated(measurement: Repeated, trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
-    """Work per second of both trees, by turns; medians."""
+def repeated(measurement: Repeated, sides: Sequence[Side], data: Path, repeats: int) -> dict[str, Any]:
+    """Return work per second of both sides, by turns; medians."""
     with tempfile.TemporaryDirectory() as cache:
-        workers = [Worker(tree, measurement.program, data, f"{cache}/{k}") for k, tree in enumerate(trees)]
+        workers = [Worker(side, measurement.program, data, f"{cache}/{k}") for k, side in enumerate(sides)]
         for worker in workers:
             for _ in range(measurement.warm_up):
                 worker.run()
@@ -231,14 +266,14 @@ def repeated(measurement: Repeated, trees: Sequence[Path], data: Path, repeats: 
     }
 
 
-def command_seconds(command: Command, tree: Path, data: Path, folder: Path, cache: Path) -> float:
+def command_seconds(command: Command, side: Side, data: Path, folder: Path, cache: Path) -> float:
     """Seconds to the end of a command, or to the first line of its file ``until``."""
     out = Path(tempfile.mkdtemp(dir=folder)) / "out"
     words = [{"DATA": str(data), "OUT": str(out)}.get(word, word) for word in command.words]
     begin = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, "-m", "drivax", *words],
-        env=environment(tree, JAX_COMPILATION_CACHE_DIR=str(cache)),
+        env=environment(side, str(cache)),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -257,9 +292,9 @@ def command_seconds(command: Command, tree: Path, data: Path, folder: Path, cach
 
 
 def timed_command(
-    name: str, command: Command, trees: Sequence[Path], data: Path, repeats: int
+    name: str, command: Command, sides: Sequence[Side], data: Path, repeats: int
 ) -> dict[str, Any]:
-    """Seconds of a command of both trees, by turns; medians."""
+    """Return seconds of a command of both sides, by turns; medians."""
     pairs = []
     with tempfile.TemporaryDirectory() as top:
         folder = Path(top)
@@ -267,8 +302,8 @@ def timed_command(
             kept = not name.endswith("first")
             caches = [folder / f"cache-{k}{'' if kept else f'-{turn}'}" for k in (0, 1)]
             seconds = [
-                command_seconds(command, tree, data, folder, cache)
-                for tree, cache in zip(trees, caches, strict=True)
+                command_seconds(command, side, data, folder, cache)
+                for side, cache in zip(sides, caches, strict=True)
             ]
             # The first turn fills the caches, and the page cache.
             if turn or not kept:
@@ -288,64 +323,88 @@ def commit_of(tree: Path) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def measure(names: Sequence[str], trees: Sequence[Path], data: Path, repeats: int) -> dict[str, Any]:
+def measure(names: Sequence[str], sides: Sequence[Side], data: Path, repeats: int) -> dict[str, Any]:
     """Return a row for each measurement, with the commits, the machine's speed and the load."""
-    rows, commits = {}, dict(zip(("before", "after"), map(commit_of, trees), strict=True))
+    rows = {}
+    commits = {name: commit_of(side.tree) for name, side in zip(("before", "after"), sides, strict=True)}
     for name in names:
         measurement = MEASUREMENTS[name]
         with conditions() as record:
             if isinstance(measurement, Repeated):
-                row = repeated(measurement, trees, data, repeats)
+                row = repeated(measurement, sides, data, repeats)
             else:
-                row = timed_command(name, measurement, trees, data, max(1, repeats // 3))
+                row = timed_command(name, measurement, sides, data, max(1, repeats // 3))
         rows[name] = row = row | record | {"commits": commits}
         print(f"{name}: {json.dumps(row)}", flush=True)
     return rows
 
 
-def table(result: Mapping[str, Any]) -> str:
+def table(rows: Mapping[str, Any], kernels: bool = False) -> str:
     """Return the Markdown table of stored ratios."""
     lines = [
-        f"| what | ratio | goal (aim) | before | after | unit | {HEADINGS} |",
+        f"| what | ratio | goal (aim) | {'without' if kernels else 'before'} | {'with' if kernels else 'after'} | unit "
+        f"| {HEADINGS} |",
         "|---|---:|---|---:|---:|---|---|---|",
     ]
-    for name, row in result["rows"].items():
+    for name, row in rows.items():
+        measurement = MEASUREMENTS[name]
+        goal = measurement.kernels_goal if kernels and isinstance(measurement, Repeated) else measurement.goal
         lines.append(
-            f"| {name} | {row['ratio']} | {MEASUREMENTS[name].goal} | {row['before']:,} "
+            f"| {name} | {row['ratio']} | {goal} | {row['before']:,} "
             f"| {row['after']:,} | {row['unit']} | {cells(row)} |"
         )
     return "\n".join(lines)
 
 
+def write_tables(result: Mapping[str, Any]) -> None:
+    """Put both tables into the page."""
+    for kernels, markers in MARKERS.items():
+        before, rest = PAGE.read_text().split(markers[0])
+        inserted = f"{markers[0]}\n\n{table(result.get(_key(kernels), {}), kernels)}\n\n{markers[1]}"
+        PAGE.write_text(before + inserted + rest.split(markers[1])[1])
+
+
+def _key(kernels: bool) -> str:
+    return "kernel_rows" if kernels else "rows"
+
+
 def main() -> None:
-    """Measure, print, and with ``--write`` store the result and the table of the page."""
+    """Measure, print, and with ``--write`` store the result and the tables of the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path)
     parser.add_argument("--against", type=Path, help="root of the other tree")
-    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=tuple(MEASUREMENTS))
+    parser.add_argument("--kernels", action="store_true", help="this tree without and with native kernels")
+    parser.add_argument("--only", nargs="+", choices=MEASUREMENTS)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--write", action="store_true", help="store the rows; others stay")
     parser.add_argument("--table", action="store_true", help="write the stored rows into the page")
     args = parser.parse_args()
     if not args.table:
-        trees = (args.against.resolve(), ROOT)
-        rows = measure(args.only, trees, args.data.resolve(), args.repeats)
+        if args.kernels:
+            sides = Side(ROOT, {"DRIVAX_NATIVE": "0"}), Side(ROOT)
+        else:
+            sides = Side(args.against.resolve()), Side(ROOT)
+        names = args.only or [name for name, row in MEASUREMENTS.items() if _has_goal(row, args.kernels)]
+        rows = measure(names, sides, args.data.resolve(), args.repeats)
         if args.write:
-            stored = json.loads(RESULT.read_text())["rows"] if RESULT.exists() else {}
-            stored |= rows
-            result = {
-                "command": "python -m experiments.speed.ratios --data SET --against TREE --write",
-                "rows": {name: stored[name] for name in MEASUREMENTS if name in stored},
-                "versions": versions(),
-            }
-            write_json(RESULT, result)
+            result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+            key = _key(args.kernels)
+            stored = result.get(key, {}) | rows
+            result[key] = {name: stored[name] for name in MEASUREMENTS if name in stored}
+            result["command"] = (
+                "python -m experiments.speed.ratios --data SET [--against TREE | --kernels] --write"
+            )
+            write_json(RESULT, result | {"versions": versions()})
     if args.write or args.table:
-        text = PAGE.read_text()
-        before, rest = text.split(BEGIN)
-        inserted = f"{BEGIN}\n\n{table(json.loads(RESULT.read_text()))}\n\n{END}"
-        PAGE.write_text(before + inserted + rest.split(END)[1])
+        write_tables(json.loads(RESULT.read_text()))
+
+
+def _has_goal(measurement: Repeated | Command, kernels: bool) -> bool:
+    if kernels:
+        return isinstance(measurement, Repeated) and bool(measurement.kernels_goal)
+    return not (isinstance(measurement, Repeated) and not measurement.goal)
 
 
 if __name__ == "__main__":

@@ -37,15 +37,15 @@ def test_ratio_of_two_trees_is_that_of_their_work(ratios, tmp_path):
     for name, cost in (("before", 3), ("after", 1)):
         (tmp_path / name / "src").mkdir(parents=True)
         (tmp_path / name / "src" / "drivax.py").write_text(f"COST = {cost}")
-    trees = (tmp_path / "before", tmp_path / "after")
-    row = ratios.repeated(ratios.Repeated("calls/s", program, ""), trees, tmp_path, 3)
+    sides = [ratios.Side(tmp_path / name) for name in ("before", "after")]
+    row = ratios.repeated(ratios.Repeated("calls/s", program, ""), sides, tmp_path, 3)
     assert row["ratio"] == pytest.approx(3, rel=0.2)
     assert row["before"] == pytest.approx(1 / 0.06, rel=0.2)
 
 
 def test_failed_program_is_an_error(ratios, tmp_path):
     with pytest.raises(SystemExit, match="failed"):
-        ratios.Worker(tmp_path, "def call(): raise ValueError", tmp_path, str(tmp_path)).run()
+        ratios.Worker(ratios.Side(tmp_path), "def call(): raise ValueError", tmp_path, str(tmp_path)).run()
 
 
 def test_rows_show_their_conditions(ratios):
