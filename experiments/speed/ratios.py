@@ -382,6 +382,8 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="write the stored rows into the page")
     args = parser.parse_args()
     if not args.table:
+        if args.data is None or (args.against is None) != args.kernels:
+            parser.error("needs --data, and one of --against and --kernels")
         if args.kernels:
             sides = Side(ROOT, {"DRIVAX_NATIVE": "0"}), Side(ROOT)
         else:

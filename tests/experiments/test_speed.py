@@ -58,5 +58,5 @@ def test_rows_show_their_conditions(ratios):
         "machine_ms": [19.6, 17.2],
         "load": [0, 1.2],
     }
-    lines = ratios.table({"rows": {name: row}}).splitlines()
+    lines = ratios.table({name: row}).splitlines()
     assert lines[2] == f"| {name} | 1.5 | 1.4 x (1.8 x) | 20 | 30 | steps/s | 17 to 20 | 0.0 to 1.2 |"
