@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.result_tables import planners_table
 from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner

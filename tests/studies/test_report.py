@@ -94,6 +94,12 @@ def test_report_shows_the_results(page):
     assert "Common scenarios" not in text  # there are none in these results
 
 
+def test_latest_of_equal_validation_scores_counts():
+    results = RESULTS | {"validations": [{"rule": [1.0, 0.0], "score": [0.5, 0.5]}]}
+    *_, row = validations_table(results, "mean_q").rows
+    assert [cell.text for cell in row] == ["seeds with their highest score", "0", "1"]
+
+
 @needs_browser
 def test_it_fits_a_phone(page, tmp_path):
     path, _ = page

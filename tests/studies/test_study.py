@@ -20,8 +20,8 @@ from drivax.stats.significance import holm_adjust
 from drivax.studies import study as runner
 from drivax.studies.definition import Study, StudyConfig, StudyDefinition, StudySets, load_study
 from drivax.studies.verdicts import (
-    Condition,
     Strata,
+    ValidationCheck,
     compare_rankings,
     decide_claims,
     describe_sample_size,
@@ -206,13 +206,13 @@ def test_scores_of_another_method_are_refused(data):
 def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
     rising = {"score": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], "progress": [0.0] * 7 + [0.95]}
     flat = {"score": [0.1, 0.5, 0.8, 0.8, 0.81, 0.8, 0.8, 0.8], "progress": [0.0] * 4 + [0.9] + [0.0] * 3}
-    one = Condition.of("bc", [rising], 0.8, 0.03)
+    one = ValidationCheck.of("bc", [rising], 0.8, 0.03)
     assert one.change == pytest.approx(0.2) and one.progress == 0.95 and not one.met
-    assert Condition.of("bc", [flat], 0.8, 0.03).met
-    assert not Condition.of("bc", [flat], 0.91, 0.03).met
+    assert ValidationCheck.of("bc", [flat], 0.8, 0.03).met
+    assert not ValidationCheck.of("bc", [flat], 0.91, 0.03).met
     # Of equal scores, the latest is that of the best checkpoint.
     equal = {"score": [0.8] * 8, "progress": [0.0] * 7 + [0.9]}
-    assert Condition.of("bc", [equal], 0.8, 0.03).progress == 0.9
+    assert ValidationCheck.of("bc", [equal], 0.8, 0.03).progress == 0.9
 
 
 def test_seeds_do_not_make_up_for_each_other():
@@ -220,9 +220,9 @@ def test_seeds_do_not_make_up_for_each_other():
     up = {"score": [0.5] * 6 + [0.7, 0.7], "progress": [0.9] * 8}
     down = {"score": [0.7] * 6 + [0.5, 0.5], "progress": [0.9] * 8}
     flat = {"score": [0.7] * 8, "progress": [0.9] * 8}
-    found = Condition.of("bc", [up, down], 0.8, 0.03)
+    found = ValidationCheck.of("bc", [up, down], 0.8, 0.03)
     assert found.change == pytest.approx(0.0) and found.moved == pytest.approx(0.2) and not found.met
-    found = Condition.of("bc", [flat] * 4 + [flat | {"progress": [0.5] * 8}], 0.8, 0.03)
+    found = ValidationCheck.of("bc", [flat] * 4 + [flat | {"progress": [0.5] * 8}], 0.8, 0.03)
     assert found.progress > 0.8 and found.least == 0.5 and not found.met
 
 

@@ -55,7 +55,8 @@ class Comparison:
         traffic: Traffic model of both.
         scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
         strata: Number of strata of the split; 1 without strata.
-        sensitivity: Sensitivity of the primary metric; None if the metric does not vary.
+        sensitivity: Sensitivity of the primary metric; None if the metric does not vary, or if too few scenarios or
+            recordings define it.
         seeds: Spread over seeds of A and B; None for a single seed.
     """
 
@@ -171,7 +172,7 @@ class _Contrast:
         )
 
     def _test(self, metric: str, x: Values, y: Values) -> tuple[Interval, SignificanceResult]:
-        """Return the difference of the means, and its significance test."""
+        """Return the difference of the means, and its significance test: with several seeds a t test."""
         plan, split, clusters = self.plan, self.split, self.clusters
         resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
         if split is not None:
@@ -202,7 +203,7 @@ class _Contrast:
         return test(x, y, self.clusters, self.plan.resamples, seed=self.plan.seed)
 
     def sensitivity(self) -> Sensitivity | None:
-        """Return the sensitivity in the primary metric; None if the metric does not vary."""
+        """Return the sensitivity in the primary metric (:class:`Comparison`)."""
         plan, split = self.plan, self.split
         x, y = self.a.values(plan.primary), self.b.values(plan.primary)
         if split is None:

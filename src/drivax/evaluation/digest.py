@@ -67,10 +67,10 @@ def episode_digest(table: EpisodeTable) -> str:
 def grid_cells(
     values: Float[np.ndarray, " n"], unit: float
 ) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " start"]]:
-    """Return the cell of each value, and the distance from each start of the grid to the nearest edge.
+    """Return the cell of each value, and for each start of the grid the least distance of a value from an edge.
 
-    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the largest negative
-    number. Distances are shares of the unit.
+    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the smallest int64.
+    Distances are shares of the unit.
     """
     defined = np.isfinite(values)
     starts = np.arange(_STARTS) / _STARTS

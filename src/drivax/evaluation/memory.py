@@ -52,8 +52,8 @@ def free_memory(device: Any) -> int | None:
 def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:
     """Return the number of scenarios to load at a time: as many as fit in half of the free memory.
 
-    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`. A scenario exists twice
-    while its bank is built. ``free`` is in bytes, or None if unknown, for :data:`MOST` scenarios.
+    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`, which is returned if
+    ``free`` (bytes) is None. A scenario exists twice while its bank is built.
     """
     if free is None:
         return MOST

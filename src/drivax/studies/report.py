@@ -190,7 +190,7 @@ def rule_cost_table(results: Results, rule: str) -> Table:
 
 
 def validations_table(results: Results, rule: str) -> Table:
-    """Return the first baseline's ``rule`` and score at each validation, and the number of seeds that peak there."""
+    """Return the first baseline's ``rule`` and score at each validation, and the seeds whose checkpoint they choose."""
     curves = {
         name: np.array([seed[key] for seed in results["validations"]])
         for name, key in ((rule, "rule"), ("score", "score"))
@@ -200,9 +200,13 @@ def validations_table(results: Results, rule: str) -> Table:
         (f"{name}, mean over seeds", *(f"{value:.3f}" for value in values.mean(axis=0)))
         for name, values in curves.items()
     ]
+    best = {
+        rule: curves[rule].argmax(axis=1),
+        "score": np.array([best_validation(scores) for scores in curves["score"]]),
+    }
     rows += [
-        (f"seeds with their highest {name}", *(str((values.argmax(axis=1) == k).sum()) for k in validations))
-        for name, values in curves.items()
+        (f"seeds with their highest {name}", *(str((best_of_seed == k).sum()) for k in validations))
+        for name, best_of_seed in best.items()
     ]
     return _table("dense", ("validation", *(str(k + 1) for k in validations)), rows)
 
