@@ -180,7 +180,7 @@ def _open_folder(study: Study) -> None:
     other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
     if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
         raise UsageError(
-            "has no labelled events, which the oracle and its control need",
+            "has no labelled events, which the oracle arms need",
             file=sets.train,
             cure=f"pass --arms [{','.join(other_arms)}]",
         )
