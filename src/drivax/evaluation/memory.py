@@ -14,7 +14,7 @@ import jax
 from drivax.errors import DrivaxError
 from drivax.files import format_bytes
 
-#: Maximum number of scenarios loaded at a time; their bank takes about 6 GB.
+#: Maximum number of scenarios loaded at a time; those of the built-in world take 4 GB, in ``idm`` traffic 7 GB.
 MOST = 10_000
 #: Bytes reserved per scenario of a program call; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
