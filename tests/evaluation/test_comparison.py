@@ -83,6 +83,17 @@ def test_recordings_are_resampled_as_a_whole():
     assert result.primary.evidence.units == 20
 
 
+def test_planners_of_one_name_are_distinguished_by_their_folders():
+    """Every algorithm has a ``seed-0``."""
+    tables = [table("seed-0", seed=seed) for seed in (1, 2, 3)]
+    folders = ("runs/bc/seed-0", "runs/ppo/seed-0", "runs/ppo/other")
+    bc, ppo, other = (
+        dataclasses.replace(one, folder=Path(f)) for one, f in zip(tables, folders, strict=True)
+    )
+    assert compare(PLAN, [bc], [ppo]).names == ("seed-0 (bc/seed-0)", "seed-0 (ppo/seed-0)")
+    assert compare(PLAN, [bc], [other]).names == ("seed-0 (seed-0)", "seed-0 (other)")
+
+
 def test_order_does_not_matter_and_only_common_scenarios_count():
     a = table("one", rows=range(N))
     part = table("two", rows=list(reversed(range(20, N + 10))))

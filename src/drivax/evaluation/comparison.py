@@ -51,7 +51,7 @@ class Comparison:
     """Result of a comparison.
 
     Attributes:
-        names, folders: Names and run folders of A and B.
+        names, folders: Different names, and run folders of A and B.
         traffic: Traffic model of both.
         scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
         strata: Number of strata of the split; 1 without strata.
@@ -299,10 +299,13 @@ def compare(
 
 
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
+    """Return the names of A and B; equal ones with the shortest different ends of their folders."""
     if a.name != b.name:
         return a.name, b.name
-    labels = [side.folder.name if side.folder else arm for side, arm in ((a, "A"), (b, "B"))]
-    return f"{a.name} ({labels[0]})", f"{b.name} ({labels[1]})"
+    parts_a, parts_b = (side.folder.parts if side.folder else (arm,) for side, arm in ((a, "A"), (b, "B")))
+    lengths = range(1, max(len(parts_a), len(parts_b)) + 1)
+    n = next((n for n in lengths if parts_a[-n:] != parts_b[-n:]), 1)
+    return f"{a.name} ({Path(*parts_a[-n:])})", f"{b.name} ({Path(*parts_b[-n:])})"
 
 
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:

@@ -210,14 +210,14 @@ class DevkitVerdict:
         direction: 1, 0.5 or 0: less than 2 m, less than 6 m, or more against traffic within a second.
         making_progress: 1 if the progress ratio is at least 0.2.
         ttc_ok: 1 if the time to collision is always at least 0.95 s.
-        progress: Progress ratio along the expert's route.
+        progress: Progress ratio along the expert's route; 1 without a route.
         speed: Speed-limit compliance.
         comfortable: 1 if all six comfort series are within their limits.
         collisions: First contacts.
         ttc_s: Time to collision of each sample, 0 to 2.9 s; inf if there is none.
         in_lane: Whether all corners are in one lane or in connected lanes, per sample.
         backward_m: Largest distance against traffic within a second, at most 0.
-        progress_m: Progress of the expert and of ego.
+        progress_m: Progress of the expert and of ego; 0 without a route.
         comfort: Comfort series.
     """
 
