@@ -111,7 +111,7 @@ def test_components_equal_hand_computed_values(steps):
 
 
 def test_every_step_of_an_approach(steps):
-    """From a distance of 74 m to nearly 0, without a discontinuity between the two route windows."""
+    """From a gap of 66 m to one of 4 m, without a discontinuity between the two route windows."""
     at = np.arange(3, 45)
     gap = 60.0 - 4.8 - 15.0 * (at - NOW) * 0.1
     reference = [expected(g / 15.0, 15.0**2 / (2 * g)) for g in gap]
@@ -155,7 +155,7 @@ def test_last_motion_is_repeated_where_ego_is_missing(steps):
 
 
 def test_speed_noise_of_one_cm_per_s_is_negligible(components):
-    """Two least-squares windows of 1.5 s: the published heuristic scores the same noise 0.6."""
+    """A fit over 1.5 s removes most of it; the published heuristic scores the same noise 0.6."""
     assert components["noise"]["volatility"].max() < 0.02
 
 

@@ -96,7 +96,7 @@ def test_effect_that_the_random_control_shares_is_not_credited():
 
 @pytest.mark.parametrize(("rate", "verdict"), [(0.06, "undecided"), (0.11, "contradicted")])
 def test_a_claimed_size_is_tested_against_that_size(rate, verdict):
-    """The claimed rate is 0.055: a claim of a size needs more than a reduction."""
+    """The claimed rate is 0.34 x 0.16 = 0.054: a claim of a size needs more than a reduction."""
     results = verdicts(EVEN | {"ensemble": rate})
     assert results["ensemble collides less than the baseline"].verdict == "supported"
     assert results[SIZE].verdict == verdict
@@ -136,7 +136,7 @@ def test_p_values_are_adjusted_within_their_group():
 def test_undecided_claims_name_the_seeds_or_recordings_that_would_decide():
     few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
     seeds = int(describe_sample_size(few, 1).split()[0])
-    assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.75
+    assert 10 <= seeds <= 13  # by a normal distribution 4e-4 / ((0.02 / 2.8016)^2 - 1e-5) = 9.77
     assert int(describe_sample_size(few, 20).split()[0]) > seeds
     assert describe_sample_size(replace(few, difference=1e-6), 1).startswith("neither seeds nor recordings")
     assert "test recordings" in describe_sample_size(CrossedEffect(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400), 1)

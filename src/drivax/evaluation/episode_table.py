@@ -34,7 +34,7 @@ _ACTION_JERK = "standard deviation of the change of the action from step to step
 ADDED = {
     "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
 }  # fmt: skip
-#: All columns of an evaluation but user-defined metrics.
+#: All columns after the keys, except user-defined metrics.
 COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
 #: Columns of zeros and ones, which have Wilson intervals.
 RATES = names_of(COLUMNS, "rate")
