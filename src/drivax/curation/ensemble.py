@@ -268,8 +268,8 @@ def fit(
     """Return the trained parameters of all members, along a leading axis.
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
-    results. By default this is used on all devices except CPUs, where batched products of small matrices take three
-    times as long.
+    results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
+    take three times as long.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:

@@ -31,7 +31,7 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """Log of one scenario; while ego is not observed, its last motion is repeated.
+    """Log of one scenario; while ego is not observed, its last (at the start its first) motion is repeated.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.

@@ -46,7 +46,7 @@ class Pairs:
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     """Return problem and cure if the episodes of two runs cannot be paired, else None.
 
-    Paired episodes need the same scenario set, traffic and start.
+    Paired episodes need the same scenario set, traffic and start. The seed of noisy starts may differ.
     """
     hashes = [str(run.data.get("hash") or "") for run in (a, b)]
     if all(hashes) and hashes[0] != hashes[1]:
