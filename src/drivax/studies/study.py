@@ -366,8 +366,8 @@ def _validation_checks(study: Study, arms: Sequence[str]) -> list[ValidationChec
     return [ValidationCheck.of(arm, _validations(study, arm), config.progress, config.flat) for arm in arms]
 
 
-def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
-    """Return ``score``, ``progress`` and the logged ``rule`` (``checkpoints_by``) at each seed's validations."""
+def _validations(study: Study, arm: str) -> list[dict[str, list[Any]]]:
+    """Return ``score``, ``progress`` and ``rule`` (``checkpoints_by``; None if missing) at each seed's validations."""
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
         run = RunFolder(study.run(arm, seed), {})
@@ -376,7 +376,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
             {
                 "score": [_validation_score(row) for row in rows],
                 "progress": [row[_PROGRESS] for row in rows],
-                "rule": [row[metric] for row in rows if row.get(metric) is not None],
+                "rule": [row.get(metric) for row in rows],
             }
         )
     return curves
