@@ -52,7 +52,7 @@ class KernelRarity:
     The density (Rosenblatt, 1956; Parzen, 1962) is computed on a grid. Counts per cell are convolved with the kernel
     and mirrored at the bounds, so that the density integrates to 1 over the action space; it is interpolated linearly
     between cell centres. The score at density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median``
-    is the median density over steps: actions of median density score 1 / most, commoner ones less, very rare ones 1.
+    is the median density over steps: actions of median density score 1 / most, more common ones less, very rare ones 1.
 
     Attributes:
         bandwidth: Standard deviation of the kernel, in units of the action space.
