@@ -1,7 +1,7 @@
 """Measure this package on an accelerator: simulation, training, evaluation, memory, and a long PPO run.
 
-The measurements run in order of importance until their share of the time is spent; what did not run is listed as such.
-The result is written after each, so that a run that is stopped keeps what it has.
+The measurements of each stage run until its share of the time is spent; others are listed as not run. The result is
+written after each measurement, so that a stopped run keeps its results.
 
 python -m experiments.gpu --out gpu.json [--minutes 9]
 
@@ -64,7 +64,7 @@ TRAININGS = {
     ),
 }  # fmt: skip
 PLANNERS = ("constant_velocity", "idm", "pdm")
-#: Seconds that compilation and the last validation of the long training need.
+#: Seconds for compilation and the evaluation after the long training.
 _MARGIN_S = 45.0
 
 
@@ -128,7 +128,7 @@ def training(bank: ScenarioBank, preset: Sequence[str], environments: int | None
 
 
 def evaluation(scenarios: ScenarioSet, planner: str, traffic: str) -> dict[str, Any]:
-    """Return seconds per 1,000 scenarios: the first time with compilation, and again."""
+    """Return seconds per 1,000 scenarios, with compilation and again, and the success."""
     driver = make_planner(planner, None)
 
     def run() -> tuple[float, EpisodeTable]:

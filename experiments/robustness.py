@@ -40,7 +40,7 @@ from typing import Any
 from experiments.repository import RESULTS, ROOT
 
 PROGRAM = (sys.executable, "-m", "drivax")
-#: Exit statuses by fault; a negative one is the signal, before the command has installed its handlers.
+#: Exit statuses by fault; a negative one is a signal that the command does not handle, or not yet.
 STATUSES = {
     "kill": (-9,), "worker": (1,), "term": (143, -15), "int": (130, -2), "hup": (129, -1), "full": (1,),
 }  # fmt: skip
@@ -64,7 +64,7 @@ _DISK, _REST = 512 << 20, 1 << 18
 #: A stopped command, and a whole one, end within these times (s).
 _STOP_S, _RUN_S = 120.0, 900.0
 _POLL_S = 0.01
-#: A command that ends before its moment, since it is faster than in the reference, has another one, sooner.
+#: Shares of its time in which the moment is drawn; a command that ends before its moment takes the next share.
 _SHARES = (1.0, 0.6, 0.4, 0.2)
 
 _TRAIN = """

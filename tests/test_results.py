@@ -186,7 +186,10 @@ def test_longtail_verdicts_hold_under_joint_adjustment(found):
 
 def test_nuplan_page_shows_stored_counts(script, stored):
     nuplan = script("data.nuplan")
-    shown = f"{nuplan.BEGIN}\n\n{nuplan.shown(stored('nuplan'))}\n\n{nuplan.END}" in nuplan.PAGE.read_text()
+    shown = (
+        f"{nuplan.BEGIN}\n\n{nuplan.agreement_table(stored('nuplan'))}\n\n{nuplan.END}"
+        in nuplan.PAGE.read_text()
+    )
     assert shown, "run python -m experiments.data.nuplan --table, and read what the page says about it"
 
 

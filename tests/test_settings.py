@@ -204,6 +204,21 @@ def test_overrides():
     assert load("", "--limit", "5").limit == 5
 
 
+def test_kind_by_name_alone_keeps_its_kind(tmp_path: Path):
+    """``optimizer: sgd`` in a file, an extended file or a flag, then a setting of it."""
+    assert load("optimizer: sgd", "--optimizer.lr=1").optimizer == Sgd(lr=1.0)
+    assert load("", "--optimizer", "sgd", "--optimizer.lr", "1").optimizer == Sgd(lr=1.0)
+    section = "{kind: sgd, momentum: 0.5}"
+    assert load("", "--optimizer", section, "--optimizer.lr", "1").optimizer == Sgd(lr=1.0, momentum=0.5)
+    assert load("optimizer: sgd", "--optimizer.kind", "adam", "--optimizer.clip", "1").optimizer == Adam(
+        clip=1.0
+    )
+    (tmp_path / "base.yaml").write_text("optimizer: sgd")
+    (tmp_path / "own.yaml").write_text("extends: base.yaml\noptimizer: {lr: 1}")
+    assert settings.load(Training, tmp_path / "own.yaml").optimizer == Sgd(lr=1.0)
+    assert load("weights: x", "--weights.left", "1").weights == {"left": 1.0}, "a mapping has no kind"
+
+
 def test_another_kind_drops_previous_settings():
     text = "optimizer: {kind: adam, clip: 1}"
     assert load(text, "--optimizer.kind", "sgd", "--optimizer.momentum", "0.5").optimizer == Sgd(momentum=0.5)

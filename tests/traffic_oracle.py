@@ -71,12 +71,12 @@ class Path:
         arc = self.arc[:-1][keep][k] + share[k] * self.spacing
         (x0, x1), (y0, y1) = (np.interp([arc - 2.0, arc + 2.0], self.arc, self.points[:, i]) for i in (0, 1))
         around = np.array([x1 - x0, y1 - y0])
-        return arc, away[k], *(way / max(np.hypot(*way), 1e-9) for way in (u[k], around))
+        return arc, away[k], *(vector / max(np.hypot(*vector), 1e-9) for vector in (u[k], around))
 
 
-def extents(box, way):
+def extents(box, direction):
     """Half the extent of a box along and across a direction."""
-    turn_cos, turn_sin = abs(box[2:4] @ way), abs(box[3] * way[0] - box[2] * way[1])
+    turn_cos, turn_sin = abs(box[2:4] @ direction), abs(box[3] * direction[0] - box[2] * direction[1])
     return turn_cos * box[4] / 2 + turn_sin * box[5] / 2, turn_sin * box[4] / 2 + turn_cos * box[5] / 2
 
 
@@ -87,40 +87,39 @@ def law(speed, desired, gap, leader):
 
 
 def expected_accelerations(bank, index, row, arc, speed, ignored, frame, step):
-    """Return an acceleration for each agent that may count as the nearest, and the smallest distance to a border.
+    """Return an acceleration for each agent that may count as the nearest, and the least distance of one to a border.
 
     The border is that of the vehicle's corridor.
     """
     path, slot = Path(data_of(bank, AgentPaths), index, row), int(data_of(bank, AgentPaths).slot[index, row])
-    x, y, z, most = path.at(arc)
+    x, y, z, limit = path.at(arc)
     length, width = np.asarray(bank.agent_box[index, slot, :2], np.float64)
     look = min(20 + 1.5 * speed + speed * speed / 6, 120)
-    close, inside = np.inf, []
+    border_m, inside = np.inf, []
     box = np.asarray(frame.box, np.float64)
     for other in range(len(box)):
-        there = frame.valid[other] and other != slot and other not in ignored
-        if not there or abs(frame.z[other] - z) > 3 or np.hypot(*(box[other, :2] - [x, y])) > look + 12:
+        counts = frame.valid[other] and other != slot and other not in ignored
+        if not counts or abs(frame.z[other] - z) > 3 or np.hypot(*(box[other, :2] - [x, y])) > look + 12:
             continue
-        s, away, way, around = path.project(box[other, :2], arc, arc + look)
-        (half_length, half_width), (long, wide) = extents(box[other], way), extents(box[other], around)
+        s, away, direction, around = path.project(box[other, :2], arc, arc + look)
         # A logged path jitters, and with it the extent of a long box along and across it.
-        beyond = [away - (width / 2 + 0.1 + half) for half in (half_width, wide)]
-        border = min(abs(beyond[0]), abs(beyond[1])) if beyond[0] * beyond[1] > 0 else 0.0
+        (half_length, half_width), smooth = extents(box[other], direction), extents(box[other], around)
+        beyond = [away - (width / 2 + 0.1 + half) for half in (half_width, smooth[1])]
+        side_m = min(abs(beyond[0]), abs(beyond[1])) if beyond[0] * beyond[1] > 0 else 0.0
         ahead = s - arc
         if ahead > -1 and ahead < look + 1:
-            close = min(
-                close, border, abs(ahead) if away < width / 2 + half_width else np.inf, abs(ahead - look)
-            )
+            start_m = abs(ahead) if away < width / 2 + half_width else np.inf
+            border_m = min(border_m, side_m, start_m, abs(ahead - look))
         if away < width / 2 + 0.1 + half_width and 0 < ahead < look:
-            gaps = ahead - half_length - length / 2, ahead - long - length / 2
-            inside.append((*gaps, float(np.asarray(frame.velocity[other], np.float64) @ way)))
-    nearest = np.min([(here, there) for here, there, _ in inside], axis=0, initial=1e4)
+            gaps = ahead - half_length - length / 2, ahead - smooth[0] - length / 2
+            inside.append((*gaps, float(np.asarray(frame.velocity[other], np.float64) @ direction)))
+    nearest = np.min([gaps for *gaps, _ in inside], axis=0, initial=1e4)
     results = [
-        law(speed, most, here, leader)
-        for here, there, leader in inside
-        if here < nearest[0] + EQUALLY_NEAR_M or there < nearest[1] + EQUALLY_NEAR_M
+        law(speed, limit, gap, leader)
+        for gap, smooth_gap, leader in inside
+        if gap < nearest[0] + EQUALLY_NEAR_M or smooth_gap < nearest[1] + EQUALLY_NEAR_M
     ]
-    results = results or [law(speed, most, 1e4, 0.0)]
+    results = results or [law(speed, limit, 1e4, 0.0)]
     state = np.asarray(bank.light_state[index, min(step, 90)])
     for line, light in zip(
         data_of(bank, AgentPaths).stop_arc[index, row],
@@ -134,8 +133,8 @@ def expected_accelerations(bank, index, row, arc, speed, ignored, frame, step):
         if (front > 0 and speed**2 <= 2 * brakes * front) or (
             front <= 0 < front + length / 2 and speed < 0.5 and brakes > 3
         ):
-            results = [min(result, law(speed, most, max(front, 0.0), 0.0)) for result in results]
-    return results, close
+            results = [min(result, law(speed, limit, max(front, 0.0), 0.0)) for result in results]
+    return results, border_m
 
 
 def compare(bank, index, frames, traffic, every=7):
@@ -146,10 +145,10 @@ def compare(bank, index, frames, traffic, every=7):
         for row in np.flatnonzero((traffic.phase[t] == DRIVES) & (traffic.phase[t + 1] == DRIVES)):
             arc, speed = float(traffic.arc[t, -1, row]), float(traffic.speed[t, -1, row])
             ignored = set(traffic.ignored[t + 1, row].tolist())
-            accelerations, close = expected_accelerations(
+            accelerations, border_m = expected_accelerations(
                 bank, index, row, arc, speed, ignored, frame, 10 + t
             )
-            if close < 0.1:
+            if border_m < 0.1:
                 continue  # on the border of the corridor both answers are right
             reached = traffic.speed[t + 1, -1, row]
             acceleration = min(
@@ -162,7 +161,7 @@ def compare(bank, index, frames, traffic, every=7):
     return np.array(errors).reshape(-1, 2)
 
 
-def meetings(bank, index, frames, traffic):
+def new_overlaps(bank, index, frames, traffic):
     """Slot pairs with a reacting agent that begin to overlap after the first step; and the reacting slots."""
     slots = np.asarray(data_of(bank, AgentPaths).slot[index])
     reacting = [int(s) for s in slots[(traffic.phase != 0).any(0) & (slots > 0)]]

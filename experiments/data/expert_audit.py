@@ -41,8 +41,8 @@ from experiments.repository import DOCS, RESULTS
 RESULT = RESULTS / "expert_audit.json"
 PAGE = DOCS / "results" / "expert-audit.md"
 COMMAND = "python -m experiments.data.expert_audit --data ../shared/data --write"
-#: A logged vehicle is taken as ego when it is seen now and without a gap for this long, and moves this far meanwhile.
-SEEN_STEPS, MOVES_M = 21, 2.0
+#: A logged vehicle is taken as ego if it is valid for this many steps from now on, and moves this far meanwhile, m.
+VALID_STEPS, MOVES_M = 21, 2.0
 PLANNERS = ("expert", "expert_actions")
 HEAD = (
     "scenarios", "planner", "n", "distance m (median, max)", "collisions", "off-road steps", "contradicted",
@@ -65,9 +65,9 @@ def moving_vehicles(recording: Recording) -> list[int]:
     rows = []
     for row in np.flatnonzero((tracks.kind == AgentKind.VEHICLE) & tracks.valid[:, now]):
         ahead = tracks.valid[row, now:]
-        seen = len(ahead) if ahead.all() else int(np.argmin(ahead))
-        xy = tracks.xy[row, now : now + seen]
-        moved = np.hypot(*np.diff(xy, axis=0).T).sum() if seen >= SEEN_STEPS else 0.0
+        steps = len(ahead) if ahead.all() else int(np.argmin(ahead))
+        xy = tracks.xy[row, now : now + steps]
+        moved = np.hypot(*np.diff(xy, axis=0).T).sum() if steps >= VALID_STEPS else 0.0
         if row != recording.ego and moved >= MOVES_M and np.hypot(*(xy[-1] - xy[0])) >= MOVES_M:
             rows.append(int(row))
     return rows
@@ -102,10 +102,10 @@ def rows_of(batch: list[Case], planner: str) -> list[dict[str, Any]]:
 
 
 def _row(case: Case, planner: str, facts: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    judged = facts["logged"].copy()
-    judged[0] = False
-    faults = {name: facts[name] & judged for name in ("collision", "offroad", "left_map", "red_light")}
-    divergence = facts["log_divergence_m"][judged]
+    counted = facts["logged"].copy()
+    counted[0] = False
+    faults = {name: facts[name] & counted for name in ("collision", "offroad", "left_map", "red_light")}
+    divergence = facts["log_divergence_m"][counted]
     off = CURRENT_STEP + np.flatnonzero(faults["offroad"])
     contradicted = sum(nearest_edges_say_on_road(case.scenario, int(step)) for step in off)
     lights = Flag.LIGHTS in case.scenario.has
@@ -113,8 +113,8 @@ def _row(case: Case, planner: str, facts: Mapping[str, np.ndarray]) -> dict[str,
         "group": case.group,
         "scenario": case.scenario.id,
         "planner": planner,
-        "steps": int(judged.sum()),
-        "distance_m": round(float(facts["moved_m"][judged].sum()), 2),
+        "steps": int(counted.sum()),
+        "distance_m": round(float(facts["moved_m"][counted].sum()), 2),
         "collision_step": _first(faults["collision"]),
         "offroad_steps": int(faults["offroad"].sum()),
         "contradicted_steps": contradicted if planner == "expert" else None,

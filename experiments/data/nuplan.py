@@ -29,7 +29,7 @@ PAGE = DOCS / "results" / "nuplan.md"
 BEGIN, END = "<!-- nuplan.py: begin -->", "<!-- nuplan.py: end -->"
 _WIDTH_M, _BEGIN_M, _JOINT_M, _END_M = 3.7, -150.0, 300.0, 350.0
 _CAR_M = (5.176, 2.297, 1.777)
-#: Our metric of each of the devkit's terms that do not depend on the logged ego; the first two are 1 less ours. Not
+#: Our metric of each of the devkit's terms that do not depend on the logged ego; the first two are 1 minus ours. Not
 #: taken from ``evaluation.profiles``, so that the script also runs with sources that lack it.
 METRICS = {
     "fault_score": "at_fault_collision", "drivable": "offroad", "ttc_ok": "ttc_ok", "direction": "direction",
@@ -43,10 +43,10 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
     rows = np.concatenate([np.array(scene["past"])[:-1], np.array(scene["ego"])])
     time_s = DT_S * (np.arange(len(rows)) - 10)
     agents = scene["agents"]
-    way = [agent["v"] * np.array([np.cos(agent["h"]), np.sin(agent["h"])]) for agent in agents]
+    velocities = [agent["v"] * np.array([np.cos(agent["h"]), np.sin(agent["h"])]) for agent in agents]
     xy = [
-        np.array([agent["x"], agent["y"]]) + time_s[:, None] * step
-        for agent, step in zip(agents, way, strict=True)
+        np.array([agent["x"], agent["y"]]) + time_s[:, None] * other_velocity
+        for agent, other_velocity in zip(agents, velocities, strict=True)
     ]
     heading = np.stack([rows[:, 2], *(np.full(len(rows), agent["h"]) for agent in agents)])
     velocity = rows[:, 6:7] * np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], axis=-1)
@@ -68,7 +68,7 @@ def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
         {
             "xy": np.stack([rows[:, 4:6], *xy]),
             "heading": heading,
-            "velocity": np.stack([velocity, *(np.broadcast_to(step, (len(rows), 2)) for step in way)]),
+            "velocity": np.stack([velocity, *(np.broadcast_to(v, (len(rows), 2)) for v in velocities)]),
             "valid": np.ones(heading.shape, bool),
             "size": np.array([_CAR_M, *([*agent["size"], 1.5] for agent in agents)]),
             "kind": ["vehicle", *(agent["kind"] for agent in agents)],
@@ -100,7 +100,7 @@ def _verdict(devkit: Mapping[str, Any], name: str) -> float:
     return float(devkit["comfort"]["comfortable"] if name == "comfortable" else devkit[name])
 
 
-def shown(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
+def agreement_table(result: Mapping[str, Mapping[str, Mapping[str, int]]]) -> str:
     """Return the counts of every stored state in Markdown."""
     groups = list(next(iter(result.values())))
     heads = ["metric", "ours", *(f"{group}, {state}" for group in groups for state in result)]
@@ -135,7 +135,7 @@ def main() -> None:
             return
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
     before, rest = PAGE.read_text().split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n\n{shown(result)}\n\n{END}{rest.split(END)[1]}")
+    PAGE.write_text(f"{before}{BEGIN}\n\n{agreement_table(result)}\n\n{END}{rest.split(END)[1]}")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ steps at which any lane of its direction is within 1.5 m of the log: the upper b
 
     python -m experiments.data.routes --data ../shared/data [--routes published] [--pictures FOLDER] [--write]
 
-``--pictures`` draws every log that is not covered; ``--write`` stores experiments/results/routes_graph.json (or
-routes_published.json).
+``--pictures`` draws every log with a route that no candidate covers; ``--write`` stores
+experiments/results/routes_graph.json (or routes_published.json).
 """
 
 from __future__ import annotations

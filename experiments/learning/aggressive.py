@@ -205,7 +205,7 @@ COLUMNS = {
 
 
 def tables() -> str:
-    """Return the stored results as tables of the guide."""
+    """Return the stored results as Markdown tables."""
     results = json.loads(RESULT.read_text())
     row_groups = (results["ego"]["drivers"], results["ego"]["minus"], results["others"], results["traffic"])
     return "\n".join(_table(rows) for rows in row_groups)

@@ -8,8 +8,7 @@ python -m experiments.learning.presets judge     (means with intervals of the ev
 python -m experiments.learning.presets table     (the stored results into the pages, and the curves of docs/algorithms)
 
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. Checkpoints are selected on the split `validation`
-and evaluated once on `test`. Intervals of means over seeds and differences resample seeds and segments of the world,
-both with replacement.
+and evaluated once on `test`. Intervals cover other seeds and other segments of the world (`stats.seeds`).
 """
 
 from __future__ import annotations
@@ -118,7 +117,7 @@ def learning_curves(trainings: Sequence[Training]) -> dict[str, dict[str, list[l
     """Return quantity -> seed -> points (step, value) of all validations."""
     return {
         metric: {
-            training.name: [
+            training.folder.name: [
                 [int(step), round(float(value), 4)] for step, value in training.curves[f"validation/{metric}"]
             ]
             for training in trainings

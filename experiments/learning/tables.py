@@ -1,6 +1,6 @@
 """Write the results of ``presets.py`` and ``training.py`` as tables and learning curves to the pages of the docs.
 
-The content goes between ``<!-- presets.py: WHAT -->`` and ``<!-- presets.py: end -->``; see :func:`written`.
+The content goes between ``<!-- presets.py: WHAT -->`` and ``<!-- presets.py: end -->``; see :func:`format_block`.
 """
 
 from __future__ import annotations

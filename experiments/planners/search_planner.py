@@ -152,7 +152,7 @@ class Others:
         trend: Trend,
         route: tuple[Array, Array, Array],
     ) -> Others:
-        """Select the agents on ego's level.
+        """Select the nearest agents on ego's level, and predict them.
 
         Args:
             bank: The scenarios.
@@ -472,7 +472,8 @@ def _shifted_line(
 ) -> Float[Array, "P 7"]:
     """Shift the route laterally from the car's current offset and heading to a target offset.
 
-    The shift is a cubic with a maximum lateral acceleration of 3.5 m/s2: 6 d / T^2 for a shift by d in time T.
+    The shift by d is a cubic over a time T of 1 to 2.5 s, if possible with at most 3.5 m/s2 of lateral acceleration,
+    which is 6 d / T^2.
     """
     lateral, shift = offsets_m
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]

@@ -21,7 +21,7 @@ BEGIN, END = "<!-- sizes: python -m experiments.speed.encoders --table -->\n", "
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown table. Without times, types of equal size share a row."""
+    """Return a Markdown table. Without times it has float32 rows only, since sizes do not depend on the type."""
     rows = result["rows"]
     timed = all("gradient_us" in row for row in rows)
     if not timed:

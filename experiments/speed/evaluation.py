@@ -1,6 +1,7 @@
 """Time evaluations of every planner in log replay and reactive traffic, without compilation.
 
-The first batch compiles, so the others are timed and extrapolated to all batches. Nothing else may run on the machine.
+The first batch compiles, so the others are timed, and extrapolated to 1,000 scenarios of 80 steps. Nothing else may run
+on the machine.
 
 python -m experiments.speed.evaluation --data SET [--planner NAME ...] [--write]     SET: at least 1,024 scenarios
 python -m experiments.speed.evaluation --table                                       what is stored, into the page
@@ -30,8 +31,8 @@ PAGE = DOCS / "results" / "speed.md"
 BEGIN, END = "<!-- evaluation.py: begin -->", "<!-- evaluation.py: end -->"
 #: Whole batches, so that their times are equal.
 SCENARIOS = 1024
-#: Seconds that 1,000 scenarios x 80 steps may take in recorded traffic, and how many times that in reactive traffic.
-AIMS, REACTIVE = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}, 3
+#: Seconds that 1,000 scenarios of 80 steps may take in log replay traffic.
+AIMS = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}
 TRAFFIC = ("log", "idm")
 
 

@@ -147,7 +147,9 @@ def table(result: dict[str, Any]) -> str:
     ]
     members = result["members"]
     sizes = f"{members['members']} members of {members['parameters_of_one']:,} parameters, batch {members['batch']}"
-    times = f"{members['seconds_of_all']} s for {members['updates']} updates side by side, {members['ratio']} times"
+    times = (
+        f"{members['seconds_of_all']} s for {members['updates']} updates of each, {members['ratio']} times"
+    )
     return "\n".join(rows) + (
         f"\n\n{sizes}: {times} as long as one "
         f"alone. Steps are drawn {result['draws_per_second']:,} times per second ({', '.join(result['devices'])})."

@@ -4,8 +4,8 @@
     python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
 
 SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
-tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first run of each, which
-compiles, does not count. A command starts in a new process, with an empty compilation cache (``first``) or with that
+tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first runs of each, which
+compile, do not count. A command starts in a new process, with an empty compilation cache (``first``) or with that
 of an earlier run (``again``). Nothing else may run on the machine. Each row has the time of a fixed program and the
 load before and after it.
 """

@@ -68,22 +68,22 @@ SCENARIOS, MANY = 1024, 4096
 
 
 def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
-    """Time both tasks in both kinds of traffic alternately, each at its best batch size."""
+    """Time both tasks in both kinds of traffic at all batch sizes alternately; details are of the fastest size."""
     kinds = [(name, traffic, batch) for name in TASKS for traffic in ("log", "idm") for batch in BATCHES]
     bank = replicate(prepare_bank(IdmTraffic(), bank))
     programs = [
         compile_program(bank, replace(config, task=TASKS[name], traffic=traffic, batch=batch))
         for name, traffic, batch in kinds
     ]
-    found = dict(zip(kinds, steps_per_second(programs, config.repeats), strict=True))
+    rates = dict(zip(kinds, steps_per_second(programs, config.repeats), strict=True))
     result = {}
     for name, traffic in dict.fromkeys(kind[:2] for kind in kinds):
-        batch = max(BATCHES, key=lambda size, kind=(name, traffic): found[*kind, size])
+        batch = max(BATCHES, key=lambda size, kind=(name, traffic): rates[*kind, size])
         program = programs[kinds.index((name, traffic, batch))]
         result[f"{name}, {traffic}"] = {
             "batch": batch,
-            "steps_per_second": round(found[name, traffic, batch]),
-            "by_batch": {size: round(found[name, traffic, size]) for size in BATCHES},
+            "steps_per_second": round(rates[name, traffic, batch]),
+            "by_batch": {size: round(rates[name, traffic, size]) for size in BATCHES},
             "compile_seconds": round(step_compiled(bank, TASKS[name], traffic), 2),
             "program_compile_seconds": round(program.compile_seconds, 2),
             "state_bytes": program.state_bytes,

@@ -35,8 +35,8 @@ from experiments.speed.machine import conditions
 RESULT = RESULTS / "training.json"
 SCENARIOS = 1024
 _TWO_ENCODERS = ("--algorithm.network.shared_encoder", "false")
-#: What is trained: the preset; with an encoder each for policy and value; with twice the passes over experience; and
-#: with the small latent-query encoder in bfloat16.
+#: What is trained: the preset; with an encoder each for policy and value; these with more passes over the experience;
+#: and the preset with the small latent-query encoder in bfloat16.
 KINDS = {
     "ppo": (),
     "ppo, two encoders": _TWO_ENCODERS,

@@ -94,7 +94,7 @@ def residuals(recording: Recording) -> dict[str, list[Array]]:
 
 
 def summary(pieces: list[Array]) -> dict[str, float]:
-    """Return the median residual, its autocorrelation, and the fitted noise."""
+    """Return medians of the residual's deviation and autocorrelation, its 90th percentile, and the fitted noise."""
     # Medians over runs are robust to a few tracks with swapped identities.
     deviation = float(np.median([np.std(piece) for piece in pieces]))
     lag = float(np.median([np.mean(p[1:] * p[:-1]) / max(np.mean(p * p), 1e-12) for p in pieces]))

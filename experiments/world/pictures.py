@@ -1,7 +1,7 @@
 """Draw the built-in world: every family of roads in each domain, and every kind of labelled event.
 
-Draws the first generated scenario of each family or event. An event is drawn at the step at which ego and its actor are
-closest, with both paths.
+Draws, among the first common scenarios of each family, the one with the most map features, and the first scenario of
+each kind of event, at the step at which ego and its actor are closest, with both paths.
 
 Run: python -m experiments.world.pictures [--seed 0] [--folder docs/guide] [--only grid|ring|events]
 """

@@ -97,7 +97,10 @@ def measure_speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
 def measure_set(
     folder: Path, planners: tuple[str, ...], evaluated_count: int | None = None
 ) -> list[dict[str, Any]]:
-    """Return a row per scenario: tags, statistics, and results of the expert and the planners."""
+    """Return a row per scenario: tags, statistics, and results of the expert and the planners.
+
+    With ``evaluated_count`` the planners drive only the chunks of 512 scenarios that begin before it.
+    """
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
@@ -202,7 +205,7 @@ def severity(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def near_misses(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the share of rare scenarios, overall and by kind, where a constant-speed ego nears the actor."""
+    """Return the share of events, overall and by kind, in which ego at constant speed is within 1 s of a collision."""
     kinds = {"all": rows}
     for row in rows:
         kinds.setdefault(row["event"], []).append(row)
@@ -315,7 +318,7 @@ def main() -> None:
         "--driven",
         type=int,
         default=None,
-        help="scenarios that planners other than the expert drive (of each set)",
+        help="scenarios of each set that planners other than the expert drive, in chunks of 512",
     )
     parser.add_argument("--rare-rate", type=float, default=0.05)
     parser.add_argument("--domain", choices=sorted(DOMAINS), default="grid")

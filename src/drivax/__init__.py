@@ -1,8 +1,7 @@
 """Train, curate and judge driving planners on recorded traffic, in one JAX program.
 
-Every command of the command line has a function here. Names are imported on first use: ``import drivax`` is fast, and
-worker processes that convert data never load JAX. ``plugins`` resolves dotted names, and decides which modules a
-stranger's file may name.
+``generate``, ``train``, ``evaluate``, ``write_report`` and other functions do what the commands do. Names are imported
+on first use: ``import drivax`` is fast, and worker processes that convert data never load JAX.
 """
 
 from __future__ import annotations

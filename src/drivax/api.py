@@ -1,4 +1,4 @@
-"""The Python interface: one function per command of the command line."""
+"""Functions of the Python interface: load, simulate, evaluate, generate, convert, compare and curate."""
 
 from __future__ import annotations
 
@@ -68,6 +68,8 @@ def load(
         DataError: The set is damaged, an id is not in it, or no scenario is left.
         UsageError: A filter or the limit is impossible.
     """
+    if limit is not None and limit < 1:
+        raise UsageError(f"a limit of {limit} leaves no scenario", cure="use 1 or more")
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
         selection = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
@@ -88,9 +90,9 @@ def make_simulator(
     Args:
         task: Action space, observation, reward and termination; the default task if None.
         traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
-            ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
-            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
-        trust: Modules outside drivax whose code that policy may name.
+            ``zoo:NAME``), or a traffic object. All but ``log`` may need a bank that
+            :func:`drivax.simulator.traffic.bank_data.prepare_bank` prepares for the simulator's ``traffic``.
+        trust: Modules outside drivax whose code the policy may name.
     """
     return Simulator(task or Task(), as_traffic(traffic, trust))
 
@@ -173,10 +175,10 @@ def generate(
         out: Folder to write.
         scenarios: Number of scenarios.
         seed: Scenario ``i`` of a seed is the same in every set.
-        options: World, workers and capacity.
+        options: World, workers, capacity, length, egos, and whether to overwrite ``out``.
 
     Raises:
-        UsageError: ``out`` exists, or an option is impossible.
+        UsageError: ``out`` exists without ``options.overwrite``, or an option is impossible.
     """
     from drivax.synthetic.generate import generate as generate_set
 
@@ -202,7 +204,7 @@ def compare(
     a: str | Path, b: str | Path, plan: ComparisonPlan | None = None, data: Path | None = None,
     **settings: Any,
 ) -> Comparison:  # fmt: skip
-    """Compare two evaluations.
+    """Compare two planners by their evaluations.
 
     Args:
         a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.

@@ -22,20 +22,22 @@ from pathlib import Path
 _PATIENCE_S = 2.0
 #: Programs that compile faster are not stored (s): reading them takes as long.
 _LEAST_COMPILE_S = 0.1
-#: Largest total size of the cache, and the age from which a file is complete (another process may be writing it).
+#: Total size to which the cache is cut, and the time since its last use from which a file may be deleted (s): another
+#: process may still write it.
 _MAX_BYTES, _SETTLED_S = 2 << 30, 600.0
 
 
 def use_compilation_cache(folder: str | Path | None = None, *, max_bytes: int = _MAX_BYTES) -> Path | None:
     """Store compiled programs on disk, and read those that are there; call it before the first computation.
 
-    Every command does so unless it gets ``--no-cache``. Processes may share the folder. At most ``max_bytes`` stay:
-    the least recently used programs are deleted here. JAX warns of a damaged entry and compiles again.
+    Every command does so unless it gets ``--no-cache``. Processes may share the folder. This call deletes the least
+    recently used programs until ``max_bytes`` are left, but none that was used in the last ten minutes; later programs
+    add to them. JAX warns of a damaged entry and compiles again.
 
     Args:
         folder: Folder of the cache; ``$XDG_CACHE_HOME/drivax`` or ``~/.cache/drivax`` by default. It is created with
             mode 0700.
-        max_bytes: Largest total size of the cache.
+        max_bytes: Total size of the cache after this call.
 
     Returns:
         The folder of this version and processor; None if it cannot be used (read-only, or owned by another user) or
@@ -105,7 +107,10 @@ def _processor() -> str:
 
 
 def _prune(top: Path, max_bytes: int, keep: Path) -> None:
-    """Delete the least recently used files of all versions until the rest fits, and empty folders but ``keep``."""
+    """Delete the least recently used files of all versions until the rest fits, and empty folders but ``keep``.
+
+    Files that were used in the last ten minutes stay.
+    """
     files = []
     for path in top.glob("jax*/*"):
         with suppress(OSError):  # another process deletes as well

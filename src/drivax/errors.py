@@ -98,7 +98,7 @@ class UsageError(DrivaxError):
 def explain_system(error: BaseException, file: str | Path | None = None) -> DrivaxError | None:
     """Return the error that explains a failure of a file or disk (DataError) or a limit of this process (UsageError).
 
-    ``file`` counts if the system's error names none. Other errors are None.
+    The result names ``file`` if the system's error names none. It is None for all other errors.
     """
     number = getattr(error, "errno", None)
     if isinstance(error, MemoryError):

@@ -17,7 +17,7 @@ _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-
 
 
 def escape_controls(text: Any) -> str:
-    r"""Return a name for a terminal: control characters as ``\x1b``, ``\n`` or ``\u202e``."""
+    r"""Return text for a terminal: control characters as ``\x1b``, ``\n`` or ``\u202e``."""
     return _CONTROL.sub(lambda match: match[0].encode("unicode_escape").decode(), str(text))
 
 

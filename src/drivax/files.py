@@ -24,7 +24,7 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -78,6 +78,13 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
         raise UsageError(f"output {kind} already exists", file=path, cure=cure)
 
 
+def path_end(path: Path, others: Iterable[Path]) -> str:
+    """Return the shortest end of a path that no other path has, or all of it."""
+    parts, other_parts = path.parts, [other.parts for other in others]
+    lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in other_parts))
+    return str(Path(*parts[-next(lengths, len(parts)) :]))
+
+
 def free_bytes(path: Path) -> int:
     """Return the free bytes on the disk of a path, which need not exist."""
     path = path.absolute()
@@ -110,8 +117,8 @@ def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost names the output; the size
-    is that of the outermost block that has one. Other errors of the system get the name if they have none, or a hidden
-    one.
+    is that of the outermost block that has one. Other system errors get the name ``path`` if they name no file, or a
+    hidden one.
     """
     try:
         yield
@@ -139,8 +146,8 @@ def _is_full_disk(error: Exception) -> bool:
 def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
     """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
 
-    A full disk is reported with the space that is free without the part that did fit, and the ``size`` in bytes. With
-    ``follow``, a symbolic link stays, and the file that it leads to is written.
+    A full disk is reported with ``size`` in bytes, and with the space that is free once the incomplete file is deleted.
+    With ``follow``, a symbolic link stays, and the file that it leads to is written.
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)

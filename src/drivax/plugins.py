@@ -25,7 +25,7 @@ from drivax.errors import UsageError, did_you_mean
 _FORM = re.compile(r"(?!zoo:)[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 #: First arguments of reward terms and of features.
 _TERM_ARGUMENTS = (("before", "now", "around"), ("bank", "context", "frames"))
-#: Packages that were found in the current folder; their other modules may import their neighbours too.
+#: Packages that are not on Python's path: the current folder is searched for their modules and what these import.
 _local_packages: set[str] = set()
 
 
@@ -147,7 +147,7 @@ def dotted_name(thing: Any) -> str:
 
 
 def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
-    """Check that a callable accepts positional arguments of these types; those of drivax's terms must be the same.
+    """Check that a callable accepts as many positional arguments; a term of drivax must annotate them with these types.
 
     Raises:
         ValueError: The signature differs or, as of some builtins, is unknown.
@@ -180,7 +180,7 @@ def result_class(function: Any) -> type | None:
     if isinstance(function, type):
         return function
     if isinstance(function, BuiltinFunctionType):
-        return type(None)
+        return type(None)  # no builtin function makes a component
     try:
         result = typing.get_type_hints(function).get("return")
     except Exception:  # evaluating an annotation may raise any error
@@ -213,6 +213,7 @@ def _check_method(thing: Any, name: str, member: str, expected: Any) -> None:
     method = getattr(thing, member, None)
     if not inspect.isfunction(expected) or not callable(method):
         return
+    # A method of an object has its `self` already.
     arguments = tuple(inspect.signature(expected).parameters)[not isinstance(thing, type) :]
     signature = _signature(method)
     has_names = signature is not None and tuple(signature.parameters)[: len(arguments)] == arguments

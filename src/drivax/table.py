@@ -146,7 +146,10 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
-        """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
+        """Return one line per number: labels, ``across`` unless it is ``metric``, metric, mean, low, high, n.
+
+        Undefined numbers are empty.
+        """
         labels = [i for i, column in enumerate(self.columns) if column.label and column.key != "metric"]
         keys = [self.columns[i].key or self.columns[i].heading for i in labels]
         keys += [] if self.across == "metric" else [self.across]
@@ -189,7 +192,8 @@ def interval_cell(
 def number(value: float | None, unit: str, signed: bool = False) -> str:
     """Format a number for tables, with a plus sign if ``signed``.
 
-    The unit is ``rate`` (percent, one digit), ``share`` (three digits), or a physical unit (three figures).
+    The unit is ``rate`` (percent, one decimal), ``share`` (three decimals), or a physical unit (two decimals below 10,
+    one below 1,000, then none).
     """
     if value is None:
         return MISSING
@@ -212,7 +216,10 @@ def suffix(unit: str, signed: bool = False) -> str:
 
 
 def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
-    """Format an interval as ``low–high``, or as ``low to high`` if the dash could be read as a sign."""
+    """Format an interval as ``low–high``, or as ``low to high`` if the dash could be read as a sign.
+
+    An interval without width is ``all equal``, and a mean without bounds has ``no interval``.
+    """
     if interval.low is None or interval.high is None:
         return "no interval" if interval.n else ""
     if interval.low == interval.high:

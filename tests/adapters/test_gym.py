@@ -70,7 +70,7 @@ def test_environment_ids_are_registered(name):
 
 @pytest.mark.slow
 def test_environments_by_id(data):
-    """On scenarios of the built-in world where none are given; Gymnasium's own wrappers check every call."""
+    """On loaded data, and on two scenarios of the built-in world; Gymnasium's own wrappers check every call."""
     made = gymnasium.make("drivax/minimal-v0", data=data).unwrapped
     assert made.observation_space == DrivingEnv(data, TASKS["minimal"]).observation_space
     env = gymnasium.make("drivax/minimal-v0", data=data, task=SMALL)

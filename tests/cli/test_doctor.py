@@ -41,7 +41,7 @@ def sample(name: str, folder: Path) -> Path:
 
 
 def asked(path: Path, capsys) -> tuple[int, str]:
-    """Exit status and what is said, with line breaks taken out."""
+    """Return exit status and output without line breaks."""
     status = main(["doctor", str(path)])
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
@@ -134,7 +134,8 @@ WRONG = {
     "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not a table of annotations", "folder of the log"),
     "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "no ScenarioNet scenario", "sd_*.pkl"),
     "tfrecord-1_1.json": (
-        lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(), "no metadata", "writes metadata"
+        lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(),
+        "without GPUDrive's positions", "GPUDrive's present converter"
     ),
     "log_map_archive_x.json": (lambda: b'{"lane_segments": {}}', "without its recording", "scenario_*.parquet"),
     "notes.json": (lambda: b'{"mine": 1}', "JSON of no data set", "as downloaded"),
@@ -235,6 +236,11 @@ def test_gaps_in_shard_numbers_are_named(numbers, sentence):
 def test_many_gaps_are_counted_only():
     paths = [Path(f"t.tfrecord-{number:05d}-of-00100") for number in range(0, 100, 2)]
     assert gaps(paths) == ["t.tfrecord: 50 of 100 shards"]
+
+
+def test_families_of_one_name_are_named_with_their_folder():
+    paths = [Path(split, "t.tfrecord-00000-of-00001") for split in ("train", "val")]
+    assert gaps(paths) == ["train/t.tfrecord: all 1 shards", "val/t.tfrecord: all 1 shards"]
 
 
 def test_shards_are_grouped_by_folder(tmp_path, capsys):

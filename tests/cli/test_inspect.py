@@ -213,6 +213,11 @@ def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
     assert said in line and len(line.splitlines()) == 1
 
 
+def test_picture_is_no_folder(sets, inspect, tmp_path):
+    line = inspect(sets[0], "--observations", "--draw", tmp_path, "--overwrite", status=2)
+    assert "output is a folder; name a file to write" in line
+
+
 def test_samples_are_evenly_spread(sets, monkeypatch):
     from drivax.report import inspection
     from drivax.scenario.select.selection import Selection

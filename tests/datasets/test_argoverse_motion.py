@@ -13,8 +13,9 @@ import pytest
 from datasets.samples import av2_motion
 from datasets.samples.av2_motion import height, place
 from drivax.datasets.argoverse.motion import ArgoverseMotion, decode
+from drivax.datasets.argoverse.tables import read_table
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.geometry.polylines import project
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.assemble import assemble
@@ -214,6 +215,13 @@ def test_damage_is_one_bad_record_of_one_line(rewritten, problem):
     (bad,) = READER.read(path)
     assert isinstance(bad, BadRecord) and bad.file == path and bad.cure
     assert problem in bad.problem and "\n" not in str(bad.error())
+
+
+def test_a_repeated_column_is_reported_as_such(tmp_path):
+    path = tmp_path / "x.parquet"
+    pq.write_table(pa.Table.from_arrays([pa.array([1]), pa.array([2])], names=["a", "a"]), path)
+    with pytest.raises(DataError, match="has several columns a"):
+        read_table(path, {"a": "number"})
 
 
 def test_a_missing_map_is_named(sample, tmp_path):

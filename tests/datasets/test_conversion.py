@@ -101,6 +101,12 @@ def test_limit(folder, tmp_path, limit, workers, ids):
     assert [entry["scenario_id"] for entry in ScenarioSet.open(tmp_path / "set").entries] == ids
 
 
+def test_duplicates_in_a_file_do_not_count_toward_the_limit(wire, write_records, tmp_path):
+    path = write_records("x.tfrecord", *(wire.scenario(name) for name in ("a", "a", "b", "c")))
+    convert(path, tmp_path / "set", Conversion(limit=2))
+    assert [entry["scenario_id"] for entry in ScenarioSet.open(tmp_path / "set").entries] == ["a", "b"]
+
+
 def test_audit_is_stored_with_its_scenario(folder, tmp_path):
     batches = []
 
@@ -579,6 +585,19 @@ def test_resuming_reports_written_scenarios_and_reads_the_rest(thirty, tmp_path)
     ]
 
 
+def test_conversion_that_stopped_at_its_limit_adds_nothing(thirty, tmp_path):
+    options = Conversion(shard_size=5, limit=10)
+
+    def stop(done, files, scenarios):
+        if scenarios == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(thirty, tmp_path / "set", options, stop)
+    result = convert(thirty, tmp_path / "set", options)
+    assert (result.written, result.scenarios, result.files, ids(tmp_path / "set")) == (10, 10, 2, GOOD[:10])
+
+
 def test_skipped_records_of_an_earlier_run_count_under_strict(thirty, tmp_path):
     def stop(done, files, scenarios):
         if scenarios == 14:
@@ -663,7 +682,7 @@ def test_command_reports_written_and_skipped_records(folder, tmp_path, capsys):
     assert main(["convert", str(folder), str(tmp_path / "set"), "--workers", "1"]) == 0
     out, err = capsys.readouterr()
     announced, done = out.splitlines(keepends=True)
-    # Nine records are counted; which of them can be read shows later.
+    # Eight records are counted; which of them can be read shows later.
     assert announced.startswith("found womd-scenario (3 files): about 8 scenarios, 4.")
     assert done.startswith(f"{tmp_path / 'set'}: 4 scenarios from 3 files in ")
     assert done.endswith("4 records skipped, 1 file of other formats ignored\n")

@@ -11,11 +11,11 @@ from datasets.samples import womd_scenario
 from datasets.test_export_recording import assert_same_map
 from drivax.datasets import gpudrive
 from drivax.datasets.export.recording import restore
-from drivax.datasets.gpudrive import file_name, gpudrive_scene
+from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd import scenario_reader as protos
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
-from scenario.recordings import FAR, driving, make_recording, make_tracks, moved
+from scenario.recordings import FAR, driving, light, make_recording, make_tracks, moved
 
 
 @pytest.fixture(scope="module")
@@ -24,34 +24,34 @@ def source():
 
 
 @pytest.fixture(scope="module")
-def scene(source):
-    """The scene after a round trip through strict JSON text."""
-    text = json.dumps(gpudrive_scene(assemble(source), "x.json"), allow_nan=False)
+def content(source):
+    """The content of the file after a round trip through strict JSON text."""
+    text = json.dumps(gpudrive_content(assemble(source), "x.json"), allow_nan=False)
     return json.loads(text)
 
 
-def test_keys_are_those_of_the_published_files(scene):
-    assert list(scene) == ["name", "scenario_id", "objects", "roads", "tl_states", "metadata"]
-    assert set(scene["metadata"]) == {"sdc_track_index", "objects_of_interest", "tracks_to_predict"}
-    for thing in scene["objects"]:
+def test_keys_are_those_of_the_published_files(content):
+    assert list(content) == ["name", "scenario_id", "objects", "roads", "tl_states", "metadata"]
+    assert set(content["metadata"]) == {"sdc_track_index", "objects_of_interest", "tracks_to_predict"}
+    for thing in content["objects"]:
         assert set(thing) == {
             "position", "width", "length", "height", "heading", "velocity", "valid", "goalPosition", "type", "id",
             "mark_as_expert",
         }  # fmt: skip
-    for road in scene["roads"]:
+    for road in content["roads"]:
         assert set(road) == {"geometry", "type", "map_element_id", "id"}
-    assert (scene["name"], scene["scenario_id"]) == ("x.json", "0123456789abcdef")
+    assert (content["name"], content["scenario_id"]) == ("x.json", "0123456789abcdef")
 
 
-def test_objects(scene, source):
-    assert [thing["id"] for thing in scene["objects"]] == [17, 900, 2406]  # the ego last
-    assert [thing["type"] for thing in scene["objects"]] == ["cyclist", "pedestrian", "vehicle"]
-    assert scene["metadata"] == {
+def test_objects(content, source):
+    assert [thing["id"] for thing in content["objects"]] == [17, 900, 2406]  # the ego last
+    assert [thing["type"] for thing in content["objects"]] == ["cyclist", "pedestrian", "vehicle"]
+    assert content["metadata"] == {
         "sdc_track_index": 2,
         "objects_of_interest": [2406, 17],
         "tracks_to_predict": [{"track_index": 0, "difficulty": 0}],
     }
-    bike, track = scene["objects"][0], source.tracks
+    bike, track = content["objects"][0], source.tracks
     assert bike["valid"] == track.valid[1].tolist()
     for step in (0, 1, 2, 59, 60):
         x, y = track.xy[1, step] if track.valid[1, step] else (-10_000.0, -10_000.0)
@@ -64,19 +64,26 @@ def test_objects(scene, source):
     assert bike["goalPosition"]["x"] == pytest.approx(track.xy[1, last, 0], abs=1e-4)
 
 
-def test_roads_and_lights(scene):
-    codes = {road["id"]: (road["type"], road["map_element_id"]) for road in scene["roads"]}
+def test_roads_and_lights(content):
+    codes = {road["id"]: (road["type"], road["map_element_id"]) for road in content["roads"]}
     assert codes[1] == ("lane", 2) and codes[4] == ("lane", 1) and codes[5] == ("road_line", 6)
     assert codes[7] == ("road_edge", 15) and codes[8] == ("road_edge", 16)
     assert (
         codes[10] == ("crosswalk", 18) and codes[11] == ("speed_bump", 19) and codes[12] == ("driveway", 20)
     )
-    assert len(codes) == len(scene["roads"]) == 11  # ids are unique
-    assert scene["tl_states"].keys() == {"2", "4"}
-    light = scene["tl_states"]["4"]
-    assert light["time_index"] == list(range(20, 91)) and set(light["state"]) == {"arrow_stop"}
-    assert light["x"] == [pytest.approx(womd_scenario.X0 - 60, abs=1e-3)] * 71
-    assert scene["tl_states"]["2"]["state"] == ["stop"] * 50 + ["go"] * 41
+    assert len(codes) == len(content["roads"]) == 11  # ids are unique
+    assert content["tl_states"].keys() == {"2", "4"}
+    states = content["tl_states"]["4"]
+    assert states["time_index"] == list(range(20, 91)) and set(states["state"]) == {"arrow_stop"}
+    assert states["x"] == [pytest.approx(womd_scenario.X0 - 60, abs=1e-3)] * 71
+    assert content["tl_states"]["2"]["state"] == ["stop"] * 50 + ["go"] * 41
+
+
+def test_of_two_lights_of_a_lane_the_nearest_to_the_log_is_written():
+    lights = light(1, 120.0, 0.0, [6] * 91), light(1, 50.0, 0.0, [4] * 91)
+    stored = assemble(make_recording(lights=lights))
+    assert [one.lane_id for one in restore(stored).lights] == [1, 1]
+    assert gpudrive_content(stored, "x.json")["tl_states"]["1"]["state"] == ["stop"] * 91
 
 
 def test_file_names_have_the_prefix_that_the_loader_expects():
@@ -85,7 +92,7 @@ def test_file_names_have_the_prefix_that_the_loader_expects():
 
 def round_trip(recording):
     stored = assemble(recording)
-    back = gpudrive.decode(json.loads(json.dumps(gpudrive_scene(stored, "x.json"))))
+    back = gpudrive.decode(json.loads(json.dumps(gpudrive_content(stored, "x.json"))))
     kept = restore(stored)
     rows = [kept.tracks.track_id.tolist().index(number) for number in back.tracks.track_id]
     assert sorted(rows) == list(range(len(kept.tracks.kind)))

@@ -432,7 +432,7 @@ def test_dense_map_is_sampled_more_sparsely_and_not_cut_off():
 def round_trip(recording, tolerance_m: float = 1e-3):
     stored = assemble(recording)
     payload = example(tf_example(stored)[0])
-    assert womd.flavour(payload) == womd.EXAMPLE_FORMAT  # not taken for ScenarioMax's
+    assert womd.format_of(payload) == womd.EXAMPLE_FORMAT  # not taken for ScenarioMax's
     back = womd_example.WomdExample().decode(payload)
     kept = restore(stored)
     rows = [kept.tracks.track_id.tolist().index(number) for number in back.tracks.track_id]
@@ -468,7 +468,7 @@ def test_round_trip(source):
     assert again.overflow == stored.overflow
 
 
-def test_round_trip_of_a_real_scene(real_data):
+def test_round_trip_of_a_real_scenario(real_data):
     """And against the proto itself: moving agents to a millimetre, parked ones within the 0.3 m of their one pose."""
     (source,) = protos.WomdScenario().read(real_data / "womd" / "motion_data_one_scenario.tfrecord")
     stored, back = round_trip(source)

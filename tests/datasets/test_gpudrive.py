@@ -19,8 +19,8 @@ from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind
 
 
 @pytest.fixture
-def scene():
-    return sample.scene()
+def content():
+    return sample.content()
 
 
 def read(path) -> Recording:
@@ -51,24 +51,24 @@ def test_tracks(tmp_path):
     assert recording.current_step == 10
 
 
-def test_item_1_headings_are_wrapped(scene):
-    scene["objects"][3]["heading"] = [7 * math.pi / 2] * 91
-    np.testing.assert_allclose(decode(scene).tracks.heading[3], -math.pi / 2)
+def test_item_1_headings_are_wrapped(content):
+    content["objects"][3]["heading"] = [7 * math.pi / 2] * 91
+    np.testing.assert_allclose(decode(content).tracks.heading[3], -math.pi / 2)
 
 
-def test_item_4_invalid_steps_stay_empty(scene):
-    tracks = decode(scene).tracks
+def test_item_4_invalid_steps_stay_empty(content):
+    tracks = decode(content).tracks
     for values in (tracks.xy, tracks.z, tracks.heading, tracks.velocity, tracks.size):
         assert not values[~tracks.valid].any()  # -10000 in the file
 
 
-def test_steps_without_a_position_are_invalid(scene):
-    scene["objects"][0]["valid"] = [True] * 91
-    assert not decode(scene).tracks.valid[0, 30:36].any()
+def test_steps_without_a_position_are_invalid(content):
+    content["objects"][0]["valid"] = [True] * 91
+    assert not decode(content).tracks.valid[0, 30:36].any()
 
 
-def test_item_19_ego_and_marks_rows_versus_ids(scene):
-    recording = decode(scene)
+def test_item_19_ego_and_marks_rows_versus_ids(content):
+    recording = decode(content)
     assert recording.ego == 3
     assert recording.to_predict == (0,)  # rows in the file
     assert recording.of_interest == (2, 3)  # ids 41 and 2406 in the file
@@ -76,8 +76,8 @@ def test_item_19_ego_and_marks_rows_versus_ids(scene):
     assert stored.agent_id[0] == 2406
 
 
-def test_roads(scene):
-    recording = decode(scene)
+def test_roads(content):
+    recording = decode(content)
     kinds = {feature.feature_id: feature.kind for feature in recording.features}
     assert kinds == {
         1: RoadKind.LANE_SURFACE, 2: RoadKind.LANE_SURFACE, 5: RoadKind.LANE_FREEWAY,
@@ -99,21 +99,21 @@ def test_roads(scene):
         ("2", "road_line", RoadKind.LINE_UNKNOWN),
     ],
 )
-def test_road_codes(scene, code, word, kind):
-    scene["roads"][0] |= {"map_element_id": code, "type": word}
-    assert decode(scene).features[0].kind == kind
+def test_road_codes(content, code, word, kind):
+    content["roads"][0] |= {"map_element_id": code, "type": word}
+    assert decode(content).features[0].kind == kind
 
 
-def test_unknown_and_one_point_roads_are_counted(scene):
-    scene["roads"][0] |= {"map_element_id": 99, "type": "runway"}
-    scene["roads"][3]["geometry"] = scene["roads"][3]["geometry"][:1]
-    recording = decode(scene)
+def test_unknown_and_one_point_roads_are_counted(content):
+    content["roads"][0] |= {"map_element_id": 99, "type": "runway"}
+    content["roads"][3]["geometry"] = content["roads"][3]["geometry"][:1]
+    recording = decode(content)
     assert recording.lost == {"unknown_roads": 1, "one_point_features": 1}
     assert len(recording.features) == 9
 
 
-def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(scene):
-    stored = assemble(decode(scene))
+def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(content):
+    stored = assemble(decode(content))
     lanes = stored.lane_id.tolist()
     first, second = lanes.index(1), lanes.index(2)
     assert stored.lane_successor[first].tolist() == [second, -1, -1, -1]
@@ -121,21 +121,21 @@ def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(scene):
     assert Flag.SPEED_LIMITS not in stored.has
 
 
-def test_item_5_jumps_split_dense_polylines_only(scene):
-    edge = scene["roads"][4]["geometry"]
+def test_item_5_jumps_split_dense_polylines_only(content):
+    edge = content["roads"][4]["geometry"]
     del edge[40:60]
-    assert decode(scene).split_gap_m == 1.0
-    assert 8 not in assemble(decode(scene)).feature_id[assemble(decode(scene)).feature_closed]
-    assert (assemble(decode(scene)).feature_id == 8).sum() == 2
-    for road in scene["roads"][:6]:
+    assert decode(content).split_gap_m == 1.0
+    assert 8 not in assemble(decode(content)).feature_id[assemble(decode(content)).feature_closed]
+    assert (assemble(decode(content)).feature_id == 8).sum() == 2
+    for road in content["roads"][:6]:
         road["geometry"] = road["geometry"][::8]
-    assert decode(scene).split_gap_m is None  # points 4 m apart are thinned lines, not jumps
-    assert (assemble(decode(scene)).feature_id == 8).sum() == 1
+    assert decode(content).split_gap_m is None  # points 4 m apart are thinned lines, not jumps
+    assert (assemble(decode(content)).feature_id == 8).sum() == 1
 
 
-def test_item_3_implausible_sizes_are_those_of_the_class(scene):
-    scene["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
-    stored = assemble(decode(scene))
+def test_item_3_implausible_sizes_are_those_of_the_class(content):
+    content["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
+    stored = assemble(decode(content))
     row = stored.agent_id.tolist().index(78)
     np.testing.assert_allclose(stored.agent_size[row], (4.1, 1.9, 1.6))
     assert Flag.DEFAULT_SIZES in stored.has
@@ -143,50 +143,50 @@ def test_item_3_implausible_sizes_are_those_of_the_class(scene):
 
 
 @pytest.mark.parametrize("value", [0, -4.5, 1e6, 1e-9, math.nan, math.inf])
-def test_item_3_implausible_sizes_are_counted(scene, value):
-    assert "implausible_sizes" not in decode(scene).lost
-    scene["objects"][0]["width"] = scene["objects"][2]["length"] = value
-    recording = decode(scene)
+def test_item_3_implausible_sizes_are_counted(content, value):
+    assert "implausible_sizes" not in decode(content).lost
+    content["objects"][0]["width"] = content["objects"][2]["length"] = value
+    recording = decode(content)
     assert recording.lost["implausible_sizes"] == 2
     assert not recording.tracks.size[0, :, 1].any() and not recording.tracks.size[2, :, 0].any()
-    for row in scene["objects"]:
+    for row in content["objects"]:
         del row["height"]  # absent in other converters' files, which is no loss
-    assert decode(scene).lost["implausible_sizes"] == 2
+    assert decode(content).lost["implausible_sizes"] == 2
 
 
-def test_lights_as_the_converter_writes_them(scene):
+def test_lights_as_the_converter_writes_them(content):
     place = {"x": [1.0] * 3, "y": [2.0] * 3, "z": [3.0] * 3}
-    scene["tl_states"] = {"2": {"state": ["stop", "arrow_go", 99], "time_index": [0, 5, 6], **place}}
-    (light,) = decode(scene).lights
+    content["tl_states"] = {"2": {"state": ["stop", "arrow_go", 99], "time_index": [0, 5, 6], **place}}
+    (light,) = decode(content).lights
     assert light.lane_id == 2 and light.stop_point.tolist() == [1.0, 2.0, 3.0]
     assert light.states[[0, 1, 5, 6]].tolist() == [
         LightState.STOP, LightState.UNOBSERVED, LightState.ARROW_GO, LightState.UNKNOWN
     ]  # fmt: skip
 
 
-def test_lights_at_zeros_stand_where_their_lane_begins(scene):
-    lane = next(road["id"] for road in scene["roads"] if road["type"] == "lane")
+def test_lights_at_zeros_stand_where_their_lane_begins(content):
+    lane = next(road["id"] for road in content["roads"] if road["type"] == "lane")
     seen = {"state": ["stop"], "time_index": [0], **{axis: [0.0] for axis in "xyz"}}
-    scene["tl_states"] = {str(lane): seen, "99999": seen}
-    recording = decode(scene)
+    content["tl_states"] = {str(lane): seen, "99999": seen}
+    recording = decode(content)
     (light,) = recording.lights
     (start,) = (f.points[0] for f in recording.features if f.feature_id == lane)
     np.testing.assert_array_equal(light.stop_point, start)
     assert recording.lost["lights_without_place"] == 1
 
 
-def test_heights_may_be_missing_and_unknown_fields_are_counted(scene):
+def test_heights_may_be_missing_and_unknown_fields_are_counted(content):
     """Converters of flat data sets leave out z and the height of boxes."""
-    before = decode(copy.deepcopy(scene))
-    for row in scene["objects"]:
+    before = decode(copy.deepcopy(content))
+    for row in content["objects"]:
         del row["height"]
         row["yaw_rate"] = [0.0] * 91
         for point in row["position"]:
             point.pop("z", None)  # points may be shared
-    for road in scene["roads"]:
+    for road in content["roads"]:
         for point in road["geometry"]:
             point.pop("z", None)  # points may be shared
-    after = decode(scene)
+    after = decode(content)
     np.testing.assert_array_equal(after.tracks.xy, before.tracks.xy)
     np.testing.assert_array_equal(after.tracks.size[..., :2], before.tracks.size[..., :2])
     assert not after.tracks.size[..., 2].any() and not after.tracks.z.any()
@@ -194,17 +194,17 @@ def test_heights_may_be_missing_and_unknown_fields_are_counted(scene):
     assert after.lost == before.lost | {"unknown_fields": 1}
 
 
-def test_ids_are_numbered_where_the_file_has_none(scene):
-    for row in (*scene["objects"], *scene["roads"]):
+def test_ids_are_numbered_where_the_file_has_none(content):
+    for row in (*content["objects"], *content["roads"]):
         del row["id"]
-    recording = decode(scene)
+    recording = decode(content)
     assert recording.tracks.track_id.tolist() == [0, 1, 2, 3]
     assert [feature.feature_id for feature in recording.features] == list(range(10))
 
 
-def broken(scene, *path, value):
+def broken(content, *path, value):
     *outer, last = path
-    place = scene
+    place = content
     for key in outer:
         place = place[key]
     place[last] = value
@@ -242,13 +242,18 @@ def broken(scene, *path, value):
         (("tl_states",), [1], "not a dictionary"),
         (("tl_states",), {"x": {}}, "not an id"),
         (("tl_states",), {"1": {"state": []}}, "no lists"),
+        (
+            ("tl_states",),
+            {"1": {"state": ["go"], "time_index": [91], "x": [0], "y": [0], "z": [0]}},
+            "names step 91, there are 91",
+        ),
     ],
 )
 def test_contradictions_are_refused_in_one_line(tmp_path, path, value, said):
-    scene = sample.scene()
-    broken(scene, *path, value=value)
+    content = sample.content()
+    broken(content, *path, value=value)
     file = tmp_path / "tfrecord-00000-of-00001_0.json"
-    file.write_text(json.dumps(scene))
+    file.write_text(json.dumps(content))
     (bad,) = GpuDrive().read(file)
     assert isinstance(bad, BadRecord) and said in bad.problem, bad
     assert bad.file == file and bad.cure
@@ -273,10 +278,10 @@ def test_missing_and_oversized_files(tmp_path):
     assert "has 300 MB, more than the 67 MB" in bad.problem
 
 
-def test_recognises_by_content(tmp_path, scene):
+def test_recognises_by_content(tmp_path, content):
     assert GpuDrive().recognise(sample.write(tmp_path))
     roads_first = tmp_path / "b.json"
-    roads_first.write_text(json.dumps({"roads": scene["roads"], **scene}))
+    roads_first.write_text(json.dumps({"roads": content["roads"], **content}))
     assert GpuDrive().recognise(roads_first)
     other = tmp_path / "log_map_archive.json"
     other.write_text(json.dumps({"drivable_areas": {}, "lane_segments": {}, "pedestrian_crossings": {}}))

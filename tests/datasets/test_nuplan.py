@@ -224,7 +224,7 @@ def test_boxes_without_a_track_are_counted(tmp_path):
     change(path, "DELETE FROM track WHERE token = ?", sample.token("track", 0))
     (recording,) = read(path)
     assert recording.lost == {"boxes_without_track": 96}
-    assert 1 not in recording.tracks.track_id[1:] or len(recording.tracks.track_id) == 12
+    assert recording.tracks.track_id.tolist() == list(range(12))
 
 
 def test_tables_columns_and_layers_of_unknown_names_are_counted(tmp_path):
@@ -357,6 +357,12 @@ def test_every_window_belongs_to_one_scene(lengths, gaps, future):
     for piece in cut:
         assert len(piece.sweeps) <= 400 + future + 10
         assert np.isin(line.time_us[piece.sweeps[1:]] - line.time_us[piece.sweeps[:-1]], 100_000).all()
+
+
+def test_scenes_without_a_token_have_different_names():
+    line = time_line([0] * 300 + [1] * 300)
+    line = replace(line, scenes=tuple(str(scene) for scene in line.scenes))
+    assert [piece.name for piece in pieces(line)] == ["no-scene", "no-scene.2"]
 
 
 def test_short_logs_are_one_recording_without_a_future(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
-from drivax.datasets.womd.records import flavour
+from drivax.datasets.womd.records import format_of
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
@@ -53,13 +53,13 @@ def signs(wire) -> dict[str, dict[str, bytes]]:
 
 @pytest.mark.parametrize("sign", ["difficulty", "times", "numbering", "ego", "damage"])
 def test_one_sign_may_be_missing(wire, sign):
-    assert flavour(wire.scenariomax(**signs(wire)[sign])) == "scenariomax"
+    assert format_of(wire.scenariomax(**signs(wire)[sign])) == "scenariomax"
 
 
 @pytest.mark.parametrize("pair", [("difficulty", "times"), ("times", "numbering"), ("difficulty", "ego")])
 def test_two_missing_signs_make_it_womds(wire, pair):
     changes = {name: value for sign in pair for name, value in signs(wire)[sign].items()}
-    assert flavour(wire.scenariomax(**changes)) == "womd-example"
+    assert format_of(wire.scenariomax(**changes)) == "womd-example"
 
 
 def test_one_sign_does_not_make_womds_a_scenariomax(wire):
@@ -70,10 +70,10 @@ def test_one_sign_does_not_make_womds_a_scenariomax(wire):
     }
     untimed = {"state/current/timestamp_micros": wire.integers([-1] * 6)}
     for changes in (renumbered, untimed, {"state/difficulty_level": None}):
-        assert flavour(wire.example(**changes)) == "womd-example"
+        assert format_of(wire.example(**changes)) == "womd-example"
 
 
-def test_other_flavours_name_the_cure(wire, write_records):
+def test_other_formats_name_the_cure(wire, write_records):
     with pytest.raises(DataError, match="use --format womd-example"):
         ScenarioMax().describe(write_records("a", wire.example(**{"state/type": None})))
     (bad,) = ScenarioMax().read(write_records("b", wire.scenario()))
@@ -185,9 +185,9 @@ def test_describe_and_count(wire, write_records):
     reader = ScenarioMax()
     assert isinstance(reader, Reader) and reader.companions == ()
     path = write_records("a.tfrecord", wire.scenariomax(), wire.scenariomax("two"))
-    told = reader.describe(path)
-    assert (told.recordings, reader.count(path), told.dataset) == (2, 2, "ScenarioMax")
-    notes = " ".join(told.notes)
+    description = reader.describe(path)
+    assert (description.recordings, reader.count(path), description.dataset) == (2, 2, "ScenarioMax")
+    notes = " ".join(description.notes)
     assert "which data set" in notes and "2 lanes have a speed limit" in notes and "path_samples" in notes
     assert [r.scenario_id for r in reader.read(path)] == ["sm_0001", "two"]
 

@@ -434,10 +434,11 @@ def test_7_edges_of_metadrive_turn_to_their_lanes():
     x = np.arange(0.0, 50.0)
     lane = np.stack((x, np.zeros(50), np.zeros(50)), axis=1)
     right, left, far = lane - (0, 2, 0), lane + (0, 2, 0), lane + (0, 500, 0)  # noqa: RUF005
-    turned = orient_edges([right, left, far], [lane])
+    turned = orient_edges([right, left, far, left[:1]], [lane])
     np.testing.assert_array_equal(turned[0], right)
     np.testing.assert_array_equal(turned[1], left[::-1])
     np.testing.assert_array_equal(turned[2], far)
+    np.testing.assert_array_equal(turned[3], left[:1])
 
 
 def test_7_edges_of_womd_are_not_turned(tree):
@@ -467,9 +468,7 @@ def test_reader_recognises_counts_reads_and_describes(tree, tmp_path):
     assert described.dataset == "Waymo Open Motion Dataset, by ScenarioNet"
     assert (described.version, described.recordings, described.notes) == ("v1.2", 1, ())
     scenario = assemble(recording)
-    assert {Flag.LIGHTS, Flag.LANE_GRAPH, Flag.SPEED_LIMITS, Flag.ELEVATION} <= set(scenario.has) | {
-        Flag.ELEVATION
-    }
+    assert {Flag.LIGHTS, Flag.LANE_GRAPH, Flag.SPEED_LIMITS} <= set(scenario.has)
     assert not scenario.has & (Flag.CHAINED_GRAPH | Flag.NO_FUTURE)
 
 

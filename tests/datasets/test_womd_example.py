@@ -220,7 +220,7 @@ def test_mutated_payloads_never_crash(wire):
     assert outcomes == {Recording, DataError}
 
 
-def test_other_flavour_names_the_cure(wire, write_records):
+def test_other_format_names_the_cure(wire, write_records):
     (bad,) = WomdExample().read(write_records("a.tfrecord", wire.scenario()))
     assert bad.error().cure == "use --format womd-scenario" and "Scenario protos" in bad.problem
 
@@ -229,11 +229,17 @@ def test_describe_and_count(wire, write_records):
     reader = WomdExample()
     assert isinstance(reader, Reader) and reader.companions == ("export.json",)
     path = write_records("a", *(wire.example(str(i)) for i in range(3)))
-    told = reader.describe(path)
-    assert (told.recordings, reader.count(path), told.version) == (3, 3, "1.2 or later")  # points 1 m apart
-    assert [note for note in told.notes if "path_samples" in note] and "cut off" not in str(told.notes)
-    told = reader.describe(write_records("b", wire.example(full=True, spacing=0.5)))
-    assert told.version == "1.0 or 1.1" and "cut off" in str(told.notes)
+    description = reader.describe(path)
+    assert (description.recordings, reader.count(path), description.version) == (
+        3,
+        3,
+        "1.2 or later",
+    )  # points 1 m apart
+    assert [note for note in description.notes if "path_samples" in note] and "cut off" not in str(
+        description.notes
+    )
+    description = reader.describe(write_records("b", wire.example(full=True, spacing=0.5)))
+    assert description.version == "1.0 or 1.1" and "cut off" in str(description.notes)
     with pytest.raises(DataError, match="use --format womd-scenario"):
         reader.describe(write_records("c", wire.scenario()))
     assert reader.count(write_records("d", wire.scenario())) == 0

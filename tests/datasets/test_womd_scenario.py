@@ -56,7 +56,7 @@ def test_fields_of_unknown_numbers_are_counted(wire, recording):
     lane = wire.lane(wire.line(0.0, stop=40.0)) + extent + boundary
     state = wire.state(wire.X0, wire.Y0, 30.5, 5.0, 2.0, 1.7, 0.0, 10.0, 0.0)
 
-    def scene(*more, lane=lane, state=state):
+    def lost(*more, lane=lane, state=state):
         track = wire.blob(2, wire.track(7, 1, [state] * wire.STEPS) + b"".join(more))
         return decode(
             wire.scenario(
@@ -64,10 +64,10 @@ def test_fields_of_unknown_numbers_are_counted(wire, recording):
             )
         ).lost
 
-    assert "unknown_fields" not in recording.lost and "unknown_fields" not in scene()
-    assert scene(wire.double(9, 1.0), wire.double(9, 2.0))["unknown_fields"] == 1
-    assert scene(lane=lane + wire.double(20, 3.5))["unknown_fields"] == 1
-    assert scene(state=state + wire.single(12, 0.1) + wire.single(13, 0.1))["unknown_fields"] == 2
+    assert "unknown_fields" not in recording.lost and "unknown_fields" not in lost()
+    assert lost(wire.double(9, 1.0), wire.double(9, 2.0))["unknown_fields"] == 1
+    assert lost(lane=lane + wire.double(20, 3.5))["unknown_fields"] == 1
+    assert lost(state=state + wire.single(12, 0.1) + wire.single(13, 0.1))["unknown_fields"] == 2
 
 
 def test_rows_are_rows_and_ids_are_ids(recording):
@@ -395,7 +395,7 @@ def test_mutated_payloads_never_crash(wire):
     assert outcomes == {Recording, DataError}
 
 
-def test_other_flavour_names_the_cure(wire, write_records):
+def test_other_format_names_the_cure(wire, write_records):
     path = write_records("a.tfrecord", wire.example())
     (bad,) = WomdScenario().read(path)
     assert bad.error().cure == "use --format womd-example" and "tf.Examples" in bad.problem
@@ -413,15 +413,23 @@ def test_describe_and_count(wire, write_records):
     reader = WomdScenario()
     assert isinstance(reader, Reader) and reader.companions == ()
     path = write_records("a.tfrecord", *(wire.scenario(str(i)) for i in range(3)))
-    told = reader.describe(path)
-    assert (told.recordings, reader.count(path), told.version) == (3, 3, "1.2 or later")  # it has a driveway
-    assert told.notes == ("91 steps, current step 10",)
+    description = reader.describe(path)
+    assert (description.recordings, reader.count(path), description.version) == (
+        3,
+        3,
+        "1.2 or later",
+    )  # it has a driveway
+    assert description.notes == ("91 steps, current step 10",)
     early = [f for f in wire.features() if f[2:3] != b"\x52"]  # field 10 of a map feature is a driveway
     unlinked = wire.scenario(map=wire.blob(8, wire.feature(1, 3, wire.lane(wire.line(0.0)))), lights=b"")
     older = wire.scenario(map=b"".join(wire.blob(8, f) for f in early))
     assert reader.describe(write_records("b", older)).version == "1.1 or later"
-    told = reader.describe(write_records("c", unlinked))
-    assert told.version is None and len(told.notes) == 3 and "no lane graph" in told.notes[2]
+    description = reader.describe(write_records("c", unlinked))
+    assert (
+        description.version is None
+        and len(description.notes) == 3
+        and "no lane graph" in description.notes[2]
+    )
     assert "fewer than 31 steps" in reader.describe(write_records("d", wire.scenario(steps=11))).notes[1]
     assert "3 windows" in reader.describe(write_records("e", wire.scenario(steps=199))).notes[1]
     (recording,) = reader.read(write_records("f", wire.scenario()))

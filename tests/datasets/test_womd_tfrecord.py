@@ -49,11 +49,11 @@ def test_reads_records_with_numbers(good, read):
     assert records == list(enumerate(PAYLOADS))
 
 
-def test_every_flipped_bit_is_noticed(good, read, wire):
+def test_a_flipped_bit_of_any_byte_is_noticed(good, read, wire):
     starts = [0]
     for payload in PAYLOADS:
         starts.append(starts[-1] + len(wire.frame(payload)))
-    for position in range(len(good) - 200):
+    for position in range(len(good)):
         data = bytearray(good)
         data[position] ^= 1 << position % 8
         records, path = read(bytes(data))

@@ -126,7 +126,7 @@ def test_lets_an_agent_change_into_its_lane():
 
 
 def test_does_not_cross_just_before_an_agent_that_may_come_early():
-    """Ego's rear leaves the other's path after 2.9 s; at 8 m/s its front is then 3.3 - 2.4 = 0.9 m before ego's."""
+    """Ego crosses in 2.9 s; the front of the other is then 3.3 - 2.4 = 0.9 m before the middle of ego's path."""
     crossing = partial(car, 30, heading=np.pi / 2, speed=8)
     throttle, _ = action(straight_road([car(0, 0, 0, 10), crossing(-2.9 * 8 - 3.3)]))
     assert throttle < -0.1

@@ -1,4 +1,4 @@
-"""Learns on one device and on several, in a process that simulates four: run by ``test_devices.py``."""
+"""Train on one device and on several, in a process that simulates four: run by ``test_devices.py``."""
 
 import shutil
 import sys
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from test_resume import ALGORITHMS, SHOWN, TINY
+from test_resume import ALGORITHMS, SHOWN
 
 from drivax.errors import UsageError
 from drivax.learning.algorithms.iql import IqlConfig
@@ -31,8 +31,9 @@ from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows
 from pendulum import Pendulum
+from tiny_algorithms import TINY
 
-SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
+OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
 
 
 def problem(name):
@@ -41,7 +42,7 @@ def problem(name):
         return ALGORITHMS[name].build(Pendulum(), SHOWN, 6), SHOWN
     capacity = CAPACITIES["default"].with_egos(3)
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0), capacity)])
-    environment = Driving(Simulator(Task(observation=SEEN, metrics=("steps",))), latest_start=60)
+    environment = Driving(Simulator(Task(observation=OBSERVATION, metrics=("steps",))), latest_start=60)
     if name == "driving_self_ppo":
         group = SelfPlay(environment.simulator, latest_start=60, config=SelfPlayConfig(2, past=1.0))
         mixture = Mixture((("log", environment), ("self", group)), (0.5, 0.5))
@@ -75,8 +76,8 @@ def same(one, other):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), one, other)
 
 
-def divides(learner, data, counts):
-    """The result of one device, by several that hold their share of the environments and of the replay."""
+def check_environments(learner, data, counts):
+    """Return the result of one device, after the same of several with their share of environments and replay buffer."""
     one, whole, sizes = run(learner, data, (3,), 1)
     for devices in counts:
         several, shards, parts = run(learner, data, (3,), devices)
@@ -89,8 +90,8 @@ def divides(learner, data, counts):
     return one
 
 
-def divides_agents(learner, data, one):
-    """Two agents on two devices, one each: the first learns what it learns alone, the second something else."""
+def check_seeds(learner, data, one):
+    """Two seeds on two devices, one each: the first learns what it learns alone, the second something else."""
     pair, shards, _ = run(learner, data, (3, 4), 2)
     first, second = (Seeds(learner, (3, 4)).member(pair, number) for number in (0, 1))
     same(one, first)
@@ -99,7 +100,7 @@ def divides_agents(learner, data, one):
     assert shards["over"] == (1, 4), shards
 
 
-def refuses(learner, data, devices, words):
+def check_refused(learner, data, devices, words):
     try:
         Program(Seeds(learner, (3,)), data, devices)
     except UsageError as error:
@@ -108,8 +109,8 @@ def refuses(learner, data, devices, words):
         raise AssertionError(f"{devices} devices")
 
 
-def divides_batches(learner, data):
-    """No environments: every device has the whole state, and its share of the work."""
+def check_batches(learner, data):
+    """Without environments, every device has the whole state, and its share of the work."""
     one, _, _ = run(learner, data, (3,), 1)
     work = []
     for devices in (2, None):
@@ -119,14 +120,14 @@ def divides_batches(learner, data):
         program = Program(Seeds(learner, (3,)), data, devices)
         work.append(program.compiled.cost_analysis()["flops"])
     assert work[1] < 0.6 * work[0], work
-    refuses(learner, data, 3, "8 moments cannot be divided among 3 devices")
+    check_refused(learner, data, 3, "8 steps per batch cannot be divided among 3 devices")
 
 
 def whole_runs(folder):
-    """Run folders on two devices: validated, stopped and resumed in the middle, like one of one device."""
+    """A run on two devices equals one on one device: parameters, validations, and the last half once resumed."""
     generate(folder / "set", 2, 7, Generation(workers=0))
     data = ScenarioSet.open(folder / "set")
-    task = Task(observation=SEEN, metrics=("steps",))
+    task = Task(observation=OBSERVATION, metrics=("steps",))
     algorithm, count = ALGORITHMS["ppo"], 4
     config = TrainConfig(
         task=task, algorithm=algorithm, total_steps=count * algorithm.steps_per_iteration, latest_start=60,
@@ -164,13 +165,13 @@ def main(name, extent):
         return
     learner, data = problem(name)
     if extent == "batches":
-        divides_batches(learner, data)
+        check_batches(learner, data)
     elif extent == "two":
-        divides(learner, data, (2,))
+        check_environments(learner, data, (2,))
     else:
-        one = divides(learner, data, (2, None))
-        divides_agents(learner, data, one)
-        refuses(learner, data, 3, "4 environments cannot be divided among 3 devices")
+        one = check_environments(learner, data, (2, None))
+        check_seeds(learner, data, one)
+        check_refused(learner, data, 3, "4 environments cannot be divided among 3 devices")
     print("same")
 
 

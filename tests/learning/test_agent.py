@@ -1,4 +1,4 @@
-"""Seeds in parts: a loop of one's own learns the same parameters as ``drivax.train``."""
+"""Agents in parts: a loop of your own learns the same parameters as ``drivax.train``."""
 
 import os
 import subprocess
@@ -95,7 +95,10 @@ def test_own_loop_equals_training(data, algorithm, tmp_path, request):
     assert any(moved)
 
 
-def test_offline_algorithms_have_no_agent(data):
-    with pytest.raises(UsageError, match=r"BcConfig has no parts for a loop of your own; use ppo or sac"):
-        bc = {"kind": "bc", "network": NETWORK, "batch": 4, "updates": 2}
-        make_agent(config_of(bc, 1), ScenarioBank.from_scenarios(data))
+def test_offline_algorithms_and_warm_starts_have_no_agent(data):
+    bank = ScenarioBank.from_scenarios(data)
+    bc = {"kind": "bc", "network": NETWORK, "batch": 4, "updates": 2}
+    bc_ppo = {"kind": "bc_ppo", "warm_start": {"iterations": 1}, "ppo": PPO}
+    for algorithm, name in ((bc, "BcConfig"), (bc_ppo, "BcPpoConfig")):
+        with pytest.raises(UsageError, match=rf"{name} has no parts for a loop of your own; use ppo or sac"):
+            make_agent(config_of(algorithm, 2), bank)

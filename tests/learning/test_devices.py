@@ -1,4 +1,4 @@
-"""Several devices learn what one learns, but for the order of sums: every kind of state that is divided among them."""
+"""Several devices learn what one learns, up to the order of sums, for each kind of state that they divide."""
 
 import os
 import subprocess

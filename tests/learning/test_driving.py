@@ -1,4 +1,4 @@
-"""Driving as an environment: what rows of experience hold, and what the expert did."""
+"""Driving as an environment: its rollouts, and the actions of the expert."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ from drivax.tasks.task import Task
 
 
 def moment(bank, context, frames):
-    """A feature that tells where it was made: scenario, step, last action."""
+    """A feature: scenario, step, last action."""
     place = jnp.stack([context.index, context.step]).astype(jnp.float32)
     return jnp.concatenate([place, context.action])[None]
 
@@ -53,7 +53,7 @@ def experience(bank, driving):
 
     def actor(observation, key):
         raw_action = 0.5 * jax.random.normal(key, (6, 2))
-        return raw_action, jnp.tanh(raw_action), {"seen": observation["route"]}
+        return raw_action, jnp.tanh(raw_action), {"route": observation["route"]}
 
     run = jax.jit(lambda b, e, k: collect(driving, b, e, actor, k, 120, "state"))
     return jax.device_get(run(bank, environments, jax.random.key(1)))
@@ -84,7 +84,7 @@ ON_LEVELS = [
 
 @pytest.mark.parametrize("config", ON_LEVELS, ids=lambda config: config.kind)
 def test_algorithms_learn_discrete_actions(config, bank):
-    """Levels are asked for while the network is traced."""
+    """Levels are read while the network is traced."""
     task = Task(actions=Discrete(accelerations=3, curvatures=5), observation=OBSERVATION, metrics="none")
     environment = Driving(Simulator(task), LATEST)
     learner = config.build(environment, bank, 2)
@@ -102,9 +102,11 @@ def test_discrete_policy_takes_levels(bank):
     policy, _ = learner.network(state.parameters).policy_and_value(
         environment.start(bank, jax.random.key(1), 6).observation
     )
-    taken = policy.action(policy.sample(jax.random.key(2)))
+    actions = policy.action(policy.sample(jax.random.key(2)))
     accelerations, curvatures = environment.levels
-    assert np.isin(taken[:, 0], accelerations).all() and np.isin(taken[:, 1], np.float32(curvatures)).all()
+    assert (
+        np.isin(actions[:, 0], accelerations).all() and np.isin(actions[:, 1], np.float32(curvatures)).all()
+    )
 
 
 def test_row_after_an_end_holds_the_final_state(experience):
@@ -117,14 +119,16 @@ def test_row_after_an_end_holds_the_final_state(experience):
     assert not (ended & ~alive).any() and (rollout.reward[~alive] == 0).all()
     context = rollout.state
     # Whatever happens, what a step led to is the same scenario one step later, seen with the same past.
-    lived = alive[:-1]
-    np.testing.assert_array_equal(context.index[1:][lived], context.index[:-1][lived])
-    np.testing.assert_array_equal(context.step[1:][lived], context.step[:-1][lived] + 1)
-    np.testing.assert_array_equal(context.history[1:][lived][:, :-1], context.history[:-1][lived][:, 1:])
+    steps = alive[:-1]
+    np.testing.assert_array_equal(context.index[1:][steps], context.index[:-1][steps])
+    np.testing.assert_array_equal(context.step[1:][steps], context.step[:-1][steps] + 1)
+    np.testing.assert_array_equal(context.history[1:][steps][:, :-1], context.history[:-1][steps][:, 1:])
     # Nothing of that reaches the episode that begins behind it.
-    begun = context.step[1:][~lived]
-    assert (begun >= EARLIEST).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
-    assert (context.action[1:][~lived] == 0).all() and (context.route_m[1:][~lived] >= 0).all()
+    first_steps = context.step[1:][~steps]
+    assert (
+        (first_steps >= EARLIEST).all() and (first_steps <= LATEST).all() and len(np.unique(first_steps)) > 2
+    )
+    assert (context.action[1:][~steps] == 0).all() and (context.route_m[1:][~steps] >= 0).all()
 
 
 def test_new_episodes_begin_as_logged(experience, bank):
@@ -152,7 +156,9 @@ def test_stored_states_give_the_same_observation(experience, bank, driving):
     _, rollout, _ = experience
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rollout.state)
     again = jax.jit(driving.observe_all)(bank, rows)
-    np.testing.assert_allclose(again["route"], rollout.extra["seen"].reshape(again["route"].shape), atol=1e-5)
+    np.testing.assert_allclose(
+        again["route"], rollout.extra["route"].reshape(again["route"].shape), atol=1e-5
+    )
     one = jax.jit(driving.simulator.observe)(bank, jax.tree.map(lambda leaf: leaf[7], rows))
     np.testing.assert_allclose(one["route"], again["route"][7], atol=1e-5)
 
@@ -184,13 +190,13 @@ def test_demonstrations_follow_the_log(bank, driving):
         ],
         axis=-1,
     )
-    reached = jax.vmap(bicycle)(motion[:, 0], 6.0 * action[:, 0], 0.3 * action[:, 1])
-    off = np.linalg.norm(reached[:, :2] - motion[:, 1, :2], axis=-1)
-    assert (~clipped).mean() > 0.9 and off[~clipped].max() < 0.05
+    next_motion = jax.vmap(bicycle)(motion[:, 0], 6.0 * action[:, 0], 0.3 * action[:, 1])
+    distance = np.linalg.norm(next_motion[:, :2] - motion[:, 1, :2], axis=-1)
+    assert (~clipped).mean() > 0.9 and distance[~clipped].max() < 0.05
     # The last action that is seen is what the expert did a step before.
-    did = {(i, s): a for i, s, a in zip(index, step, action, strict=True)}
-    pairs = [(did[i, s - 1], o[0, 2:]) for i, s, o in zip(index, step, observation["moment"], strict=True)
-             if (i, s - 1) in did]  # fmt: skip
+    action_at = {(i, s): a for i, s, a in zip(index, step, action, strict=True)}
+    pairs = [(action_at[i, s - 1], o[0, 2:]) for i, s, o in zip(index, step, observation["moment"], strict=True)
+             if (i, s - 1) in action_at]  # fmt: skip
     assert len(pairs) > 20
     np.testing.assert_allclose(*map(np.array, zip(*pairs, strict=True)), atol=1e-5)
 
@@ -230,12 +236,12 @@ def test_expert_of_the_route_space_is_cloned_by_its_offset(bank):
     route = Driving(Simulator(Task(actions=ROUTE, observation=OBSERVATION, metrics="none")), LATEST)
     physical = replace(route, simulator=Simulator(replace(route.task, actions=PHYSICAL)))
     key = jax.random.key(0)
-    (seen, offset, clipped), (_, action, _) = (
+    (observations, offset, clipped), (_, action, _) = (
         jax.jit(each.demonstrations, static_argnums=2)(bank, key, 32) for each in (route, physical)
     )
-    index, step = (seen["moment"][:, 0, column].astype(int) for column in (0, 1))
+    index, step = (observations["moment"][:, 0, column].astype(int) for column in (0, 1))
     contexts = jax.vmap(route._logged_context, (None, 0, 0))(bank, index, step)
     executed = jax.vmap(lambda context, a: execute(ROUTE, bank, context, a))(contexts, offset)
-    kept = ~np.asarray(clipped)
-    assert kept.sum() > 20
-    np.testing.assert_allclose(executed[kept], action[kept], atol=1e-3)
+    unclipped = ~np.asarray(clipped)
+    assert unclipped.sum() > 20
+    np.testing.assert_allclose(executed[unclipped], action[unclipped], atol=1e-3)

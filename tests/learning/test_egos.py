@@ -86,21 +86,23 @@ def test_episodes_begin_with_the_drawn_ego(worlds):
 
 def test_logged_steps_are_those_of_recorded_egos(worlds):
     bank, alone, rows = worlds
-    steps, own = (jax.jit(each.expert_steps)(data) for each, data in ((MOVING, bank), (RECORDED, alone)))
-    assert steps.usable.shape == (len(bank) * EGOS, bank.steps) and steps.egos == EGOS and own.egos == 1
+    steps, own_steps = (
+        jax.jit(each.expert_steps)(data) for each, data in ((MOVING, bank), (RECORDED, alone))
+    )
+    assert steps.usable.shape == (len(bank) * EGOS, bank.steps) and steps.egos == EGOS and own_steps.egos == 1
     empty = np.asarray(bank.egos).reshape(-1) < 0
     assert not np.asarray(steps.usable)[empty].any() and np.asarray(steps.usable)[~empty].any(axis=1).all()
     for row, number in zip(rows, range(len(rows)), strict=True):
         usable, last = np.asarray(steps.usable[row]), int(bank.last_step[row])
-        np.testing.assert_array_equal(usable[: last - 1], np.asarray(own.usable[number])[: last - 1])
+        np.testing.assert_array_equal(usable[: last - 1], np.asarray(own_steps.usable[number])[: last - 1])
         assert not usable[last - 1 :].any()
-        np.testing.assert_allclose(steps.action[row][usable], own.action[number][usable], atol=5e-3)
+        np.testing.assert_allclose(steps.action[row][usable], own_steps.action[number][usable], atol=5e-3)
     index = np.repeat(rows, 2), np.tile([12, 20], len(rows))
-    seen = jax.jit(MOVING.observe_recorded)(bank, tuple(map(jnp.asarray, index)))
-    place = np.repeat(np.arange(len(rows)), 2), index[1]
-    own_seen = jax.jit(RECORDED.observe_recorded)(alone, tuple(map(jnp.asarray, place)))
+    observation = jax.jit(MOVING.observe_recorded)(bank, tuple(map(jnp.asarray, index)))
+    own_index = np.repeat(np.arange(len(rows)), 2), index[1]
+    own_observation = jax.jit(RECORDED.observe_recorded)(alone, tuple(map(jnp.asarray, own_index)))
     for name in ("ego", "agents", "route"):
-        np.testing.assert_allclose(seen[name], own_seen[name], atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(observation[name], own_observation[name], atol=2e-3, err_msg=name)
 
 
 def test_demonstrations_are_those_of_logged_steps(worlds):

@@ -1,4 +1,4 @@
-"""Recorded experience: what the simulator gives while the expert drives, drawn by weight."""
+"""Logged experience: equal to an expert in the simulator, and drawn by weight."""
 
 from dataclasses import replace
 
@@ -30,12 +30,12 @@ DRIVING = Driving(Simulator(Task(observation=OBSERVATION, metrics="none")))
 @pytest.fixture(scope="module")
 def bank(data):
     bank = ScenarioBank.from_scenarios(data)
-    # Somebody stands in ego's way half a second behind the current step of the first scenario: the episode ends there.
+    # In the first scenario an agent stands where ego is 0.5 s after the current step: the episode ends there.
     ego, box = bank.agents[0, 15, 0], bank.agent_box[0, 0]
     agents = bank.agents.at[0, :, 1].set(ego)
     # In the last, the log loses ego.
     agents = agents.at[2, 70:, 0, AgentColumn.VALID].set(0.0)
-    # In the second, it looks aside for a moment.
+    # In the second, ego's logged heading is wrong at one step.
     agents = agents.at[1, JUMP, 0, 3:5].set(-agents[1, JUMP, 0, 4:2:-1])
     return replace(bank, agents=agents, agent_box=bank.agent_box.at[0, 1].set(box))
 
@@ -45,44 +45,47 @@ def experience(bank):
     return ExperienceConfig().of(DRIVING, bank)
 
 
-def drive(bank, index):
-    """The expert drives online, by the planner that evaluations use: what every step was, from the current one on."""
+def drive_expert(bank, index):
+    """Drive the planner ``expert`` in the simulator; return all steps from the current one on."""
     simulator, planner = DRIVING.simulator, Expert(DRIVING.task.actions)
 
     def step(state, _):
-        seen = simulator.observe(bank, state.context)
+        observation = simulator.observe(bank, state.context)
         situation = simulator.situation(bank, state)
-        action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
+        action, _ = planner.act((), bank, state, situation, observation, jax.random.key(0))
         action = DRIVING.task.actuate(bank, state.context, action)
-        after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
-        following = simulator.observe(bank, after.context)
-        return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)
+        after, transition = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        next_observation = simulator.observe(bank, after.context)
+        return after, (
+            dict(observation), action, transition.reward, transition.terminated, dict(next_observation),
+            transition.truncated,
+        )  # fmt: skip
 
     return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]
 
 
 def test_transitions_equal_a_simulated_expert(bank, experience):
-    online = jax.device_get(jax.jit(jax.vmap(drive, (None, 0)))(bank, jnp.arange(3)))
+    online = jax.device_get(jax.jit(jax.vmap(drive_expert, (None, 0)))(bank, jnp.arange(3)))
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.usable)
-    places = jnp.asarray(index), jnp.asarray(step)
-    found = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p, 0.9))(experience, places))
-    seen, action, reward, terminated, following, truncated = jax.tree.map(
+    positions = jnp.asarray(index), jnp.asarray(step)
+    result = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p, 0.9))(experience, positions))
+    observation, action, reward, terminated, next_observation, truncated = jax.tree.map(
         lambda leaf: leaf[index, step - 10], online
     )
     first = step == 10
     assert first.sum() == 3 and len(index) > 100
-    for name, value in seen.items():
-        # Only at its first step does an episode not know what the expert did before.
+    for name, value in observation.items():
+        # At its first step an episode does not know the expert's previous action.
         np.testing.assert_allclose(
-            found.observation[name][~first], value[~first], atol=1e-3, rtol=1e-4, err_msg=name
+            result.observation[name][~first], value[~first], atol=1e-3, rtol=1e-4, err_msg=name
         )
         np.testing.assert_allclose(
-            found.next_observation[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name
+            result.next_observation[name], next_observation[name], atol=1e-3, rtol=1e-4, err_msg=name
         )
-    np.testing.assert_allclose(found.action, action, atol=1e-4)
-    np.testing.assert_allclose(found.reward, reward, atol=1e-4, rtol=1e-4)
-    np.testing.assert_array_equal(found.terminated, terminated)
+    np.testing.assert_allclose(result.action, action, atol=1e-4)
+    np.testing.assert_allclose(result.reward, reward, atol=1e-4, rtol=1e-4)
+    np.testing.assert_array_equal(result.terminated, terminated)
     np.testing.assert_array_equal(expert.truncated[index, step], truncated)
     assert np.abs(reward).max() > 0
 
@@ -94,7 +97,7 @@ def test_returns_of_logged_decisions_against_plain_loops(bank, experience, hold)
     index, first = np.nonzero(expert.usable)
     held = replace(experience, expert=replace(experience.expert, hold=hold))
     find = jax.jit(lambda e, at: (transitions(DRIVING, e, at, 0.9, 3), DRIVING.observe_recorded(bank, at)))
-    found, _ = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(first))))
+    result, _ = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(first))))
     last, cut = [], 0
     for number, (scenario, start) in enumerate(zip(index, first, strict=True)):
         step, reward, failed = start, 0.0, False
@@ -102,15 +105,15 @@ def test_returns_of_logged_decisions_against_plain_loops(bank, experience, hold)
             reward += 0.9 ** ((step - start) // hold) * expert.reward[scenario, step]
             failed |= bool(expert.terminated[scenario, step])
             step += 1
-        assert found.reward[number] == pytest.approx(reward, rel=1e-4, abs=1e-5)
-        assert found.terminated[number] == failed
-        assert found.discount[number] == pytest.approx(0.9 ** np.ceil((step - start) / hold), rel=1e-5)
+        assert result.reward[number] == pytest.approx(reward, rel=1e-4, abs=1e-5)
+        assert result.terminated[number] == failed
+        assert result.discount[number] == pytest.approx(0.9 ** np.ceil((step - start) / hold), rel=1e-5)
         last.append(step)
         cut += step < start + 3 * hold
-    assert found.terminated.any() and 0 < cut < len(index)
-    _, following = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(last))))
-    for name, value in following.items():
-        np.testing.assert_allclose(found.next_observation[name], value, atol=1e-5, err_msg=name)
+    assert result.terminated.any() and 0 < cut < len(index)
+    _, next_observation = jax.device_get(find(held, (jnp.asarray(index), jnp.asarray(last))))
+    for name, value in next_observation.items():
+        np.testing.assert_allclose(result.next_observation[name], value, atol=1e-5, err_msg=name)
 
 
 def test_steps_after_an_end_or_without_expert_are_unusable(experience):
@@ -119,7 +122,7 @@ def test_steps_after_an_end_or_without_expert_are_unusable(experience):
     end = int(np.argmax(expert.terminated[0]))
     assert 10 <= end < 16 and expert.terminated[0, end]
     np.testing.assert_array_equal(np.nonzero(expert.usable[0])[0], np.arange(10, end + 1))
-    # An action looks two steps ahead; the last one that is known of is that of step 88.
+    # An action looks two steps ahead, so the last one is that of step 88.
     whole, lost = expert.usable[1], expert.usable[2]
     assert whole[10:89].all() and not whole[:10].any() and not whole[89:].any()
     assert lost[10:68].all() and not lost[68:].any()
@@ -130,9 +133,9 @@ def test_clipped_steps_are_left_out_by_default(bank, experience):
     index, step = np.nonzero(expert.clipped & expert.usable)
     assert {JUMP - 1} <= {s for i, s in zip(index, step, strict=True) if i == 1}
     assert (np.abs(expert.action) <= 1.0).all()
-    taken = ExperienceConfig(mask_clipped=False).of(DRIVING, bank)
-    for made, drawn in ((experience, False), (taken, True)):
-        chances = np.diff(np.asarray(made.critic.cumulative).astype(np.int64), prepend=0)
+    unmasked = ExperienceConfig(mask_clipped=False).of(DRIVING, bank)
+    for each, drawn in ((experience, False), (unmasked, True)):
+        chances = np.diff(np.asarray(each.critic.cumulative).astype(np.int64), prepend=0)
         assert ((chances.reshape(expert.usable.shape)[index, step] > 0) == drawn).all()
 
 
@@ -141,16 +144,16 @@ def test_weights_apply_to_policy_or_all(bank, experience):
     weights = np.zeros(usable.shape)
     weights[1, 20], weights[1, 30], weights[0, 3] = 3.0, 1.0, 100.0
     both = ExperienceConfig().of(DRIVING, bank, weights)
-    apart = ExperienceConfig(weighted="policy").of(DRIVING, bank, weights)
-    assert both.policy is None and apart.policy is not None
-    # (3 + 1)^2 / (9 + 1); the weight of a step that is none counts for nothing.
-    assert float(both.critic.effective) == pytest.approx(1.6) == float(apart.policy.effective)
-    assert float(apart.critic.effective) == pytest.approx(usable.sum())
-    np.testing.assert_array_equal(apart.critic.cumulative, experience.critic.cumulative)
-    for made in (both, apart):
-        np.testing.assert_array_equal(made.usable, usable)
+    policy_only = ExperienceConfig(weighted="policy").of(DRIVING, bank, weights)
+    assert both.policy is None and policy_only.policy is not None
+    # (3 + 1)^2 / (9 + 1); the weight of the unusable step 3 has no effect.
+    assert float(both.critic.effective) == pytest.approx(1.6) == float(policy_only.policy.effective)
+    assert float(policy_only.critic.effective) == pytest.approx(usable.sum())
+    np.testing.assert_array_equal(policy_only.critic.cumulative, experience.critic.cumulative)
+    for each in (both, policy_only):
+        np.testing.assert_array_equal(each.usable, usable)
         # What features are normalised by.
-        np.testing.assert_array_equal(made.uniform.cumulative, experience.critic.cumulative)
+        np.testing.assert_array_equal(each.uniform.cumulative, experience.critic.cumulative)
 
 
 def test_usable_steps_are_the_drawn_steps(data):

@@ -45,12 +45,12 @@ def test_fitted_q_estimates_returns(table):
     ends = replace(table, terminated=table.truncated, truncated=table.terminated)
     # Where episodes are cut off the same state follows, so that the loop goes on for ever.
     loops = replace(table, seen=jnp.ones_like(table.seen))
-    judge = FittedQ(FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05), NETWORK, Logged(), GAMMA)
+    evaluation = FittedQ(FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05), NETWORK, Logged(), GAMMA)
 
     @jax.jit
     def both(data):
         def always(push):
-            return judge.value(data, lambda seen: jnp.full((*seen["pendulum"].shape[:-1], 1), push))
+            return evaluation.value(data, lambda seen: jnp.full((*seen["pendulum"].shape[:-1], 1), push))
 
         return always(0.5), always(-0.5)
 
@@ -67,24 +67,24 @@ def test_learner_logs_fitted_q(table):
     """
     right = np.asarray(table.action[..., 0]) > 0
     number = np.broadcast_to(np.arange(LENGTH + 1), right.shape)
-    pays = jnp.asarray(right * number, jnp.float32)
-    near = replace(table, seen=100.0 + 1e-2 * table.seen, reward=pays, terminated=table.truncated)
+    reward = jnp.asarray(right * number, jnp.float32)
+    near = replace(table, seen=100.0 + 1e-2 * table.seen, reward=reward, terminated=table.truncated)
     worth = sum(GAMMA**step * step for step in range(LENGTH))
-    fits = FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05)
+    fitted_q = FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05)
     config = IqlConfig(
-        network=NETWORK, batch=64, updates=100, gamma=GAMMA, loss="mse", inverse_temperature=0.0, fitted_q=fits,
+        network=NETWORK, batch=64, updates=100, gamma=GAMMA, loss="mse", inverse_temperature=0.0, fitted_q=fitted_q,
         policy_rate=1e-2,
     )  # fmt: skip
-    found = {}
+    metrics = {}
     for normalise in (True, False):
         learner = replace(config, normalise=normalise).build(Logged(), near, 4)
-        made = training_data(learner.config, Logged(), near, np.asarray(right, np.float64))
-        state = jax.jit(learner.init)(made, jax.random.key(0))
+        experience = training_data(learner.config, Logged(), near, np.asarray(right, np.float64))
+        state = jax.jit(learner.init)(experience, jax.random.key(0))
         for _ in range(4):
-            state, _ = jax.jit(learner.iterate)(made, state)
-        found[normalise] = learner.held_out_metrics(ExperienceConfig().of(Logged(), near), state)
-    assert found[True]["fitted_q"] == pytest.approx(worth, rel=0.05)
-    assert abs(found[False]["fitted_q"] - worth) > 0.2 * worth
+            state, _ = jax.jit(learner.iterate)(experience, state)
+        metrics[normalise] = learner.held_out_metrics(ExperienceConfig().of(Logged(), near), state)
+    assert metrics[True]["fitted_q"] == pytest.approx(worth, rel=0.05)
+    assert abs(metrics[False]["fitted_q"] - worth) > 0.2 * worth
 
 
 def test_checkpoints_are_ranked_by_fitted_q():
@@ -96,5 +96,5 @@ def test_checkpoints_are_ranked_by_fitted_q():
     for algorithm in ({"kind": "bc"}, {"kind": "iql"}):
         with pytest.raises(UsageError, match="needs fitted-Q evaluation"):
             settings.load(TrainConfig, values | {"algorithm": algorithm})
-    fits = {"kind": "iql", "fitted_q": {"updates": 5}}
-    assert settings.load(TrainConfig, values | {"algorithm": fits}).checkpoint_rule == "fitted_q"
+    fitted_q = {"kind": "iql", "fitted_q": {"updates": 5}}
+    assert settings.load(TrainConfig, values | {"algorithm": fitted_q}).checkpoint_rule == "fitted_q"

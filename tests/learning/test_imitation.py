@@ -33,7 +33,7 @@ class Logged(Pendulum):
 
 
 @pytest.fixture(scope="module")
-def shown():
+def demonstrations():
     """What a pendulum's expert might do: push against the rate."""
     angle, rate = jax.random.uniform(jax.random.key(0), (2, 500), minval=-3.0, maxval=3.0)
     return Demonstrations({"angle": angle, "rate": rate}, jnp.tanh(-rate)[:, None])
@@ -57,8 +57,8 @@ def test_losses_against_numpy(mask):
     density = stats.norm.logpdf(np.arctanh(action.astype(float)), loc, scale) - np.log1p(-(action**2.0))
     for loss, expected in (("mse", (error**2).mean(axis=-1)), ("likelihood", -density.sum(axis=-1))):
         cloning = Cloning(loss=loss, mask_clipped=mask)
-        found, logs = cloning.batch_loss(gaussian, parameters, Logged(), data, jax.random.key(0))
-        assert float(found) == pytest.approx(expected[counts].mean(), rel=1e-4)
+        value, logs = cloning.batch_loss(gaussian, parameters, Logged(), data, jax.random.key(0))
+        assert float(value) == pytest.approx(expected[counts].mean(), rel=1e-4)
         assert float(logs["imitation_error"]) == pytest.approx(np.abs(error)[counts].mean(), rel=1e-4)
         assert float(logs["left_out"]) == pytest.approx(2 / 6 if mask else 0.0, abs=1e-6)
 
@@ -76,27 +76,29 @@ def test_clipped_steps_have_no_loss():
         assert slope[0] == 0.0 and slope[1] < 0.0
 
 
-def test_likelihood_fits_the_standard_deviation(shown):
+def test_likelihood_fits_the_standard_deviation(demonstrations):
     """Of an expert that acts by N(0.4, 0.2) before squashing, whatever it sees."""
-    action = jnp.tanh(0.4 + 0.2 * jax.random.normal(jax.random.key(1), shown.action.shape))
-    data = replace(shown, action=action)
+    action = jnp.tanh(0.4 + 0.2 * jax.random.normal(jax.random.key(1), demonstrations.action.shape))
+    data = replace(demonstrations, action=action)
     config = BcConfig(loss="likelihood", batch=256, updates=300, learning_rate=1e-2, network=TINY)
     learner = config.build(Pendulum(), data, 1)
     state, _ = jax.jit(learner.iterate)(data, jax.jit(learner.init)(data, jax.random.key(0)))
     policy = learner.distribution(state.parameters, Pendulum().observe_all(data, data.stored))
-    drawn = np.arctanh(np.asarray(action))
-    assert float(policy.loc.mean()) == pytest.approx(drawn.mean(), abs=0.03)
-    assert float(policy.scale.mean()) == pytest.approx(drawn.std(), rel=0.1)
+    raw_action = np.arctanh(np.asarray(action))
+    assert float(policy.loc.mean()) == pytest.approx(raw_action.mean(), abs=0.03)
+    assert float(policy.scale.mean()) == pytest.approx(raw_action.std(), rel=0.1)
 
 
-def test_a_grid_and_missing_experts_are_refused(shown):
+def test_a_grid_and_missing_experts_are_refused(demonstrations):
     levels = (tuple(np.linspace(-1, 1, 5)),)
     environment = Pendulum(levels=levels)
     network = replace(TINY, distribution="grid")
     with pytest.raises(UsageError, match="use loss: likelihood"):
-        BcConfig(network=network).build(environment, shown, 1)
-    learner = BcConfig(network=network, loss="likelihood", batch=8, updates=2).build(environment, shown, 1)
-    state = jax.jit(learner.init)(shown, jax.random.key(0))
+        BcConfig(network=network).build(environment, demonstrations, 1)
+    learner = BcConfig(network=network, loss="likelihood", batch=8, updates=2).build(
+        environment, demonstrations, 1
+    )
+    state = jax.jit(learner.init)(demonstrations, jax.random.key(0))
     assert isinstance(learner.distribution(state.parameters, {"pendulum": jnp.zeros(3)}), Grid)
     with pytest.raises(UsageError, match="reparameterised samples"):
         SacConfig(network=network)
@@ -114,13 +116,13 @@ def test_imitation_weight_decays():
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_settling_fits_ppo_values_to_a_fixed_policy(shown, shared):
+def test_settling_fits_ppo_values_to_a_fixed_policy(demonstrations, shared):
     network = replace(TINY, shared_encoder=shared)
     start, ppo = WarmStart(iterations=1, cloning=CLONING, settle=1), replace(PPO, network=network)
-    learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), shown, 3)
-    states, iterate = [jax.jit(learner.init)(shown, jax.random.key(0))], jax.jit(learner.iterate)
+    learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), demonstrations, 3)
+    states, iterate = [jax.jit(learner.init)(demonstrations, jax.random.key(0))], jax.jit(learner.iterate)
     for _ in range(3):
-        states.append(iterate(shown, states[-1])[0])
+        states.append(iterate(demonstrations, states[-1])[0])
 
     def changes(name):
         parts = [jax.tree.leaves(state.parameters[name]) for state in states[1:]]
@@ -131,20 +133,20 @@ def test_settling_fits_ppo_values_to_a_fixed_policy(shown, shared):
 
 
 @pytest.mark.slow
-def test_imitation_loss_keeps_the_policy_near_the_expert(shown):
+def test_imitation_loss_keeps_the_policy_near_the_expert(demonstrations):
     """From the same clone, learning by reward with a large weight stays nearer to the expert than without."""
     errors = {}
     for weight in (0.0, 30.0):
         start = WarmStart(iterations=1, cloning=replace(CLONING, updates=100), weight=weight)
         ppo = replace(PPO, learning_rate=1e-2)
-        learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), shown, 21)
-        state = jax.jit(learner.init)(shown, jax.random.key(0))
+        learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), demonstrations, 21)
+        state = jax.jit(learner.init)(demonstrations, jax.random.key(0))
 
         def run(state, learner=learner):
-            return jax.lax.scan(lambda s, _: learner.iterate(shown, s), state, None, 21)[0]
+            return jax.lax.scan(lambda s, _: learner.iterate(demonstrations, s), state, None, 21)[0]
 
         state = jax.jit(run)(state)
-        seen = Pendulum().observe_all(shown, shown.stored)
-        policy = learner.online.distribution(state.parameters, seen)
-        errors[weight] = float(jnp.abs(policy.mode() - shown.action).mean())
+        observations = Pendulum().observe_all(demonstrations, demonstrations.stored)
+        policy = learner.online.distribution(state.parameters, observations)
+        errors[weight] = float(jnp.abs(policy.mode() - demonstrations.action).mean())
     assert errors[30.0] < 0.5 * errors[0.0], errors

@@ -111,6 +111,7 @@ def test_impossible_settings_are_refused():
         ({"latest_start": 9}, r"latest_start is 9; use 10 \(earliest_start\) or more"),
         ({"earliest_start": -1}, "earliest_start is -1; use 0 or more"),
         ({"patience": 2}, "patience needs validations; set evaluate_every"),
+        ({"total_steps": 0}, "total_steps is 0; use 1 or more"),
         ({"checkpoint_every": 0}, "checkpoint_every and keep at least 1"),
         ({"keep": 0}, "checkpoint_every and keep at least 1"),
         ({"task": {"actions": {"kind": "direct_state"}}}, "cannot learn in direct_state"),

@@ -47,10 +47,10 @@ def numbers(state: ToyState):
 def test_seeds_are_runs_of_their_own(data, config, tmp_path):
     lines = []
     folder = train(config, data, tmp_path / "three", seeds=3, log=lines.append, validation=None)
-    inside = seed_folders(folder.path)
-    assert [path.name for path in inside] == ["seed-4", "seed-5", "seed-6"]
+    folders = seed_folders(folder.path)
+    assert [path.name for path in folders] == ["seed-4", "seed-5", "seed-6"]
     assert len(lines) == 1 and lines[0].startswith("memory: ") and "scenarios" in lines[0]
-    for seed, path in zip((4, 5, 6), inside, strict=True):
+    for seed, path in zip((4, 5, 6), folders, strict=True):
         alone = train(replace(config, seed=seed), data, tmp_path / f"alone-{seed}", validation=None).path
         assert settings.load(TrainConfig, path / "config.yaml") == replace(config, seed=seed)
         assert [row["step"] for row in read_rows(path / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
@@ -62,7 +62,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
         for one, other in zip(numbers(last_state(path)), numbers(last_state(alone)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
     bank = ScenarioBank.from_scenarios(data)
-    assert load_policy(inside[0], bank, trust=["toy_learner"])[1] == config.task
+    assert load_policy(folders[0], bank, trust=["toy_learner"])[1] == config.task
     with pytest.raises(UsageError, match=r"contains 3 seeds; name one, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
@@ -72,7 +72,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
 def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path):
     whole = train(config, data, tmp_path / "whole", seeds=2, validation=None)
     cut = train(config, data, tmp_path / "cut", seeds=2, validation=None)
-    # As if the machine had gone while checkpoints were written: one agent is a checkpoint behind.
+    # As if the machine had gone while checkpoints were written: one seed is a checkpoint behind.
     shutil.rmtree(cut.path / "seed-5" / "checkpoints" / "step-000000060")
     resumed = train(config, data, tmp_path / "cut", resume=True)
     for path, other in zip(seed_folders(whole.path), seed_folders(resumed.path), strict=True):
@@ -85,22 +85,24 @@ def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path
 
 @pytest.mark.slow
 def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
-    """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
+    """The toy adds random numbers of its key to its parameters: their start is the difference from a fresh run."""
     former = train(config, data, tmp_path / "former", validation=None).path
     plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2, validation=None).path
     lines = []
     onward = replace(config, total_steps=10, begin_from=f"{former}@40")
     run = train(onward, data, tmp_path / "run", seeds=2, log=lines.append, validation=None)
     assert lines[1:] == [f"starts from parameters of {former}@40"]
-    began = Checkpoints(former / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40)
+    start_state = Checkpoints(former / "checkpoints").restore(
+        jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40
+    )
     pairs = list(zip(seed_folders(run.path), seed_folders(plain), strict=True))
     for path, fresh in pairs:
         parameters, key, iteration = numbers(last_state(path))
         lacks = parameters - numbers(last_state(fresh))[0]
-        np.testing.assert_allclose(lacks, began.parameters, rtol=1e-5)
+        np.testing.assert_allclose(lacks, start_state.parameters, rtol=1e-5)
         assert iteration == 1 and (key == numbers(last_state(fresh))[1]).all()
         assert policy_training_sets(str(path)) == policy_training_sets(str(former)), "each set once"
-    # Without a step it is the best; whoever resumes from the very beginning finds the same.
+    # Without a step it is the best; resuming from the beginning finds the same.
     run = train(replace(onward, begin_from=str(former)), data, tmp_path / "best", validation=data)
     assert (
         run.config(TrainConfig, trust=["toy_learner"]).begin_from == f"{former}@60"
@@ -111,7 +113,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     train(config, data, run.path, validation=data, resume=True)
     for one, again in zip(before, numbers(last_state(run.path)), strict=True):
         np.testing.assert_array_equal(one, again)
-    # What does not fit is told before a folder is made.
+    # What does not fit is refused before a folder is created.
     wide = replace(onward, algorithm=ToyConfig(size=4))
     for wrong, words in (
         (
@@ -126,7 +128,7 @@ def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
         with pytest.raises(DrivaxError, match=words):
             train(wrong, data, tmp_path / "never", validation=None)
     assert not (tmp_path / "never").exists()
-    # Where it came from is not asked for any more once there is a checkpoint.
+    # Once there is a checkpoint, the former run is not read.
     shutil.rmtree(former)
     train(config, data, run.path, validation=data, resume=True)
 
@@ -143,8 +145,8 @@ def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
         assert [row["step"] for row in rows] == [10, 20, 30]
         about = json.loads((path / "checkpoints" / "step-000000030" / "about.json").read_text())
         row = rows[-1]
-        wanted = [row[f"validation/{name}"] for name in ("accuracy", "progress_ratio", "comfortable")]
-        assert about["score"] == wanted and all(value >= 0.0 for value in wanted)
+        expected = [row[f"validation/{name}"] for name in ("accuracy", "progress_ratio", "comfortable")]
+        assert about["score"] == expected and all(value >= 0.0 for value in expected)
     # Nothing is left to do, and resuming does nothing.
     train(patient, data, tmp_path / "run", validation=data, resume=True)
     assert [row["step"] for row in read_rows(run.path / "seed-4" / "metrics.jsonl")] == [10, 20, 30]
@@ -196,8 +198,8 @@ def test_command_trains_several_seeds(data, tmp_path, capsys):
     out = tmp_path / "out"
     arguments = ["train", str(tmp_path / "toy.yaml"), "--data", str(data.path), "--out", str(out)]
     assert main([*arguments, "--seeds", "2", "--total_steps", "20"]) == 0
-    told = capsys.readouterr()
-    assert "wrote" in told.out and "memory: " in told.err and (out / "seed-5" / "metrics.jsonl").is_file()
+    output = capsys.readouterr()
+    assert "wrote" in output.out and "memory: " in output.err and (out / "seed-5" / "metrics.jsonl").is_file()
     more = ["--from", str(out / "seed-4"), "--total_steps", "10"]
     assert main([*arguments[:-1], str(tmp_path / "onward"), *more]) == 0
     assert f"starts from parameters of {out / 'seed-4'}@20" in capsys.readouterr().err

@@ -41,22 +41,22 @@ def test_account_covers_all_bytes():
         return replace(state, parameters=state.parameters + square.sum()), jnp.zeros(50) + square[0, 0]
 
     compiled = jax.jit(iterate, donate_argnums=1).lower(data, state).compile()
-    found = account(data, jnp.zeros(6), state, compiled, jax.devices()[:1])
-    assert {name: size for name, size in found.sizes.items() if name != "program"} == {
+    memory = account(data, jnp.zeros(6), state, compiled, jax.devices()[:1])
+    assert {name: size for name, size in memory.sizes.items() if name != "program"} == {
         "scenarios": 5 * 7 * 4 + 9, "validation": 24, "replay": 1600, "environments": 16 + 4 + 16,
         "networks and optimiser": 120 + 8,
     }  # fmt: skip
     # Results that take the place of no argument, and the table.
-    assert 200 + 35 * 35 * 4 <= found.sizes["program"] < 10 * 35 * 35 * 4
-    assert found.total == sum(found.sizes.values())
-    assert found.limit == memory_of(jax.devices()[0]) and found.limit > 10**8
-    assert found.text().startswith("memory: ") and "replay 1.6 kB" in found.text()
-    assert memory_of(jax.devices()[0], 4) == found.limit // 4
+    assert 200 + 35 * 35 * 4 <= memory.sizes["program"] < 10 * 35 * 35 * 4
+    assert memory.total == sum(memory.sizes.values())
+    assert memory.limit == memory_of(jax.devices()[0]) and memory.limit > 10**8
+    assert memory.text().startswith("memory: ") and "replay 1.6 kB" in memory.text()
+    assert memory_of(jax.devices()[0], 4) == memory.limit // 4
 
 
 def test_training_that_does_not_fit_is_refused_with_a_cure():
-    parts = {"scenarios": 3_000_000_000, "replay": 5_000_000_000, "program": 2}
-    fits = MemoryAccount(parts, 9_000_000_000, "cuda:0")
+    sizes = {"scenarios": 3_000_000_000, "replay": 5_000_000_000, "program": 2}
+    fits = MemoryAccount(sizes, 9_000_000_000, "cuda:0")
     fits.check()
     replace(fits, limit=None).check()
     with pytest.raises(UsageError) as refused:

@@ -1,7 +1,7 @@
-"""Offline learning from a mixture of 5 % good and 95 % poor drives of the pendulum.
+"""Offline learning from a mixture of 5 % good and 95 % poor episodes of the pendulum.
 
-Weighted by return every algorithm swings up; from steps that are all alike none does. The good driver pumps energy; the
-poor one damps every swing.
+With weights by return every algorithm recovers at least half of the good policy's advantage, with uniform weights less
+than a tenth. The good policy pumps energy; the poor one damps every swing.
 """
 
 from functools import partial
@@ -36,54 +36,54 @@ ITERATIONS = 20
 QUICK = ("bc",)
 
 
-def swings_up(seen, key):
-    """Pumps energy until that of the upright pendulum is there, and holds it near the top."""
-    cos, sin, rate = jnp.moveaxis(seen, -1, 0)
+def swing_up(observation, key):
+    """Pump energy up to that of the upright pendulum, and hold it near the top."""
+    cos, sin, rate = jnp.moveaxis(observation, -1, 0)
     angle, energy = jnp.arctan2(sin, cos), 0.5 * rate**2 + 15.0 * (cos - 1.0)
     near = (jnp.abs(angle) < 0.6) & (jnp.abs(rate) < 3.0)
     torque = jnp.where(near, -8.0 * angle - 2.0 * rate, -0.3 * energy * jnp.sign(rate + 1e-3))
-    return _shaken(jnp.clip(torque / MAX_TORQUE, -1.0, 1.0), 0.05, key)
+    return _add_noise(jnp.clip(torque / MAX_TORQUE, -1.0, 1.0), 0.05, key)
 
 
-def damps(seen, key):
-    """Works against every swing."""
-    return _shaken(0.8 * jnp.clip(-0.5 * seen[:, 2], -1.0, 1.0), 0.2, key)
+def damp(observation, key):
+    """Work against every swing."""
+    return _add_noise(0.8 * jnp.clip(-0.5 * observation[:, 2], -1.0, 1.0), 0.2, key)
 
 
-def _shaken(action, noise, key):
+def _add_noise(action, noise, key):
     return jnp.clip(action + noise * jax.random.normal(key, action.shape), -1.0, 1.0)[:, None]
 
 
 @pytest.fixture(scope="module")
 def mixture():
     """The episodes, their returns, and a weight per step that follows the return of its episode."""
-    good, earned = jax.jit(lambda key: episodes(swings_up, key, GOOD))(jax.random.key(1))
-    poor, lost = jax.jit(lambda key: episodes(damps, key, EPISODES - GOOD))(jax.random.key(2))
+    good, good_returns = jax.jit(lambda key: episodes(swing_up, key, GOOD))(jax.random.key(1))
+    poor, poor_returns = jax.jit(lambda key: episodes(damp, key, EPISODES - GOOD))(jax.random.key(2))
     table = jax.tree.map(lambda *parts: jnp.concatenate(parts), good, poor)
-    found = np.concatenate([earned, lost]).astype(float)
-    share = (found - found.min()) / (found.max() - found.min())
+    episode_returns = np.concatenate([good_returns, poor_returns]).astype(float)
+    share = (episode_returns - episode_returns.min()) / (episode_returns.max() - episode_returns.min())
     # As trajectories are weighed by Hong et al. 2023 (arXiv 2306.13085): exp of the normalised return over 0.1.
     weights = np.exp(share / 0.1)[:, None] * np.ones(table.reward.shape)
-    return table, found, weights
+    return table, episode_returns, weights
 
 
-def earns(config, table, weights):
-    """Mean return, by its mode, of what was learned."""
+def mean_return(config, table, weights):
+    """Return the mean return of the learned policy's mode."""
     learner = config.build(Logged(), table, ITERATIONS)
-    made = training_data(config, Logged(), table, weights)
+    experience = training_data(config, Logged(), table, weights)
 
     @jax.jit
-    def run(made):
-        state = learner.init(made, jax.random.key(0))
-        state = jax.lax.scan(lambda s, _: learner.iterate(made, s), state, None, ITERATIONS)[0]
+    def run(experience):
+        state = learner.init(experience, jax.random.key(0))
+        state = jax.lax.scan(lambda s, _: learner.iterate(experience, s), state, None, ITERATIONS)[0]
         return returns(learner.distribution, state.parameters, jax.random.key(9))[0].mean()
 
-    return float(run(made))
+    return float(run(experience))
 
 
 def test_demonstrations_are_a_mixture(mixture):
-    _, found, weights = mixture
-    assert found[:GOOD].min() > -500 and found[GOOD:].max() < -1400
+    _, episode_returns, weights = mixture
+    assert episode_returns[:GOOD].min() > -500 and episode_returns[GOOD:].max() < -1400
     assert weights[:GOOD].sum() / weights.sum() > 0.95 and GOOD / EPISODES == 0.05
 
 
@@ -91,12 +91,13 @@ def test_demonstrations_are_a_mixture(mixture):
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS]
 )
 def test_weights_by_return_recover_the_good_policy(mixture, name):
-    """Half of the way from the mixture's mean to the good policy, at least; without them, not a tenth of it."""
-    table, found, weights = mixture
-    judge = partial(earns, ALGORITHMS[name], table)
-    gained = [
-        (judge(by) - found.mean()) / (found[:GOOD].mean() - found.mean())
-        for by in (weights, np.ones_like(weights))
+    """More than half of the way from the mean return to that of the good episodes; without weights, under a tenth."""
+    table, episode_returns, weights = mixture
+    evaluate = partial(mean_return, ALGORITHMS[name], table)
+    gains = [
+        (evaluate(step_weights) - episode_returns.mean())
+        / (episode_returns[:GOOD].mean() - episode_returns.mean())
+        for step_weights in (weights, np.ones_like(weights))
     ]
-    assert gained[0] > 0.5, gained
-    assert gained[1] < 0.1, gained
+    assert gains[0] > 0.5, gains
+    assert gains[1] < 0.1, gains

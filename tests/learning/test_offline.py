@@ -38,7 +38,7 @@ TD3_BC = Td3BcConfig(network=NETWORK, batch=COUNT, gamma=0.9)
 
 
 @pytest.fixture(scope="module")
-def part():
+def batch():
     """A batch of steps."""
     keys = jax.random.split(jax.random.key(1), 5)
     return Transitions(
@@ -52,12 +52,12 @@ def part():
 
 
 @pytest.fixture(scope="module")
-def improved(part):
+def policy_batch(batch):
     """Other steps, to improve the policy at."""
-    return {"pendulum": 0.5 - part.observation["pendulum"]}, -part.action
+    return {"pendulum": 0.5 - batch.observation["pendulum"]}, -batch.action
 
 
-def begun(config):
+def build_learner(config):
     """A learner with what it trains, and targets that differ from what they follow."""
     learner = config.build(Logged(), arms([0.0], [0.0]), 1)
     state = jax.jit(learner.init)((), jax.random.key(0))
@@ -65,21 +65,21 @@ def begun(config):
     return learner, {"policy": state.parameters, **state.rest}, target
 
 
-def losses(learner, trained, target, part, improved, key):
+def losses(learner, trained, target, batch, policy_batch, key):
     """What is logged of a batch."""
-    found = jax.jit(lambda t: learner.loss(t, target, part, improved, key))(trained)
-    return float(found[0]), {name: float(value) for name, value in found[1].items()}
+    result = jax.jit(lambda t: learner.loss(t, target, batch, policy_batch, key))(trained)
+    return float(result[0]), {name: float(value) for name, value in result[1].items()}
 
 
-def on_the_host(tree):
+def to_numpy(tree):
     return {name: np.asarray(value, np.float64) for name, value in tree.items()}
 
 
-def test_cql_against_numpy(part, improved):
+def test_cql_against_numpy(batch, policy_batch):
     config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0, backup_actions=2)
-    learner, trained, target = begun(config)
+    learner, trained, target = build_learner(config)
     key = jax.random.key(7)
-    total, logs = losses(learner, trained, target, part, improved, key)
+    total, logs = losses(learner, trained, target, batch, policy_batch, key)
 
     @jax.jit
     def outputs(trained):
@@ -87,110 +87,111 @@ def test_cql_against_numpy(part, improved):
         critic_key, policy_key = jax.random.split(key)
         next_key, sample_key = jax.random.split(critic_key)
         uniform_key, now_key, then_key = jax.random.split(sample_key, 3)
-        following = learner.distribution(trained["policy"], part.next_observation)
-        now = learner.distribution(trained["policy"], part.observation)
-        there = learner.distribution(trained["policy"], improved[0])
+        following = learner.distribution(trained["policy"], batch.next_observation)
+        now = learner.distribution(trained["policy"], batch.observation)
+        there = learner.distribution(trained["policy"], policy_batch[0])
         then = jnp.stack([jnp.tanh(following.sample(own)) for own in jax.random.split(next_key, 2)])
         uniform = jax.random.uniform(uniform_key, (ACTIONS, COUNT, 1), minval=-1.0)
         rows = {"uniform": [], "now": [], "then": []}
         for number in range(ACTIONS):
             for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
                 raw_action = policy.sample(jax.random.split(own, ACTIONS)[number])
-                q = learner.q_values(trained["critic"], part.observation, jnp.tanh(raw_action))
+                q = learner.q_values(trained["critic"], batch.observation, jnp.tanh(raw_action))
                 rows[name].append((q, policy.log_prob(raw_action)))
             rows["uniform"].append(
-                (learner.q_values(trained["critic"], part.observation, uniform[number]), None)
+                (learner.q_values(trained["critic"], batch.observation, uniform[number]), None)
             )
         raw_action = there.sample(policy_key)
         return {
-            "target": learner.q_values(target["critic"], part.next_observation, then),
-            "q": learner.q_values(trained["critic"], part.observation, part.action),
-            **{f"q_{name}": jnp.stack([q for q, _ in found]) for name, found in rows.items()},
+            "target": learner.q_values(target["critic"], batch.next_observation, then),
+            "q": learner.q_values(trained["critic"], batch.observation, batch.action),
+            **{f"q_{name}": jnp.stack([q for q, _ in result]) for name, result in rows.items()},
             **{f"p_{name}": jnp.stack([p for _, p in rows[name]]) for name in ("now", "then")},
-            "judged": learner.q_values(trained["critic"], improved[0], jnp.tanh(raw_action)),
+            "judged": learner.q_values(trained["critic"], policy_batch[0], jnp.tanh(raw_action)),
             "log_prob": there.log_prob(raw_action),
             "mode": there.mode(),
         }
 
-    found = on_the_host(outputs(trained))
-    value = found["target"].min(axis=0).max(axis=0)
-    assert (value > found["target"].min(axis=0)[0]).any()
-    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, value)
-    error = 0.5 * ((found["q"] - goal) ** 2).mean()
+    result = to_numpy(outputs(trained))
+    value = result["target"].min(axis=0).max(axis=0)
+    assert (value > result["target"].min(axis=0)[0]).any()
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, value)
+    error = 0.5 * ((result["q"] - td_target) ** 2).mean()
     stacked = np.concatenate([
-        found["q_uniform"] / 2 + np.log(2.0),
-        found["q_now"] / 2 - found["p_now"][:, None],
-        found["q_then"] / 2 - found["p_then"][:, None],
+        result["q_uniform"] / 2 + np.log(2.0),
+        result["q_now"] / 2 - result["p_now"][:, None],
+        result["q_then"] / 2 - result["p_then"][:, None],
     ])  # fmt: skip
-    penalty = (2 * (special.logsumexp(stacked, axis=0) - np.log(3 * ACTIONS)) - found["q"]).mean()
-    soft = 0.1 * found["log_prob"] - found["judged"].min(axis=0)
-    off = found["mode"] - np.asarray(improved[1])
-    policy = (soft / np.abs(found["judged"].min(axis=0)).mean()).mean() + 0.7 * (off**2).mean()
+    penalty = (2 * (special.logsumexp(stacked, axis=0) - np.log(3 * ACTIONS)) - result["q"]).mean()
+    soft = 0.1 * result["log_prob"] - result["judged"].min(axis=0)
+    mode_error = result["mode"] - np.asarray(policy_batch[1])
+    policy = (soft / np.abs(result["judged"].min(axis=0)).mean()).mean() + 0.7 * (mode_error**2).mean()
     expected = {
         "critic": error,
         "penalty": penalty,
         "penalty_weight": 2.0,
-        "mean_q": found["q"].mean(),
-        "mean_q_uniform": found["q_uniform"].mean(),
+        "mean_q": result["q"].mean(),
+        "mean_q_uniform": result["q_uniform"].mean(),
         "policy": policy,
-        "mean_q_policy": found["judged"].mean(),
-        "entropy": -found["log_prob"].mean(),
+        "mean_q_policy": result["judged"].mean(),
+        "entropy": -result["log_prob"].mean(),
         "temperature": 0.1,
-        "imitation_error": np.abs(off).mean(),
+        "imitation_error": np.abs(mode_error).mean(),
     }
     assert set(logs) == set(expected)
     for name, number in expected.items():
         assert logs[name] == pytest.approx(number, rel=1e-4, abs=1e-5), name
-    heat = -0.1 * (found["log_prob"].mean() - 1.0)
+    temperature_loss = -0.1 * (result["log_prob"].mean() - 1.0)
     multiplier = -2.0 * (penalty - 1.5)
-    assert total == pytest.approx(error + 2 * penalty + multiplier + policy + heat, rel=1e-4)
+    assert total == pytest.approx(error + 2 * penalty + multiplier + policy + temperature_loss, rel=1e-4)
 
 
 @pytest.mark.slow
-def test_published_penalty_includes_the_logged_action(part, improved):
+def test_published_penalty_includes_the_logged_action(batch, policy_batch):
     config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
-    learner, trained, target = begun(config)
+    learner, trained, target = build_learner(config)
     key = jax.random.key(7)
-    _, logs = losses(learner, trained, target, part, improved, key)
+    _, logs = losses(learner, trained, target, batch, policy_batch, key)
     sample_key = jax.random.split(jax.random.split(key)[0])[1]
     now, following = (
-        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.next_observation)
+        learner.distribution(trained["policy"], observation)
+        for observation in (batch.observation, batch.next_observation)
     )
-    action, density = learner._penalty_actions(now, following, part.action, sample_key)
+    action, density = learner._penalty_actions(now, following, batch.action, sample_key)
     assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
-    np.testing.assert_array_equal(action[-1], part.action)
-    q = np.asarray(learner.q_values(trained["critic"], part.observation, action), np.float64)
-    data = np.asarray(learner.q_values(trained["critic"], part.observation, part.action), np.float64)
+    np.testing.assert_array_equal(action[-1], batch.action)
+    q = np.asarray(learner.q_values(trained["critic"], batch.observation, action), np.float64)
+    data = np.asarray(learner.q_values(trained["critic"], batch.observation, batch.action), np.float64)
     # The study's, but for a constant: the logarithm of how many there are.
     expected = (special.logsumexp(q, axis=1) - data).mean() - np.log(2 * ACTIONS + 1)
     assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
 
 
-def test_iql_against_numpy(part, improved):
-    learner, trained, target = begun(replace(IQL, largest_weight=1.05))
-    total, logs = losses(learner, trained, target, part, improved, jax.random.key(7))
+def test_iql_against_numpy(batch, policy_batch):
+    learner, trained, target = build_learner(replace(IQL, largest_weight=1.05))
+    total, logs = losses(learner, trained, target, batch, policy_batch, jax.random.key(7))
 
     @jax.jit
     def outputs(trained):
-        policy = learner.distribution(trained["policy"], improved[0])
+        policy = learner.distribution(trained["policy"], policy_batch[0])
         return {
-            "target": learner.q_values(target["critic"], part.observation, part.action),
-            "q": learner.q_values(trained["critic"], part.observation, part.action),
-            "value": learner._value(trained["value"], part.observation),
-            "then": learner._value(trained["value"], part.next_observation),
-            "there": learner.q_values(target["critic"], *improved),
-            "value_there": learner._value(trained["value"], improved[0]),
-            "log_prob": policy.log_prob(jnp.arctanh(improved[1])),
+            "target": learner.q_values(target["critic"], batch.observation, batch.action),
+            "q": learner.q_values(trained["critic"], batch.observation, batch.action),
+            "value": learner._value(trained["value"], batch.observation),
+            "then": learner._value(trained["value"], batch.next_observation),
+            "there": learner.q_values(target["critic"], *policy_batch),
+            "value_there": learner._value(trained["value"], policy_batch[0]),
+            "log_prob": policy.log_prob(jnp.arctanh(policy_batch[1])),
         }
 
-    found = on_the_host(outputs(trained))
-    error = found["target"].min(axis=0) - found["value"]
+    result = to_numpy(outputs(trained))
+    error = result["target"].min(axis=0) - result["value"]
     value = (np.where(error > 0, 0.7, 0.3) * error**2).mean()
-    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["then"])
-    critic = 0.5 * ((found["q"] - goal) ** 2).mean()
-    advantage = found["there"].min(axis=0) - found["value_there"]
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["then"])
+    critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
+    advantage = result["there"].min(axis=0) - result["value_there"]
     weights = np.minimum(np.exp(3.0 * advantage), 1.05)
-    policy = -(weights * found["log_prob"]).mean()
+    policy = -(weights * result["log_prob"]).mean()
     assert 0.0 < logs["weights_cut"] == (weights == 1.05).mean() < 1.0
     for name, number in (
         ("value", value),
@@ -202,30 +203,30 @@ def test_iql_against_numpy(part, improved):
     assert total == pytest.approx(value + critic + policy, rel=1e-4)
 
 
-def test_td3_bc_against_numpy(part, improved):
-    learner, trained, target = begun(replace(TD3_BC, noise=0.5, noise_bound=0.3))
+def test_td3_bc_against_numpy(batch, policy_batch):
+    learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3))
     key = jax.random.key(7)
-    total, logs = losses(learner, trained, target, part, improved, key)
+    total, logs = losses(learner, trained, target, batch, policy_batch, key)
 
     @jax.jit
     def outputs(trained):
-        mode = learner.distribution(target["policy"], part.next_observation).mode()
+        mode = learner.distribution(target["policy"], batch.next_observation).mode()
         noise = 0.5 * jax.random.normal(key, mode.shape)
         then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
-        action = learner.distribution(trained["policy"], improved[0]).mode()
+        action = learner.distribution(trained["policy"], policy_batch[0]).mode()
         return {
-            "target": learner.q_values(target["critic"], part.next_observation, then),
-            "q": learner.q_values(trained["critic"], part.observation, part.action),
-            "judged": learner.q_values(trained["critic"], improved[0], action)[0],
-            "off": action - improved[1],
+            "target": learner.q_values(target["critic"], batch.next_observation, then),
+            "q": learner.q_values(trained["critic"], batch.observation, batch.action),
+            "judged": learner.q_values(trained["critic"], policy_batch[0], action)[0],
+            "off": action - policy_batch[1],
             "noise": noise,
         }
 
-    found = on_the_host(outputs(trained))
-    assert (np.abs(found["noise"]) > 0.3).any() and (np.abs(found["noise"]) < 0.3).any()
-    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["target"].min(axis=0))
-    critic = 0.5 * ((found["q"] - goal) ** 2).mean()
-    policy = -2.5 * found["judged"].mean() / np.abs(found["judged"]).mean() + (found["off"] ** 2).mean()
+    result = to_numpy(outputs(trained))
+    assert (np.abs(result["noise"]) > 0.3).any() and (np.abs(result["noise"]) < 0.3).any()
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["target"].min(axis=0))
+    critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
+    policy = -2.5 * result["judged"].mean() / np.abs(result["judged"]).mean() + (result["off"] ** 2).mean()
     assert logs["critic"] == pytest.approx(critic, rel=1e-4)
     assert logs["policy"] == pytest.approx(policy, rel=1e-4)
     assert total == pytest.approx(critic + policy, rel=1e-4)
@@ -234,46 +235,46 @@ def test_td3_bc_against_numpy(part, improved):
 @pytest.mark.parametrize(
     "config", [replace(CQL, gap=1.5, imitation=0.5), IQL, TD3_BC], ids=["cql", "iql", "td3"]
 )
-def test_every_loss_reaches_its_own_parameters_only(config, part, improved):
-    learner, trained, target = begun(config)
+def test_every_loss_reaches_its_own_parameters_only(config, batch, policy_batch):
+    learner, trained, target = build_learner(config)
 
     @jax.jit
     def slopes(trained):
         def of(trained, name):
-            total, logs = learner.loss(trained, target, part, improved, jax.random.key(7))
+            total, logs = learner.loss(trained, target, batch, policy_batch, jax.random.key(7))
             return total if name == "total" else logs[name]
 
         return {name: jax.grad(of)(trained, name) for name in ("total", "critic", "policy")}
 
-    found = slopes(trained)
+    result = slopes(trained)
     largest = partial(
         jax.tree.reduce, lambda most, leaf: max(most, float(jnp.abs(leaf).max())), initializer=0.0
     )
     for part_of_loss in ("critic", "policy"):
         for name in trained:
-            reached = largest(found[part_of_loss][name])
+            reached = largest(result[part_of_loss][name])
             assert (reached > 1e-6) == (name == part_of_loss), (part_of_loss, name)
     # Nothing but the critics' own losses moves them; of CQL these are two.
     if not isinstance(config, CqlConfig):
         jax.tree.map(
             partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6),
-            found["total"]["critic"], found["critic"]["critic"],
+            result["total"]["critic"], result["critic"]["critic"],
         )  # fmt: skip
     for name in set(trained) - {"policy", "critic"}:
-        assert largest(found["total"][name]) > 0.0, name
+        assert largest(result["total"][name]) > 0.0, name
 
 
-def learned(config, data, iterations=20, weights=None):
+def train_learner(config, data, iterations=20, weights=None):
     """A learner and its state after n iterations, and what the last one logged."""
     learner = config.build(Logged(), data, iterations)
-    made = training_data(config, Logged(), data, weights)
+    experience = training_data(config, Logged(), data, weights)
 
     @jax.jit
-    def run(made):
-        state = learner.init(made, jax.random.key(0))
-        return jax.lax.scan(lambda s, _: learner.iterate(made, s), state, None, iterations)
+    def run(experience):
+        state = learner.init(experience, jax.random.key(0))
+        return jax.lax.scan(lambda s, _: learner.iterate(experience, s), state, None, iterations)
 
-    state, logs = run(made)
+    state, logs = run(experience)
     return learner, state, jax.tree.map(lambda leaf: float(leaf[-1]), logs)
 
 
@@ -282,7 +283,7 @@ FAST = {"batch": 64, "updates": 50, "policy_rate": 3e-3, "critic_rate": 3e-3}
 
 @pytest.fixture(scope="module")
 def bandit():
-    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where no agent has been, all pay -1."""
+    """Arms from -0.5 to 0.5, of which the higher ones pay more; those beyond are not logged, and pay -1."""
     action = np.random.default_rng(0).uniform(-0.5, 0.5, 500)
     return arms(action, action)
 
@@ -303,28 +304,28 @@ def bandit():
 )
 def test_unlogged_arms_are_not_overestimated(bandit, config, stays):
     """Without a term that keeps them there, actions go where the critic makes up values."""
-    learner, state, _ = learned(config, bandit)
-    seen = {"pendulum": jnp.ones(3)}
-    action = learner.distribution(state.parameters, seen).mode()
-    believed = float(learner.q_values(state.rest["critic"], seen, action).min())
+    learner, state, _ = train_learner(config, bandit)
+    observation = {"pendulum": jnp.ones(3)}
+    action = learner.distribution(state.parameters, observation).mode()
+    predicted = float(learner.q_values(state.rest["critic"], observation, action).min())
     true = float(action[0]) if abs(float(action[0])) <= 0.5 else -1.0
     assert (abs(float(action[0])) <= 0.55) == stays, float(action[0])
-    assert (believed - true > 0.5) == (not stays), (believed, true)
+    assert (predicted - true > 0.5) == (not stays), (predicted, true)
     if stays:
         assert float(action[0]) > 0.05, "better than what is done on average"
 
 
 @pytest.mark.slow
 def test_multiplier_reaches_the_gap():
-    """Arms from 0.2 to 0.4: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
+    """Arms from 0.2 to 0.4: a lower gap needs a larger weight; with a gap above the penalty the weight falls to 0."""
     action = np.random.default_rng(0).uniform(0.2, 0.4, 500)
     settings = {"network": NETWORK, "penalty": 1.0, "penalty_rate": 0.01, **FAST}
-    found = {}
+    result = {}
     for gap in (1.0, -0.5, -1.0):
-        _, _, logs = learned(CqlConfig(gap=gap, **settings), arms(action, action), iterations=60)
-        found[gap] = logs["loss/penalty_weight"], logs["loss/penalty"]
-    assert found[1.0][0] < 1e-2 < found[-0.5][0] < 1.0 < found[-1.0][0] < 100.0
-    assert found[1.0][1] > found[-0.5][1] > found[-1.0][1]
+        _, _, logs = train_learner(CqlConfig(gap=gap, **settings), arms(action, action), iterations=60)
+        result[gap] = logs["loss/penalty_weight"], logs["loss/penalty"]
+    assert result[1.0][0] < 1e-2 < result[-0.5][0] < 1.0 < result[-1.0][0] < 100.0
+    assert result[1.0][1] > result[-0.5][1] > result[-1.0][1]
 
 
 def test_timeouts_bootstrap():
@@ -334,20 +335,20 @@ def test_timeouts_bootstrap():
     table = Table(jnp.ones((20, 10, 3)), jnp.zeros((20, 10, 1)), ones, never, number == 8, number < 9)
     config = IqlConfig(network=NETWORK, gamma=0.8, tau=0.1, expectile=0.5, **FAST)
     for data, worth in ((table, 5.0), (replace(table, terminated=table.usable), 1.0)):
-        _, _, logs = learned(config, data)
+        _, _, logs = train_learner(config, data)
         assert logs["loss/mean_value"] == pytest.approx(worth, rel=0.05)
 
 
 @pytest.mark.slow
 def test_weights_select_training_steps(bandit):
-    """Only the arms around 0.3 have weight: for all that is learned, or for the policy alone."""
+    """Only the arms around 0.3 have weight: for policy and critics, or for the policy alone."""
     weights = np.zeros((500, 2))
     weights[:, 0] = np.abs(np.asarray(bandit.action[:, 0, 0]) - 0.3) < 0.05
     chosen = bandit.action[:, 0, 0][weights[:, 0] > 0]
     config = IqlConfig(network=NETWORK, inverse_temperature=0.0, loss="mse", **FAST)
     for weighted, mean in (("all", float(chosen.mean())), ("policy", 0.0)):
         records = ExperienceConfig(weighted=weighted)
-        learner, state, logs = learned(replace(config, records=records), bandit, weights=weights)
+        learner, state, logs = train_learner(replace(config, records=records), bandit, weights=weights)
         action = float(learner.distribution(state.parameters, {"pendulum": jnp.ones(3)}).mode()[0])
         assert action == pytest.approx(0.3, abs=0.05)
         assert logs["loss/mean_q"] == pytest.approx(mean, abs=0.08)
@@ -397,9 +398,9 @@ def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     again = training_data(config, Logged(), bandit, weights)
     for _ in range(3):
         state = iterate(again, state)[0]
-    one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
-    for mine, theirs in zip(one, other, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    one, other = ([_plain(leaf) for leaf in jax.tree.leaves(batch)] for batch in (state, states[-1]))
+    for left, right in zip(one, other, strict=True):
+        np.testing.assert_array_equal(left, right)
     if name == "td3_bc":
         # Six updates with a delay of two: the policy moved in three of them.
         counts = {
@@ -450,18 +451,23 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
 @pytest.mark.parametrize(("kind", "every"), [(IQL, 1), (TD3_BC, TD3_BC.delay)])
 @pytest.mark.parametrize("falling", [1.0, 0.5])
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
-    """Adam's step under a constant gradient is its rate, whatever moves how often."""
+    """Adam's step under a constant gradient is its rate; the policy of TD3+BC takes every second step."""
     config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
-    learner = config.build(Logged(), arms([0.0], [0.0]), 4)
-    adam = learner.adam(config.policy_rate, every)
     weights = jnp.zeros(1)
 
-    def move(state, _):
-        change, state = adam.update(jnp.ones(1), state, weights)
-        return state, change[0]
+    def rates(config, count):
+        adam = config.build(Logged(), arms([0.0], [0.0]), 4).adam(config.policy_rate, every)
 
-    moves = -np.asarray(jax.lax.scan(move, adam.init(weights), None, 40 // every + 1)[1])
-    fallen = np.minimum(np.arange(len(moves)) / (falling * 40 // every), 1.0)
-    np.testing.assert_allclose(moves, 1e-3 - 0.75e-3 * fallen, rtol=1e-4)
+        def move(state, _):
+            change, state = adam.update(jnp.ones(1), state, weights)
+            return state, change[0]
+
+        return -np.asarray(jax.lax.scan(move, adam.init(weights), None, count)[1])
+
+    count = 40 // every + 1
+    share = np.minimum(np.arange(count) / (falling * 40 // every), 1.0)
+    np.testing.assert_allclose(rates(config, count), 1e-3 - 0.75e-3 * share, rtol=1e-4)
+    # A share of less than one update is one update.
+    np.testing.assert_allclose(rates(replace(config, falling=1e-3), 2), [1e-3, 0.25e-3], rtol=1e-4)
     with pytest.raises(UsageError, match=r"falling is 0\.0; use more than 0"):
         replace(config, falling=0.0)

@@ -51,7 +51,7 @@ PPO = PpoConfig(
 BC = BcConfig(network=NETWORK, batch=256, updates=100, learning_rate=2e-3)
 
 
-def trained(config, data, steps):
+def train(config, data, steps):
     """A learner per seed after some steps: the learner, its states, and what was logged by iteration."""
     iterations = -(-steps // config.steps_per_iteration)
     learner = config.build(Pendulum(), data, iterations)
@@ -69,34 +69,34 @@ def trained(config, data, steps):
 
 
 @partial(jax.jit, static_argnums=0)
-def driven(distribution, parameters, key=99):
+def evaluate(distribution, parameters, key=99):
     """Mean return of each seed over 100 episodes by the mode, and what it did in them."""
-    judge = partial(returns, distribution, key=jax.random.key(key))
-    earned, shown = jax.vmap(judge)(parameters)
-    return earned.mean(axis=1), shown
+    returns_of = partial(returns, distribution, key=jax.random.key(key))
+    earned, demonstrations = jax.vmap(returns_of)(parameters)
+    return earned.mean(axis=1), demonstrations
 
 
 @pytest.fixture(scope="module")
 def expert():
     """SAC after 8,000 steps: its returns, what the first seed did in other episodes, and what was logged."""
-    learner, states, logs = trained(SAC, (), 8_000)
-    found, _ = driven(learner.distribution, states.parameters)
-    _, shown = driven(learner.distribution, states.parameters, 7)
-    moments = jax.tree.map(lambda leaf: leaf[0].reshape(-1, *leaf.shape[3:]), shown)
-    return found, Demonstrations(moments.stored, moments.action), logs
+    learner, states, logs = train(SAC, (), 8_000)
+    mean_returns, _ = evaluate(learner.distribution, states.parameters)
+    _, demonstrations = evaluate(learner.distribution, states.parameters, 7)
+    moments = jax.tree.map(lambda leaf: leaf[0].reshape(-1, *leaf.shape[3:]), demonstrations)
+    return mean_returns, Demonstrations(moments.stored, moments.action), logs
 
 
 def test_pendulum_equals_gymnasiums():
-    theirs = gymnasium.make("Pendulum-v1")
-    theirs.reset(seed=3)
-    angle, rate = theirs.unwrapped.state
-    ours, step = Pendulum(), jax.jit(Pendulum().step)
+    gym_pendulum = gymnasium.make("Pendulum-v1")
+    gym_pendulum.reset(seed=3)
+    angle, rate = gym_pendulum.unwrapped.state
+    pendulum, step = Pendulum(), jax.jit(Pendulum().step)
     array = partial(jnp.full, (1,), dtype=jnp.float32)
     state = Swing(array(angle), array(rate), jnp.zeros(1, jnp.int32), array(0.0))
-    now = Environments(state, jnp.zeros(1, bool), ours.observe_all((), ours.stored(state)))
+    now = Environments(state, jnp.zeros(1, bool), pendulum.observe_all((), pendulum.stored(state)))
     actions = np.random.default_rng(0).uniform(-1, 1, 200)
     for number, action in enumerate(actions):
-        seen, reward, terminated, truncated, _ = theirs.step(np.array([MAX_TORQUE * action]))
+        seen, reward, terminated, truncated, _ = gym_pendulum.step(np.array([MAX_TORQUE * action]))
         now, outcome = step((), now, (), jnp.array([[action]], jnp.float32), jax.random.key(0))
         np.testing.assert_allclose(outcome.reward[0], reward, rtol=2e-3, atol=2e-3)
         np.testing.assert_allclose(now.observation["pendulum"][0], seen, rtol=2e-3, atol=2e-3)
@@ -106,8 +106,8 @@ def test_pendulum_equals_gymnasiums():
 
 @pytest.mark.slow
 def test_sac_swings_up(expert):
-    found, _, logs = expert
-    assert (found > -200).all(), found
+    mean_returns, _, logs = expert
+    assert (mean_returns > -200).all(), mean_returns
     # What is logged is what happened: whole episodes, a temperature that is learned, values of the right size.
     count = np.asarray(logs["rollout/return/n"])
     episodes = np.asarray(logs["rollout/return"])[count > 0] / count[count > 0]
@@ -119,22 +119,22 @@ def test_sac_swings_up(expert):
 
 @pytest.mark.slow
 def test_ppo_swings_up():
-    learner, states, _ = trained(PPO, (), 80_000)
-    found, _ = driven(learner.distribution, states.parameters)
-    assert (found > -300).all(), found
+    learner, states, _ = train(PPO, (), 80_000)
+    mean_returns, _ = evaluate(learner.distribution, states.parameters)
+    assert (mean_returns > -300).all(), mean_returns
 
 
 @pytest.mark.slow
 def test_cloned_policy_swings_up_like_its_expert(expert):
-    best, shown, _ = expert
-    learner, states, _ = trained(BC, shown, 20 * BC.steps_per_iteration)
-    found, _ = driven(learner.distribution, states.parameters)
-    assert (found > 1.1 * best[0]).all(), (found, best)
+    best, demonstrations, _ = expert
+    learner, states, _ = train(BC, demonstrations, 20 * BC.steps_per_iteration)
+    mean_returns, _ = evaluate(learner.distribution, states.parameters)
+    assert (mean_returns > 1.1 * best[0]).all(), (mean_returns, best)
 
 
 @pytest.mark.slow
 def test_full_length_trainings_reach_their_targets():
     for config, steps, target in ((SAC, 30_000, -200), (PPO, 300_000, -300)):
-        learner, states, _ = trained(config, (), steps)
-        found, _ = driven(learner.distribution, states.parameters)
-        assert (found > target).all(), found
+        learner, states, _ = train(config, (), steps)
+        mean_returns, _ = evaluate(learner.distribution, states.parameters)
+        assert (mean_returns > target).all(), mean_returns

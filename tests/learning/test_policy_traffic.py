@@ -53,5 +53,5 @@ def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     results = drivax.evaluate("idm", loaded, traffic=with_logged)
     logged = drivax.evaluate("idm", loaded)
     assert results.summary()["traffic"] == "driven_by_bold"
-    distance = [found.summary()["metrics"]["average_ttc"]["mean"] for found in (results, logged)]
+    distance = [table.summary()["metrics"]["average_ttc"]["mean"] for table in (results, logged)]
     assert np.isfinite(distance).all() and distance[0] != distance[1]

@@ -187,6 +187,12 @@ def test_networks_are_clipped_by_their_own_norms():
     np.testing.assert_array_equal(nothing["policy"], [0.0, 0.0])
 
 
+@pytest.mark.parametrize("name", ["environments", "unroll", "epochs", "minibatches"])
+def test_settings_of_zero_are_refused(name):
+    with pytest.raises(ValueError, match="are at least 1"):
+        PpoConfig(**{name: 0})
+
+
 def test_learning_rate_falls_to_a_tenth():
     """The first step of Adam is the rate itself, whatever the gradient; and so are all, if it stays the same."""
     optimiser = clipped_adam(0.5, 1.0, updates=10, eps=0.0)
@@ -195,8 +201,8 @@ def test_learning_rate_falls_to_a_tenth():
     for _ in range(12):
         change, state = optimiser.update({"w": jnp.ones(1)}, state, weights)
         sizes.append(-float(change["w"][0]))
-    wanted = [0.5 - 0.045 * min(step, 10) for step in range(12)]
-    np.testing.assert_allclose(sizes, wanted, rtol=1e-4)
+    expected_sizes = [0.5 - 0.045 * min(step, 10) for step in range(12)]
+    np.testing.assert_allclose(sizes, expected_sizes, rtol=1e-4)
 
 
 @pytest.mark.parametrize("last", [0.1, 1.0])
@@ -214,12 +220,12 @@ def test_settings_of_rate_and_norm_reach_the_optimisers(last):
             change, state = optimiser.update({"w": jnp.array([gradient])}, state, weights)
             sizes.append(-float(change["w"][0]))
         # Adam by hand: moments of 100, 300, 300 with their biases taken out.
-        first, second, wanted = 0.0, 0.0, []
+        first, second, expected_sizes = 0.0, 0.0, []
         for step, gradient in enumerate((100.0, 300.0, 300.0), 1):
             first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
             rate = 0.5 * (1.0 + (last - 1.0) * min(step - 1, 2) / 2)
-            wanted.append(rate * first / (1 - 0.9**step) / np.sqrt(second / (1 - 0.999**step)))
-        np.testing.assert_allclose(sizes, wanted, rtol=1e-4)
+            expected_sizes.append(rate * first / (1 - 0.9**step) / np.sqrt(second / (1 - 0.999**step)))
+        np.testing.assert_allclose(sizes, expected_sizes, rtol=1e-4)
 
 
 def test_updates_are_skipped_beyond_the_target_divergence():

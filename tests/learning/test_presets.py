@@ -56,11 +56,11 @@ def test_published_numbers():
     assert (learner.minibatches, learner.epochs, learner.clip, learner.lambda_) == (8, 4, 0.2, 0.95)
     assert learner.steps_per_iteration // learner.minibatches == 512
     assert (learner.value_coefficient, learner.entropy_coefficient, learner.gradient_norm) == (0.5, 0.01, 0.5)
-    both = settings.load(TrainConfig, "published/bc_sac")
-    cloning = (settings.load(TrainConfig, "published/bc").algorithm, both.algorithm.warm_start.cloning)
+    bc_sac = settings.load(TrainConfig, "published/bc_sac")
+    cloning = (settings.load(TrainConfig, "published/bc").algorithm, bc_sac.algorithm.warm_start.cloning)
     assert {part.last_rate for part in (learner, *cloning)} == {1.0}, "rates stay"
-    assert {part.gradient_norm for part in (sac.algorithm, both.algorithm.sac, *cloning)} == {None}
-    for config in (sac, ppo, both):
+    assert {part.gradient_norm for part in (sac.algorithm, bc_sac.algorithm.sac, *cloning)} == {None}
+    for config in (sac, ppo, bc_sac):
         assert config.earliest_start == config.latest_start == 0, "episodes of 90 steps"
         assert config.task.observation == PRESETS["published"] and config.task.rewards.preset == "published"
 
@@ -87,13 +87,13 @@ def test_published_numbers_of_offline_algorithms():
 
 
 def test_offline_presets_differ_in_the_algorithm_alone():
-    found = [settings.load(TrainConfig, f"offline/{name}") for name in OFFLINE]
-    for config in found[1:]:
-        assert replace(config, algorithm=found[0].algorithm) == found[0]
-        assert config.algorithm.network == found[0].algorithm.network
-        assert config.algorithm.steps_per_iteration == found[0].algorithm.steps_per_iteration
+    configs = [settings.load(TrainConfig, f"offline/{name}") for name in OFFLINE]
+    for config in configs[1:]:
+        assert replace(config, algorithm=configs[0].algorithm) == configs[0]
+        assert config.algorithm.network == configs[0].algorithm.network
+        assert config.algorithm.steps_per_iteration == configs[0].algorithm.steps_per_iteration
 
 
 def test_cql_bc_adds_only_imitation_to_the_baseline():
-    alone, both = (settings.load(TrainConfig, f"offline/{name}").algorithm for name in ("cql", "cql_bc"))
-    assert both.imitation > 0.0 and replace(both, imitation=0.0) == alone
+    alone, bc_sac = (settings.load(TrainConfig, f"offline/{name}").algorithm for name in ("cql", "cql_bc"))
+    assert bc_sac.imitation > 0.0 and replace(bc_sac, imitation=0.0) == alone

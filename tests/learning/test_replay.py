@@ -46,10 +46,10 @@ class Counting:
         return ()
 
     def step(self, data, now, cache, action, key):
-        who, episode, step = jnp.moveaxis(now.state, -1, 0)
-        moved = jnp.stack([who, episode, step + 1], axis=-1)
-        begun = jnp.stack([who, episode + 1, jnp.zeros_like(step)], axis=-1)
-        state = jnp.where(now.over[:, None], begun, moved)
+        env, episode, step = jnp.moveaxis(now.state, -1, 0)
+        moved = jnp.stack([env, episode, step + 1], axis=-1)
+        fresh = jnp.stack([env, episode + 1, jnp.zeros_like(step)], axis=-1)
+        state = jnp.where(now.over[:, None], fresh, moved)
         over = ~now.over & (state[:, 2] >= 1 + (state[:, 0] + 2 * state[:, 1]) % 5)
         ends = state[:, 1] % 2 == 0
         outcome = Outcome(10.0 * moved[:, 1] + moved[:, 2], over & ends, over & ~ends, (), {})
@@ -66,39 +66,39 @@ def fill(config, steps, unroll):
     environment = Counting()
     environments = environment.start((), jax.random.key(0), COUNT)
     buffer = ReplayBuffer(config, environment)
-    kept = buffer.init(environments)
+    replay = buffer.init(environments)
     run = jax.jit(lambda e, key: collect(environment, (), e, act, key, unroll, config.store)[:2])
     for _ in range(steps // unroll):
         environments, rollout = run(environments, jax.random.key(0))
-        kept = jax.jit(buffer.add)(kept, rollout)
-    held = set()
-    for who in range(COUNT):
+        replay = jax.jit(buffer.add)(replay, rollout)
+    stored_steps = set()
+    for env in range(COUNT):
         row, episode, step = 0, 0, 0
         first = max(0, steps - config.capacity // COUNT)
         while row < steps:
-            length = 1 + (who + 2 * episode) % 5
+            length = 1 + (env + 2 * episode) % 5
             # A row per step, and one that only begins the next episode; the newest row has no successor.
             if step < length and first <= row < steps - 1:
-                held.add((who, episode, step))
+                stored_steps.add((env, episode, step))
             episode, step = (episode + 1, 0) if step == length else (episode, step + 1)
             row += 1
-    return buffer, kept, held
+    return buffer, replay, stored_steps
 
 
-def sampled(buffer, kept, count, seed=1, n=1):
-    return buffer.sample((), kept, buffer.draw(kept, jax.random.key(seed), (count,)), 0.9, n)
+def sample_batch(buffer, replay, count, seed=1, n=1):
+    return buffer.sample((), replay, buffer.draw(replay, jax.random.key(seed), (count,)), 0.9, n)
 
 
 @pytest.mark.parametrize("store", ["state", "observation"])
 @pytest.mark.parametrize(("capacity", "steps"), [(60, 12), (60, 20), (60, 24), (37, 48), (60, 84)])
 def test_samples_are_collected_steps(store, capacity, steps):
     """Before the ring is full, exactly full, and after it was written over once and four times."""
-    buffer, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
-    batch = sampled(buffer, kept, 4000)
+    buffer, replay, stored_steps = fill(ReplayConfig(capacity, store), steps, 4)
+    batch = sample_batch(buffer, replay, 4000)
     before, after = (
         np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.next_observation)
     )
-    assert {tuple(row) for row in before.tolist()} == held
+    assert {tuple(row) for row in before.tolist()} == stored_steps
     # What a step led to is the next state of the same episode, final states included.
     np.testing.assert_array_equal(after, before + np.array([0, 0, 1]))
     final = after[:, 2] == 1 + (after[:, 0] + 2 * after[:, 1]) % 5
@@ -113,21 +113,21 @@ def test_samples_are_collected_steps(store, capacity, steps):
 @pytest.mark.parametrize("steps", [12, 20, 24, 84])
 def test_n_step_returns_against_plain_loops(store, steps):
     """Of three steps: whole, cut short by either end of an episode, and by the newest row."""
-    buffer, kept, held = fill(ReplayConfig(60, store), steps, 4)
-    batch = sampled(buffer, kept, 2000, n=3)
+    buffer, replay, stored_steps = fill(ReplayConfig(60, store), steps, 4)
+    batch = sample_batch(buffer, replay, 2000, n=3)
     before, after = (
         np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.next_observation)
     )
-    assert {tuple(state) for state in before.tolist()} == held
+    assert {tuple(state) for state in before.tolist()} == stored_steps
     lengths = set()
-    for number, (who, episode, first) in enumerate(before.tolist()):
-        last, reward, length = first, 0.0, 1 + (who + 2 * episode) % 5
-        while last < first + 3 and (who, episode, last) in held:
+    for number, (env, episode, first) in enumerate(before.tolist()):
+        last, reward, length = first, 0.0, 1 + (env + 2 * episode) % 5
+        while last < first + 3 and (env, episode, last) in stored_steps:
             reward += 0.9 ** (last - first) * (10.0 * episode + last + 1)
             last += 1
         ended = last == length
         lengths.add((last - first, ended, episode % 2))
-        assert after[number].tolist() == [who, episode, last]
+        assert after[number].tolist() == [env, episode, last]
         assert float(batch.reward[number]) == pytest.approx(reward, rel=1e-6)
         assert float(batch.discount[number]) == pytest.approx(0.9 ** (last - first), rel=1e-6)
         assert bool(batch.terminated[number]) == (ended and episode % 2 == 0)
@@ -136,10 +136,10 @@ def test_n_step_returns_against_plain_loops(store, steps):
 
 
 def test_steps_are_sampled_uniformly():
-    buffer, kept, held = fill(ReplayConfig(60), 84, 4)
-    batch = np.asarray(sampled(buffer, kept, 20_000).observation["place"]).astype(int)
+    buffer, replay, stored_steps = fill(ReplayConfig(60), 84, 4)
+    batch = np.asarray(sample_batch(buffer, replay, 20_000).observation["place"]).astype(int)
     counts = np.unique(batch, axis=0, return_counts=True)[1]
-    assert len(counts) == len(held)
+    assert len(counts) == len(stored_steps)
     assert stats.chisquare(counts).pvalue > 0.01
     # The oracle sees a bias: one of two environments twice as often fails it.
     assert stats.chisquare(np.concatenate([counts, 2 * counts])).pvalue < 1e-9
@@ -148,12 +148,12 @@ def test_steps_are_sampled_uniformly():
 def test_rollouts_that_do_not_fit_are_refused():
     with pytest.raises(UsageError, match=r"capacity to 6 or more"):
         ReplayConfig(capacity=5).rows(3)
-    buffer, kept, _ = fill(ReplayConfig(12), 4, 4)
+    buffer, replay, _ = fill(ReplayConfig(12), 4, 4)
     environment = buffer.environment
     environments = environment.start((), jax.random.key(0), COUNT)
     _, rollout, _ = collect(environment, (), environments, act, jax.random.key(0), 5, "state")
     with pytest.raises(UsageError, match="5 steps do not fit a replay buffer of 4 rows"):
-        buffer.add(kept, rollout)
+        buffer.add(replay, rollout)
 
 
 @pytest.mark.slow
@@ -172,8 +172,8 @@ def test_states_and_observations_give_the_same_batch():
         for part in (rollout, replace(rollout, state=None, observation=rollout.extra)):
             store = "state" if part.observation is None else "observation"
             buffer = ReplayBuffer(ReplayConfig(64, store), environment)
-            kept = buffer.add(buffer.init(environments), part)
-            yield buffer.sample(bank, kept, buffer.draw(kept, jax.random.key(2), (64,)), 0.9)
+            replay = buffer.add(buffer.init(environments), part)
+            yield buffer.sample(bank, replay, buffer.draw(replay, jax.random.key(2), (64,)), 0.9)
 
     exact, stored = jax.jit(lambda bank: tuple(batches(bank)))(worlds.worlds())
     assert bool(exact.terminated.any()) or float(jnp.abs(exact.reward).max()) > 0

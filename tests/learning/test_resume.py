@@ -74,12 +74,12 @@ def test_warm_start_pretrains_and_then_reinforces(run):
         pytest.skip("has one phase")
     rows = [mean_logs(row) for row in raw]
     same = partial(np.array_equal, equal_nan=True)  # an episode that began in the middle has no return
-    begun, cloned, learned = (jax.device_get(states[number]) for number in (0, 2, 6))
+    initial, cloned, learned = (jax.device_get(states[number]) for number in (0, 2, 6))
     # Cloning moves the policy alone, and logs nothing of what it did not do.
     for part in ("environments", "optimiser", "iteration"):
-        before, after = (jax.tree.leaves(getattr(state.learner, part)) for state in (begun, cloned))
+        before, after = (jax.tree.leaves(getattr(state.learner, part)) for state in (initial, cloned))
         assert all(map(same, before, after)), part
-    assert not all(map(same, *(jax.tree.leaves(state.parameters) for state in (begun, cloned))))
+    assert not all(map(same, *(jax.tree.leaves(state.parameters) for state in (initial, cloned))))
     for row in rows[:2]:
         assert "loss/imitation" in row and "loss/policy" not in row
         assert not any(name.startswith("reward/") for name in row)
@@ -98,7 +98,7 @@ def test_warm_start_pretrains_and_then_reinforces(run):
         for state in map(jax.device_get, (states[2], states[4]))
     ]
     assert not all(map(same, *values))
-    moved = jax.tree.leaves(begun.learner.environments), jax.tree.leaves(learned.learner.environments)
+    moved = jax.tree.leaves(initial.learner.environments), jax.tree.leaves(learned.learner.environments)
     assert not all(map(same, *moved))
 
 
@@ -107,7 +107,7 @@ def test_networks_transfer_to_another_run(tmp_path):
     """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
     hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)
     fresh = jax.jit(hot.init)(SHOWN, jax.random.key(5))
-    for number, (name, wanted) in enumerate(TAKEN.items()):
+    for number, (name, expected_paths) in enumerate(TAKEN.items()):
         former = jax.jit(ALGORITHMS[name].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(6))
         Checkpoints(tmp_path / "checkpoints").save(number, former)
         origin = PretrainedRun(tmp_path, number, [])
@@ -115,12 +115,12 @@ def test_networks_transfer_to_another_run(tmp_path):
             with pytest.raises(DataError, match=r"no \.parameters.*; start from a run with the same network"):
                 origin.networks(fresh)
             continue
-        found = origin.networks(jax.eval_shape(lambda: fresh))
-        assert list(found) == wanted
-        state = replace_networks(fresh, found)
+        networks = origin.networks(jax.eval_shape(lambda: fresh))
+        assert list(networks) == expected_paths
+        state = replace_networks(fresh, networks)
         inner = former.learner if name == "bc_sac" else former
         same = {"parameters": former.parameters} | {
-            path: getattr(inner, path) for path in ("critic", "target") if f".{path}" in wanted
+            path: getattr(inner, path) for path in ("critic", "target") if f".{path}" in expected_paths
         }
         for field in fields(fresh):
             expected = same.get(field.name, getattr(fresh, field.name))
@@ -129,10 +129,12 @@ def test_networks_transfer_to_another_run(tmp_path):
         assert float(state.log_temperature) == pytest.approx(np.log(0.5))
     # And back into a warm start, where they lie one level deeper.
     both = jax.jit(ALGORITHMS["bc_sac"].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(7))
-    found = PretrainedRun(tmp_path, list(TAKEN).index("sac"), []).networks(both)
-    assert list(found) == [".parameters", ".learner.critic", ".learner.target"]
+    networks = PretrainedRun(tmp_path, list(TAKEN).index("sac"), []).networks(both)
+    assert list(networks) == [".parameters", ".learner.critic", ".learner.target"]
     jax.tree.map(
-        np.testing.assert_array_equal, replace_networks(both, found).learner.critic, found[".learner.critic"]
+        np.testing.assert_array_equal,
+        replace_networks(both, networks).learner.critic,
+        networks[".learner.critic"],
     )
 
 

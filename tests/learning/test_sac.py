@@ -64,15 +64,15 @@ def test_losses_against_numpy(sac):
             "now": policy.log_prob(now),
         }
 
-    found = {name: np.asarray(value, np.float64) for name, value in outputs(trained).items()}
-    assert not np.allclose(found["q"][0], found["q"][1]), "the critics are two networks"
-    value = np.minimum(*found["target"]) - 0.2 * found["then"]
+    result = {name: np.asarray(value, np.float64) for name, value in outputs(trained).items()}
+    assert not np.allclose(result["q"][0], result["q"][1]), "the critics are two networks"
+    value = np.minimum(*result["target"]) - 0.2 * result["then"]
     td_target = np.asarray(batch.reward) + np.asarray(batch.discount) * np.where(batch.terminated, 0.0, value)
     expected = {
-        "critic": 0.5 * ((found["q"] - td_target) ** 2).mean(),
-        "policy": (0.2 * found["now"] - np.minimum(*found["policy_q"])).mean(),
-        "mean_q": found["q"].mean(),
-        "entropy": -found["now"].mean(),
+        "critic": 0.5 * ((result["q"] - td_target) ** 2).mean(),
+        "policy": (0.2 * result["now"] - np.minimum(*result["policy_q"])).mean(),
+        "mean_q": result["q"].mean(),
+        "entropy": -result["now"].mean(),
         "temperature": 0.2,
     }
     assert set(logs) == set(expected)
@@ -94,15 +94,15 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
 
         return {name: part(name) for name in ("total", "critic", "policy")}
 
-    found = slopes_of(trained)
-    slopes = {name: slope for name, (slope, _) in found.items()}
+    result = slopes_of(trained)
+    slopes = {name: slope for name, (slope, _) in result.items()}
     for name in ("critic", "policy"):
         own, whole = (jax.tree.leaves(getattr(slopes[which], name)) for which in (name, "total"))
         for one, other in zip(own, whole, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
         assert max(float(jnp.abs(leaf).max()) for leaf in own) > 1e-3
     # The temperature's slope is alpha (entropy - target): by hand, from what is logged.
-    slope = 0.2 * (float(found["total"][1]["entropy"]) + 1.0)
+    slope = 0.2 * (float(result["total"][1]["entropy"]) + 1.0)
     assert float(slopes["total"].log_temperature) == pytest.approx(slope, rel=1e-3, abs=1e-5)
 
 
@@ -134,7 +134,7 @@ def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
 
 @pytest.fixture(scope="module")
 def logged():
-    """Experience of which every number says that the log has it, to train with from the pendulum."""
+    """Logged steps whose numbers no step of the pendulum has."""
     steps = jnp.ones((5, 6), bool).at[:, -1].set(False)
     table = Table(
         seen=jnp.full((5, 6, 3), 9.0), action=jnp.full((5, 6, 1), 0.25), reward=jnp.full((5, 6), 50.0),
@@ -213,6 +213,9 @@ def test_settling_fits_critics_to_a_fixed_policy(logged):
 def test_impossible_settings_are_refused():
     with pytest.raises(UsageError, match="demonstrations is 1"):
         SacConfig(network=NETWORK, demonstrations=1)
+    for share, count in ((0.03, 0), (0.97, 16)):
+        with pytest.raises(UsageError, match=f"demonstrations are {count} of 16 steps of a batch"):
+            replace(CONFIG, demonstrations=share)
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
     with pytest.raises(UsageError, match=r"raise replay\.capacity"):

@@ -1,4 +1,4 @@
-"""Places are drawn in proportion to their weights."""
+"""Steps are drawn in proportion to their weights."""
 
 import time
 from functools import partial
@@ -15,8 +15,8 @@ COUNT = 200_000
 _draw = partial(jax.jit, static_argnums=2)(sample_steps)
 
 
-def drawn(weights, seed=0, count=COUNT):
-    """How often each place was drawn."""
+def draw_counts(weights, seed=0, count=COUNT):
+    """Return how often each step is drawn."""
     index, step = _draw(sampler(weights), jax.random.key(seed), (count,))
     counts = np.zeros(weights.shape, int)
     np.add.at(counts, (np.asarray(index), np.asarray(step)), 1)
@@ -26,44 +26,44 @@ def drawn(weights, seed=0, count=COUNT):
 @pytest.fixture(scope="module")
 def weights():
     weights = np.random.default_rng(0).gamma(0.5, size=(7, 9))
-    # Zeros at both ends, beside each other, and of a whole scenario.
+    # Zeros at both ends, next to each other, and of a whole scenario.
     weights[0, :2] = weights[3] = weights[6, -3:] = 0.0
     return weights
 
 
 def test_frequencies_follow_the_weights(weights):
-    counts = drawn(weights)
-    there = weights > 0.0
-    assert counts[~there].sum() == 0 and counts.sum() == COUNT
-    expected = COUNT * weights[there] / weights.sum()
+    counts = draw_counts(weights)
+    positive = weights > 0.0
+    assert counts[~positive].sum() == 0 and counts.sum() == COUNT
+    expected = COUNT * weights[positive] / weights.sum()
     enough = expected > 5
     assert (
         stats.chisquare(
-            [*counts[there][enough], counts[there][~enough].sum()],
+            [*counts[positive][enough], counts[positive][~enough].sum()],
             [*expected[enough], expected[~enough].sum()],
         ).pvalue
         > 0.01
     )
     # The oracle sees weights that are wrong by a tenth.
     wrong = expected[enough] * np.where(np.arange(enough.sum()) % 2, 1.1, 1.0)
-    wrong *= counts[there][enough].sum() / wrong.sum()
-    assert stats.chisquare(counts[there][enough], wrong).pvalue < 1e-6
+    wrong *= counts[positive][enough].sum() / wrong.sum()
+    assert stats.chisquare(counts[positive][enough], wrong).pvalue < 1e-6
 
 
 def test_probabilities_are_exact_among_many_steps():
-    """Among a million places float32 would be wrong by a twentieth; here scenarios far apart stay equally likely."""
-    many = sampler(np.ones((12_000, 91)))
-    steps = np.diff(np.asarray(many.cumulative).astype(np.int64), prepend=0)
+    """Of a million equal weights each is right within 0.03 %, where float32 is wrong by up to 6 %."""
+    uniform = sampler(np.ones((12_000, 91)))
+    steps = np.diff(np.asarray(uniform.cumulative).astype(np.int64), prepend=0)
     np.testing.assert_allclose(steps, (2**32 - 1) / steps.size, rtol=3e-4)
-    heavy = np.ones((12_000, 91))
-    heavy[-1, -1] = heavy.sum()
-    counts = _draw(sampler(heavy), jax.random.key(1), (COUNT,))
+    skewed = np.ones((12_000, 91))
+    skewed[-1, -1] = skewed.sum()
+    counts = _draw(sampler(skewed), jax.random.key(1), (COUNT,))
     assert (np.asarray(counts[0]) == 11_999).mean() == pytest.approx(0.5, abs=0.01)
 
 
 def test_draws_follow_from_the_key_alone(weights):
-    made = sampler(weights)
-    one, again, other = (_draw(made, jax.random.key(seed), (50,)) for seed in (3, 3, 4))
+    distribution = sampler(weights)
+    one, again, other = (_draw(distribution, jax.random.key(seed), (50,)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, again)
     assert (np.asarray(one) != np.asarray(other)).any()
 
@@ -77,9 +77,9 @@ def test_zero_weights_are_refused():
 
 @pytest.mark.slow
 def test_millions_of_draws_per_second():
-    made: Sampler = sampler(np.random.default_rng(0).gamma(0.5, size=(10_000, 91)))
+    distribution: Sampler = sampler(np.random.default_rng(0).gamma(0.5, size=(10_000, 91)))
     count = 1_000_000
-    jax.block_until_ready(_draw(made, jax.random.key(0), (count,)))
-    began = time.perf_counter()
-    jax.block_until_ready(_draw(made, jax.random.key(1), (count,)))
-    assert count / (time.perf_counter() - began) > 1e6
+    jax.block_until_ready(_draw(distribution, jax.random.key(0), (count,)))
+    start_s = time.perf_counter()
+    jax.block_until_ready(_draw(distribution, jax.random.key(1), (count,)))
+    assert count / (time.perf_counter() - start_s) > 1e6

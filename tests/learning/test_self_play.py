@@ -91,8 +91,8 @@ def test_groups_reset_once_when_all_episodes_are_over(bank, experience):
     resets = over.all(axis=2)[:-1]
     assert resets.sum() >= 4 and len(np.unique(index)) == 3
     np.testing.assert_array_equal(step[1:, :, 0] == step[:-1, :, 0] + 1, ~resets)
-    begun = step[1:, :, 0][resets]
-    assert (begun >= EARLIEST).all() and (begun <= LATEST).all()
+    first_steps = step[1:, :, 0][resets]
+    assert (first_steps >= EARLIEST).all() and (first_steps <= LATEST).all()
     # An episode that ended stays over until its group starts again; only padding is over from the start.
     expected = np.where(resets[..., None], slot[1:] >= moving, over[:-1] | ends[:-1])
     np.testing.assert_array_equal(over[1:], expected)
@@ -111,13 +111,13 @@ def test_groups_step_as_a_plain_loop_of_step_together(bank, environment, experie
     now, action, outcome = experience
     over, slots = grouped(now.over), grouped(now.state.context.slot)
     index, step = grouped(now.state.context.index), grouped(now.state.context.step)
-    begins = [(0, group) for group in range(COUNT // VEHICLES)]
-    begins += [(time + 1, group) for time, group in np.argwhere(over.all(axis=2)[:-1])]
+    starts = [(0, group) for group in range(COUNT // VEHICLES)]
+    starts += [(time + 1, group) for time, group in np.argwhere(over.all(axis=2)[:-1])]
     reset, one = jax.jit(SIMULATOR.reset_together), jax.jit(SIMULATOR.step_together)
     observe = jax.jit(SIMULATOR.observe_together)
     reward, memory = grouped(outcome.reward), jax.tree.map(grouped, memory_of(now.state))
-    seen = {name: grouped(value) for name, value in now.observation.items()}
-    for first, group in begins:
+    observations = {name: grouped(value) for name, value in now.observation.items()}
+    for first, group in starts:
         states = reset(bank, index[first, group, 0], slots[first, group], step[first, group, 0])
         dead = slots[first, group] >= bank.agents.shape[2]
         for time in range(first, STEPS):
@@ -125,7 +125,7 @@ def test_groups_step_as_a_plain_loop_of_step_together(bank, environment, experie
             same = partial(np.testing.assert_allclose, atol=1e-3)
             jax.tree.map(same, jax.device_get(memory_of(states)), remembered)
             observation = observe(bank, states)
-            for name, value in seen.items():
+            for name, value in observations.items():
                 np.testing.assert_allclose(observation[name], value[time, group], atol=1e-3, err_msg=name)
             np.testing.assert_array_equal(dead, over[time, group])
             if dead.all():
@@ -215,6 +215,8 @@ def test_past_policy_drives_all_but_ego_of_its_groups(environment):
     assert past_policy(Mixture((("log", log), ("own", log)), (0.5, 0.5)), 24) is past_policy(log, 24) is None
     with pytest.raises(UsageError, match=r"self_play.past is 2, self_play.refresh 50; use a share"):
         SelfPlayConfig(past=2.0)
+    with pytest.raises(UsageError, match=r"self_play.past is 0.1 of 4 groups: none; raise it"):
+        replace(environment, config=SelfPlayConfig(VEHICLES, past=0.1)).past(COUNT)
 
 
 class WithPast(Pendulum):
@@ -245,11 +247,11 @@ def test_ppo_acts_with_the_past_policy_and_learns_nothing_of_it():
     assert all(
         same(state.past, states[number].parameters) for state, number in zip(states, origin, strict=True)
     )
-    state, seen = states[3], states[3].environments.observation
+    state, observations = states[3], states[3].environments.observation
     assert not same(state.past, state.parameters)
     act = jax.jit(learner.sample_action)
     mixed, current, older = (
-        act(replace(state, parameters=now, past=before), seen, jax.random.key(1)).action
+        act(replace(state, parameters=now, past=before), observations, jax.random.key(1)).action
         for now, before in ((state.parameters, state.past), (state.parameters,) * 2, (state.past,) * 2)
     )
     np.testing.assert_array_equal(mixed[0::2], current[0::2])

@@ -1,4 +1,4 @@
-"""The pool of threads of a training of several agents."""
+"""The thread pool of a training of several seeds."""
 
 import os
 import subprocess
@@ -22,12 +22,12 @@ print(os.environ["NPROC"], sum("XLA" in name for name in names))
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads as Linux lists them")
-@pytest.mark.parametrize("given", [None, "3"])
-def test_thread_pool_has_eight_threads_by_default(given):
+@pytest.mark.parametrize("requested", [None, "3"])
+def test_thread_pool_has_eight_threads_by_default(requested):
     environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
-    environment |= {"NPROC": given} if given else {}
+    environment |= {"NPROC": requested} if requested else {}
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
     )
-    wanted, threads = map(int, result.stdout.split())
-    assert wanted == int(given or 8) and threads >= wanted
+    pool_size, threads = map(int, result.stdout.split())
+    assert pool_size == int(requested or 8) and threads >= pool_size

@@ -220,7 +220,7 @@ def test_logged_steps_are_those_of_the_log(bank):
         training_environment(replace(CONFIG, algorithm=bc, traffic=traffic))
         for traffic in ({"idm": 0.5, "log": 0.5}, "log")
     )
-    seen = [
+    demonstrations = [
         jax.jit(each.demonstrations, static_argnums=2)(bank, jax.random.key(0), 8) for each in (mixture, log)
     ]
-    jax.tree.map(np.testing.assert_array_equal, *seen)
+    jax.tree.map(np.testing.assert_array_equal, *demonstrations)

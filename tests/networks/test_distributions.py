@@ -33,7 +33,7 @@ MIXTURE = Mixture(
 ALL = {"gaussian": GAUSSIAN, "beta": BETA, "grid": GRID, "mixture": MIXTURE}
 
 
-def draws(one, count=20_000):
+def raw_samples(one, count=20_000):
     keys = jax.random.split(jax.random.key(0), count)
     return jnp.asarray(quick(lambda one, keys: jax.vmap(one.sample)(keys), one, keys))
 
@@ -47,9 +47,9 @@ def gaussian_density(action, loc, scale):
 
 def test_gaussian_log_prob_and_its_jacobian():
     action = np.array([0.7, -0.99])
-    wanted = np.log(gaussian_density(action, np.asarray(GAUSSIAN.loc), np.asarray(GAUSSIAN.scale))).sum()
+    expected = np.log(gaussian_density(action, np.asarray(GAUSSIAN.loc), np.asarray(GAUSSIAN.scale))).sum()
     raw_action = GAUSSIAN.raw_action(jnp.asarray(action))
-    assert float(GAUSSIAN.log_prob(raw_action)) == pytest.approx(wanted, rel=1e-4)
+    assert float(GAUSSIAN.log_prob(raw_action)) == pytest.approx(expected, rel=1e-4)
     np.testing.assert_allclose(GAUSSIAN.action(raw_action), action, atol=1e-5)
 
 
@@ -62,16 +62,16 @@ def test_gaussian_density_integrates_to_one():
 
 def test_gaussian_mean_action_equals_quadrature():
     cases = [(loc, scale) for loc in (-3.0, 0.0, 0.8) for scale in (1e-3, 0.3, 2.0)]
-    wanted = [
+    expected = [
         integrate.quad(lambda z, loc=loc, s=s: np.tanh(loc + s * z) * stats.norm.pdf(z), -9, 9)[0]
         for loc, s in cases
     ]
-    found = quick(lambda one: one.mean_action(), SquashedGaussian(*jnp.asarray(cases).T))
-    np.testing.assert_allclose(found, wanted, atol=1e-3)
+    result = quick(lambda one: one.mean_action(), SquashedGaussian(*jnp.asarray(cases).T))
+    np.testing.assert_allclose(result, expected, atol=1e-3)
 
 
 def test_gaussian_samples_have_its_moments():
-    raw_action = draws(GAUSSIAN)
+    raw_action = raw_samples(GAUSSIAN)
     np.testing.assert_allclose(raw_action.mean(0), GAUSSIAN.loc, atol=0.03)
     np.testing.assert_allclose(raw_action.std(0), GAUSSIAN.scale, atol=0.03)
     np.testing.assert_allclose(GAUSSIAN.mode(), np.median(np.tanh(raw_action), axis=0), atol=0.03)
@@ -87,7 +87,7 @@ def test_beta_against_scipy():
     assert float(BETA.entropy_estimate(jax.random.key(0))) == pytest.approx(
         reference.entropy().sum(), rel=1e-4
     )
-    actions = BETA.action(draws(BETA))
+    actions = BETA.action(raw_samples(BETA))
     for axis in range(2):
         one = stats.beta(float(BETA.alpha[axis]), float(BETA.beta[axis]), loc=-1, scale=2)
         assert stats.kstest(np.asarray(actions[:, axis]), one.cdf).pvalue > 1e-3
@@ -100,19 +100,19 @@ def test_a_uniform_beta_has_its_mode_in_the_middle():
 
 
 def test_grid_against_scipy():
-    wanted = special.log_softmax(np.asarray(GRID.logits, float))
+    expected = special.log_softmax(np.asarray(GRID.logits, float))
     table = np.array([(a, b) for a in LEVELS[0] for b in LEVELS[1]])
     raw_action = jnp.arange(15.0)[:, None]
     batch = Grid(jnp.broadcast_to(GRID.logits, (15, 15)), LEVELS)
-    np.testing.assert_allclose(batch.log_prob(raw_action), wanted, rtol=1e-5)
+    np.testing.assert_allclose(batch.log_prob(raw_action), expected, rtol=1e-5)
     np.testing.assert_array_equal(batch.action(raw_action), table.astype(np.float32))
     np.testing.assert_array_equal(batch.raw_action(jnp.asarray(table, jnp.float32) + 0.1), raw_action)
-    np.testing.assert_array_equal(GRID.mode(), table[np.argmax(wanted)].astype(np.float32))
-    np.testing.assert_allclose(GRID.mean_action(), np.exp(wanted) @ table, atol=1e-6)
+    np.testing.assert_array_equal(GRID.mode(), table[np.argmax(expected)].astype(np.float32))
+    np.testing.assert_allclose(GRID.mean_action(), np.exp(expected) @ table, atol=1e-6)
     entropy = float(GRID.entropy_estimate(jax.random.key(0)))
-    assert entropy == pytest.approx(stats.entropy(np.exp(wanted)), rel=1e-5)
-    counts = np.bincount(np.asarray(draws(GRID)[:, 0], int), minlength=15)
-    assert stats.chisquare(counts, np.exp(wanted) * counts.sum()).pvalue > 1e-3
+    assert entropy == pytest.approx(stats.entropy(np.exp(expected)), rel=1e-5)
+    counts = np.bincount(np.asarray(raw_samples(GRID)[:, 0], int), minlength=15)
+    assert stats.chisquare(counts, np.exp(expected) * counts.sum()).pvalue > 1e-3
 
 
 def test_mixture_against_scipy():
@@ -133,7 +133,7 @@ def test_mixture_against_scipy():
 def test_samples_agree_with_mean_mode_and_entropy(kind):
     one = ALL[kind]
     assert isinstance(one, Distribution)
-    raw_action = draws(one)
+    raw_action = raw_samples(one)
     keys = jax.random.split(jax.random.key(1), len(raw_action))
 
     def run(one, raw_action, keys):
@@ -156,7 +156,7 @@ def test_samples_are_differentiable_in_the_parameters(kind):
         return one.action(one.sample(key))[0] ** 2
 
     keys = jax.random.split(jax.random.key(3), 40_000)
-    found = quick(jax.vmap(jax.grad(second), (None, 0)), raw, keys).mean(0)
+    result = quick(jax.vmap(jax.grad(second), (None, 0)), raw, keys).mean(0)
 
     def moment(raw):
         if kind == "beta":
@@ -167,8 +167,8 @@ def test_samples_are_differentiable_in_the_parameters(kind):
         return np.trapezoid(np.tanh(grid) ** 2 * stats.norm.pdf(grid, raw[0], scale), grid)
 
     raw = np.asarray(raw, float)
-    wanted = [(moment(raw + step) - moment(raw - step)) / 2e-4 for step in 1e-4 * np.eye(2)]
-    np.testing.assert_allclose(found, wanted, atol=0.01)
+    expected = [(moment(raw + step) - moment(raw - step)) / 2e-4 for step in 1e-4 * np.eye(2)]
+    np.testing.assert_allclose(result, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -197,7 +197,7 @@ def test_first_parameters_are_centred_with_the_requested_scale():
     gaussian = distribution("gaussian", jnp.asarray(initial_parameters("gaussian", actions, 0.3)), actions)
     np.testing.assert_allclose(gaussian.scale, 0.3, rtol=1e-5)
     beta = distribution("beta", jnp.asarray(initial_parameters("beta", actions, 0.3)), actions)
-    np.testing.assert_allclose(beta.action(draws(beta)).std(0), 0.3, rtol=0.02)
+    np.testing.assert_allclose(beta.action(raw_samples(beta)).std(0), 0.3, rtol=0.02)
     grid = distribution("grid", jnp.asarray(initial_parameters("grid", actions, 0.3)), actions)
     weights = [stats.norm.pdf(np.array(axis), 0, 0.3) for axis in LEVELS]
     np.testing.assert_allclose(
@@ -216,5 +216,8 @@ def test_mistakes_are_named():
         parameter_count("grid", Actions(2))
     with pytest.raises(UsageError, match=r"a Beta of first_scale 0\.6 has no peak; use less"):
         initial_parameters("beta", Actions(2), 0.6)
+    for kind, scale in (("gaussian", 3.0), ("mixture", (0.3, 1e-4))):
+        with pytest.raises(UsageError, match=rf"first_scale of a {kind} is .*; use 0.001 to 2"):
+            initial_parameters(kind, Actions(2), scale)
     with pytest.raises(ValueError, match="levels of 1 numbers for actions of 2"):
         Actions(2, ((0.0,),))

@@ -35,13 +35,15 @@ CONFIGS = {
     "factorised": WayformerConfig(**LATENT | {"layers": 1}, fusion="early", factorised=True),
     "entity": EntityConfig(**TINY),
 }
-#: A set of series, a series and a set: where every group has parameters of its own, they tell as much as all five.
+#: A set of series, a series and a set: enough where every group has parameters of its own.
 THREE = ("agents", "ego", "route")
-SEEN = {"lq": GROUPS, "mtr": GROUPS, "entity": GROUPS, "factorised": ("agents", "ego")}
+TESTED_GROUPS = {"lq": GROUPS, "mtr": GROUPS, "entity": GROUPS, "factorised": ("agents", "ego")}
 
 
 def spec_of(name):
-    return EMPTY | {key: SPEC[key] for key in SPEC if key.removesuffix("_mask") in SEEN.get(name, THREE)}
+    return EMPTY | {
+        key: SPEC[key] for key in SPEC if key.removesuffix("_mask") in TESTED_GROUPS.get(name, THREE)
+    }
 
 
 def build(config, spec):
@@ -51,14 +53,14 @@ def build(config, spec):
 def observation(rng, spec):
     groups = {name: rng.normal(size=shape).astype(np.float32) for name, shape in spec.items()}
     masks = {name: groups[name] > -0.5 for name in spec if name.endswith("_mask")}
-    # At least one of all is there, and one of all is not.
+    # At least one row is valid, and at least one is not.
     for mask in masks.values():
         mask.flat[:1], mask.flat[-1:] = True, False
     return groups | masks
 
 
 def variants(one):
-    """An observation and others that mean the same, or that do not."""
+    """Return an observation, and changed ones with equal or other embeddings."""
     masked = [name for name in GROUPS if f"{name}_mask" in one]
     littered = {name: np.where(one[f"{name}_mask"][..., None], one[name], 777.0) for name in masked}
     mixed = {name: np.roll(one[name], 1, axis=0) for name in one if name.removesuffix("_mask") in masked}
@@ -70,7 +72,7 @@ def variants(one):
         "full": full,
         "backwards": full | {"agents": full["agents"][:, ::-1]},
         "ego backwards": full | {"ego": one["ego"][::-1]} if "ego" in one else full,
-        "nobody": one | {name: np.zeros_like(one[name]) for name in one if name.endswith("_mask")},
+        "all masked": one | {name: np.zeros_like(one[name]) for name in one if name.endswith("_mask")},
     }
 
 
@@ -91,14 +93,14 @@ def by_numpy(config, groups, parameters):
 def test_encoders_follow_their_equations_and_rules(name):
     config, spec = CONFIGS[name], spec_of(name)
     graph, parameters = build(config, spec)
-    told = variants(observation(np.random.default_rng(5), spec))
-    batch = {key: np.stack([one[key] for one in told.values()]) for key in spec}
-    found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, batch)
-    assert found.dtype == np.float32 and found.shape == (len(told), nnx.merge(graph, parameters).width)
-    embedding = dict(zip(told, found, strict=True))
-    for key in ("as it is", "full", "nobody"):
+    cases = variants(observation(np.random.default_rng(5), spec))
+    batch = {key: np.stack([one[key] for one in cases.values()]) for key in spec}
+    result = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, batch)
+    assert result.dtype == np.float32 and result.shape == (len(cases), nnx.merge(graph, parameters).width)
+    embedding = dict(zip(cases, result, strict=True))
+    for key in ("as it is", "full", "all masked"):
         np.testing.assert_allclose(
-            embedding[key], by_numpy(config, told[key], parameters), rtol=1e-4, atol=2e-5
+            embedding[key], by_numpy(config, cases[key], parameters), rtol=1e-4, atol=2e-5
         )
     for key in ("littered", "mixed"):
         np.testing.assert_allclose(embedding[key], embedding["as it is"], rtol=1e-4, atol=1e-5)
@@ -126,9 +128,9 @@ def test_gradients_are_finite_where_everything_is_masked(name):
     spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in ("agents", "route")}
     config = CONFIGS[name] if name == "entity" else replace(CONFIGS[name], layers=1, embedding=())
     graph, parameters = build(config, spec)
-    nobody = variants(observation(np.random.default_rng(6), spec))["nobody"]
-    masks = {name: jnp.asarray(value) for name, value in nobody.items() if name.endswith("_mask")}
-    rows = {name: value for name, value in nobody.items() if name not in masks}
+    all_masked = variants(observation(np.random.default_rng(6), spec))["all masked"]
+    masks = {name: jnp.asarray(value) for name, value in all_masked.items() if name.endswith("_mask")}
+    rows = {name: value for name, value in all_masked.items() if name not in masks}
 
     def loss(parameters, rows):
         return jnp.sum(nnx.merge(graph, parameters)(rows | masks) ** 2)
@@ -146,23 +148,29 @@ def test_attention_against_loops(queries):
     graph, parameters = nnx.split(nnx.eval_shape(lambda: Attention(width, heads, nnx.Rngs(0))))
     parameters = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), parameters)
     p = jax.tree.map(lambda leaf: np.asarray(leaf, float), nnx.to_pure_dict(parameters))
-    asks = rng.normal(size=(queries, width)).astype(np.float32)
+    query_rows = rng.normal(size=(queries, width)).astype(np.float32)
     tokens = rng.normal(size=(4, 5, width)).astype(np.float32)
     mask = rng.random((4, 5)) < 0.6
     mask[1], mask[2] = False, True
 
-    def run(parameters, asks, tokens, mask):
+    def run(parameters, query_rows, tokens, mask):
         attention = nnx.merge(graph, parameters)
-        alike = jnp.broadcast_to(asks, (4, *asks.shape))
-        return attention(asks, tokens, mask), attention(alike, tokens, mask), attention(asks, tokens)
+        repeated = jnp.broadcast_to(query_rows, (4, *query_rows.shape))
+        return (
+            attention(query_rows, tokens, mask),
+            attention(repeated, tokens, mask),
+            attention(query_rows, tokens),
+        )
 
-    shared, own, unmasked = quick(run, parameters, asks, tokens, mask)
+    shared, own, unmasked = quick(run, parameters, query_rows, tokens, mask)
     for row in range(4):
-        wanted = oracle.attention(asks.astype(float), tokens[row].astype(float), mask[row], p)
-        np.testing.assert_allclose(shared[row], wanted, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(own[row], wanted, rtol=1e-4, atol=1e-5)
-        everyone = oracle.attention(asks.astype(float), tokens[row].astype(float), np.ones(5, bool), p)
-        np.testing.assert_allclose(unmasked[row], everyone, rtol=1e-4, atol=1e-5)
+        expected = oracle.attention(query_rows.astype(float), tokens[row].astype(float), mask[row], p)
+        np.testing.assert_allclose(shared[row], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(own[row], expected, rtol=1e-4, atol=1e-5)
+        expected_unmasked = oracle.attention(
+            query_rows.astype(float), tokens[row].astype(float), np.ones(5, bool), p
+        )
+        np.testing.assert_allclose(unmasked[row], expected_unmasked, rtol=1e-4, atol=1e-5)
     assert (shared[1] == 0).all()
 
 
@@ -199,10 +207,10 @@ def test_parameter_counts():
 
 
 def test_groups_are_classified_by_masks_and_axes():
-    found = {
+    result = {
         name: (f.masked, f.rows, f.times, f.features, f.series) for name, f in group_shapes(SPEC).items()
     }
-    assert found == {
+    assert result == {
         "agents": (True, 3, 2, 4, True), "ego": (False, 1, 2, 3, True), "ego_static": (False, 1, 1, 2, False),
         "lights": (True, 2, 1, 3, False), "route": (True, 4, 1, 2, False),
     }  # fmt: skip
@@ -220,12 +228,12 @@ def test_empty_observations_are_refused(config):
 @pytest.mark.parametrize("name", ["lq", "mtr", "entity"])
 @pytest.mark.parametrize("missing", ["masked", "unmasked"])
 def test_encoders_accept_sets_only_or_ego_only(name, missing):
-    wanted = [g for g in GROUPS if (f"{g}_mask" in SPEC) != (missing == "masked")]
-    spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in wanted}
+    expected = [g for g in GROUPS if (f"{g}_mask" in SPEC) != (missing == "masked")]
+    spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in expected}
     graph, parameters = build(CONFIGS[name], spec)
     one = observation(np.random.default_rng(7), spec)
-    found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, one)
-    assert np.isfinite(found).all() and np.abs(found).max() > 0
+    result = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, one)
+    assert np.isfinite(result).all() and np.abs(result).max() > 0
 
 
 @pytest.mark.parametrize(
@@ -233,6 +241,7 @@ def test_encoders_accept_sets_only_or_ego_only(name, missing):
     [
         (lambda: LqConfig(width=10, heads=4), "width 10 is not a multiple of 4 heads"),
         (lambda: LqConfig(latents=0), "must be at least 1"),
+        (lambda: LqhConfig(local_layers=0), "local_layers must be at least 1"),
         (lambda: MtrConfig(layers=0), "must be at least 1"),
         (lambda: EntityConfig(width=6), "width 6 is not a multiple of 4 heads"),
     ],
@@ -248,7 +257,7 @@ def test_products_of_bfloat16_in_large_batches(asking):
     rng = np.random.default_rng(3)
     tokens = jnp.asarray(rng.normal(size=(256, 30, 128)), jnp.float32)
     queries = tokens if asking is None else tokens[0, :asking]
-    found, slopes = {}, {}
+    result, slopes = {}, {}
     for dtype in ("float32", "bfloat16"):
         graph, weights = nnx.split(Attention(128, 4, nnx.Rngs(0), dtype))
 
@@ -258,9 +267,9 @@ def test_products_of_bfloat16_in_large_batches(asking):
         def squares(*given, look=look):
             return jnp.sum(look(*given) ** 2)
 
-        found[dtype] = jax.jit(look)(weights, queries, tokens)
+        result[dtype] = jax.jit(look)(weights, queries, tokens)
         slopes[dtype] = jax.tree.leaves(jax.jit(jax.grad(squares))(weights, queries, tokens))
-    assert found["bfloat16"].dtype == jnp.float32
-    exacts, others = ([found[dtype], *slopes[dtype]] for dtype in ("float32", "bfloat16"))
+    assert result["bfloat16"].dtype == jnp.float32
+    exacts, others = ([result[dtype], *slopes[dtype]] for dtype in ("float32", "bfloat16"))
     for exact, other in zip(exacts, others, strict=True):
         assert 0.0 < np.abs(exact - other).max() < 0.03 * np.abs(exact).max()

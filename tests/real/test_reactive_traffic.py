@@ -14,7 +14,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
-from traffic_oracle import TRAFFIC, compare, meetings, runs_of
+from traffic_oracle import TRAFFIC, compare, new_overlaps, runs_of
 from traffic_oracle import Path as Line
 
 pytestmark = pytest.mark.slow
@@ -68,11 +68,11 @@ def test_paths_follow_logs_and_vehicles_follow_paths(bank, runs):
 
 
 def test_few_reactive_vehicles_collide(bank, runs):
-    found = [meetings(bank, index, *run) for index, run in enumerate(runs)]
+    found = [new_overlaps(bank, index, *run) for index, run in enumerate(runs)]
     reacting = sum(len(agents) for _, agents in found)
     between = sum(len([pair for pair in pairs if set(pair) <= set(agents)]) for pairs, agents in found)
     print(
-        f"{reacting} react, {sum(len(p) for p, _ in found)} meetings, {between} of them between two that react"
+        f"{reacting} react, {sum(len(p) for p, _ in found)} new overlaps, {between} of them between two that react"
     )
     # Merging without a light, and things that appear on top of somebody after they were hidden.
     assert reacting > 300 and between <= 0.03 * reacting

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 
 import jsonschema
 import pytest
@@ -73,6 +74,23 @@ def test_text_has_conditions_tables_and_recommendation(runs, plan, capsys):
     assert " 0.125 " in row and "red light ↓" in out
     assert re.search(r"undefined for A in 3, for B in 3", out)
     assert "recommendation: not enough scenarios" in lines
+
+
+def test_equal_means_are_not_called_lower(runs, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(runs[2], copy)
+    _, out, _ = called(capsys, runs[2], copy, "--primary", "progress_ratio", "--secondary", "[]")
+    assert (
+        "Progress has the same mean for A and B (all equal, p = 1.000)" in out and "lower with A" not in out
+    )
+
+
+def test_runs_in_folders_of_the_same_name_have_distinct_names(runs, plan, tmp_path, capsys):
+    copies = [tmp_path / name / "test" for name in ("a", "b")]
+    for copy in copies:
+        shutil.copytree(runs[2], copy)
+    _, out, _ = called(capsys, *copies, "--config", plan, "--json")
+    assert json.loads(out)["names"] == ["policy (a/test)", "policy (b/test)"]
 
 
 def test_json_equals_the_csv_files(runs, plan, capsys):

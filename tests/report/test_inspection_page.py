@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivax.errors import UsageError
 from drivax.report.charts import BINS, bins, histogram
-from drivax.report.inspection import Inspection
+from drivax.report.inspection import Inspection, comparison
 from drivax.report.pages.inspection import write_histograms
 from drivax.scenario.select.selection import Selection
 
@@ -93,6 +94,16 @@ def test_page_nests_and_loads_nothing(hand_set, tmp_path):
     parser.feed(page.read_text())
     assert parser.open == [] and parser.loads == []
     assert len(page.read_bytes()) < 200_000
+
+
+def test_sets_in_folders_of_the_same_name_stay_apart(hand_set, tmp_path):
+    for name in ("a", "b"):
+        shutil.copytree(hand_set, tmp_path / name / "set")
+    both = [Inspection.open(tmp_path / name / "set", Selection()) for name in ("a", "b")]
+    (table,) = comparison(both)
+    assert [column.heading for column in table.columns] == ["", "a/set", "b/set"]
+    text = write_histograms(both, tmp_path / "page.html").read_text()
+    assert text.count("<small>a/set: median") == text.count("<small>b/set: median") > 0
 
 
 def test_existing_page_is_kept(hand_set, tmp_path):

@@ -102,6 +102,13 @@ def test_small_observation_can_be_drawn():
     assert share(image, "vehicle") > 20 and share(image, "ego") > 20
 
 
+def test_empty_picture_reaches_further_ahead_than_back():
+    from drivax.report.pictures.observation import ObservationGroups, _extent
+
+    low, high = _extent(ObservationGroups({}, {}))
+    np.testing.assert_allclose((*low, *high), (-16, -12, 16, 24))
+
+
 def test_missing_matplotlib_is_an_error(monkeypatch):
     from drivax.report.pictures.observation import draw_observation
 

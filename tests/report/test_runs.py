@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -33,6 +34,18 @@ def test_repeated_names_get_the_folder_as_suffix(runs):
     (folder / "run.json").write_text(json.dumps(about | {"planner": "expert"}))
     evaluations, _ = read_runs(runs)
     assert [run.name for run in evaluations] == ["expert", "expert (constant)", "policy"]
+
+
+def test_training_runs_of_the_same_folder_name_have_distinct_names(runs, tmp_path):
+    folders = [
+        tmp_path / name for name in ("bc/seed-0", "bc/seed-1", "ppo/seed-0", "a/ppo", "b/ppo", "c/ppo")
+    ]
+    for folder in folders:
+        shutil.copytree(runs[-1], folder)
+    _, trainings = read_runs(folders)
+    assert [run.name for run in trainings] == [
+        "bc/seed-0", "bc/seed-1", "ppo/seed-0", "ppo", "ppo (b/ppo)", "ppo (c/ppo)",
+    ]  # fmt: skip
 
 
 def test_repeated_scenarios_keep_their_trajectories(runs):

@@ -12,14 +12,17 @@ from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.curation.scores import Combination, ScoreTable, write_scores
 from drivax.errors import UsageError
-from drivax.report.pages.viewer import findings, select, write_player
+from drivax.report.pages.viewer import findings, select_rows, write_player
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import RED, car, straight_road
 
 CLEAN = {"log_collides": False, "log_offroad_fraction": 0.0, "first_offroad_step": -1, "log_runs_red": None}
-FOUL = {"log_collides": True, "log_offroad_fraction": 0.25, "first_offroad_step": 30, "log_runs_red": True}
+FOUL = CLEAN | {
+    "log_collides": True, "first_collision_step": 40, "log_offroad_fraction": 0.25, "first_offroad_step": 30,
+    "log_runs_red": True,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def test_page_holds_the_logs(page, data):
         np.testing.assert_allclose(xy, scenario.agent_xy[:, 0], atol=0.02)
         speed = np.frombuffer(base64.b64decode(drive["speed"]), "<i2") / 100
         np.testing.assert_allclose(speed, np.linalg.norm(scenario.agent_velocity[:, 0], axis=-1), atol=0.01)
-    assert [one["rollouts"][0]["events"] for one in stored] == [{}, {"offroad": 30}, {}]
+    assert [one["rollouts"][0]["events"] for one in stored] == [{}, {"collision": 40, "offroad": 30}, {}]
     assert [one["rollouts"][0]["outcome"] for one in stored] == ["", "collides, runs red, off-road", ""]
 
 
@@ -78,14 +81,14 @@ def test_findings_are_words(data):
 
 
 def test_select_by_id_and_limit(data):
-    assert [scenario.id for scenario in select(data)] == ["calm", "bad", "new"]
-    assert [scenario.id for scenario in select(data, limit=2)] == ["calm", "bad"]
-    assert [scenario.id for scenario in select(data, ids=("new", "calm"))] == ["new", "calm"]
+    assert select_rows(data) == [0, 1, 2] and select_rows(data, limit=2) == [0, 1]
+    assert select_rows(data, ids=("new", "calm"), order=[1, 0, 2]) == [2, 0]
+    assert select_rows(data, limit=2, order=[1, 2, 0]) == [1, 2]
     with pytest.raises(UsageError) as error:
-        select(data, ids=("clam",))
+        select_rows(data, ids=("clam",))
     assert str(error.value) == f"{data.path}: record clam: is not in the set; did you mean 'calm'?"
     with pytest.raises(UsageError, match="use 1 or more"):
-        select(data, limit=0)
+        select_rows(data, limit=0)
 
 
 def test_existing_page_and_empty_selection_are_refused(page, data, tmp_path):
@@ -137,6 +140,33 @@ def test_critical_scenarios_come_first_with_their_components(data, tmp_path, cap
     capsys.readouterr()
     assert main(["view", str(data.path), "--scores", str(tmp_path / "none.npz"), "--out", str(out)]) == 1
     assert "score table not found" in capsys.readouterr().err
+
+
+def test_scores_are_those_of_the_scenario_if_data_sets_share_an_id(tmp_path):
+    with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
+        for name, speed in (("first", 4.0), ("second", 9.0)):
+            recording = replace(straight_road([car(speed=speed)]), scenario_id="same", dataset=name)
+            writer.add(assemble(recording))
+    both = ScenarioSet.open(tmp_path / "set")
+    valid = np.array([scenario.agent_valid[:, 0] for scenario in both])
+    urgency = np.where(valid, [[0.2], [0.9]], 0.0)
+    table = ScoreTable(
+        "kinematic", {}, both.hash, ("same", "same"), valid, urgency, urgency[:, 0], {"urgency": urgency}
+    )
+    write_scores(table.recombine(Combination({"urgency": 1.0})), tmp_path / "scores.npz")
+    out = tmp_path / "both.html"
+    assert main(["view", str(both.path), "--scores", str(tmp_path / "scores.npz"), "--out", str(out)]) == 0
+    text = out.read_text()
+    assert re.findall(r"score (\S+), rank (\d) of 2", text) == [("0.900", "1"), ("0.200", "2")]
+    speeds = [
+        json.loads(one)["rollouts"][0]["speed"] for one in re.findall(r'class="episode">(.*?)</script>', text)
+    ]
+    assert [np.frombuffer(base64.b64decode(speed), "<i2")[10] for speed in speeds] == [900, 400]
+
+
+def test_each_scenario_has_its_details(data, tmp_path):
+    with pytest.raises(ValueError, match="shorter"):
+        write_player(list(data), tmp_path / "page.html", details=["only one"])
 
 
 @needs_browser

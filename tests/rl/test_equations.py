@@ -29,23 +29,23 @@ def test_advantages_against_the_definition():
         reward, value, after = rng.normal(size=(3, 30))
         terminated, truncated = rng.random((2, 30)) < 0.15
         truncated &= ~terminated
-        found, target = generalised_advantages(
+        result, target = generalised_advantages(
             *(jnp.asarray(x, jnp.float32) for x in (reward, value, after)),
             jnp.asarray(terminated), jnp.asarray(truncated), 0.9, 0.8,
         )  # fmt: skip
         expected = by_loop(reward, value, after, terminated, truncated, 0.9, 0.8)
-        np.testing.assert_allclose(found, expected, atol=1e-5)
+        np.testing.assert_allclose(result, expected, atol=1e-5)
         np.testing.assert_allclose(target, expected + value, atol=1e-5)
 
 
 def test_advantages_by_hand():
     # Two steps, the second terminates: A_1 = 2 - 3 = -1; A_0 = 1 + 0.5 * 3 - 1 + 0.5 * 0.5 * (-1) = 1.25.
     arrays = (jnp.array([1.0, 2.0]), jnp.array([1.0, 3.0]), jnp.array([3.0, 7.0]))
-    found, _ = generalised_advantages(*arrays, jnp.array([False, True]), jnp.array([False, False]), 0.5, 0.5)
-    np.testing.assert_allclose(found, [1.25, -1.0])
+    result, _ = generalised_advantages(*arrays, jnp.array([False, True]), jnp.array([False, False]), 0.5, 0.5)
+    np.testing.assert_allclose(result, [1.25, -1.0])
     # Truncated instead: the final state's value counts, A_1 = 2 + 0.5 * 7 - 3 = 2.5; A_0 = 1.5 + 0.25 * 2.5.
-    found, _ = generalised_advantages(*arrays, jnp.array([False, False]), jnp.array([False, True]), 0.5, 0.5)
-    np.testing.assert_allclose(found, [2.125, 2.5])
+    result, _ = generalised_advantages(*arrays, jnp.array([False, False]), jnp.array([False, True]), 0.5, 0.5)
+    np.testing.assert_allclose(result, [2.125, 2.5])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Equations of offline learning by hand, against NumPy and finite differences, and where they end in small worlds."""
+"""Equations of offline learning by hand, against NumPy and finite differences, and their solutions in small worlds."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ def world():
     )
 
 
-def solved(transition, reward, policy):
+def solve(transition, reward, policy):
     """Q of a policy, by one linear system."""
     follows = np.einsum("sax,xb->saxb", transition, policy).reshape(STATES * ACTIONS, -1)
     q = np.linalg.solve(np.eye(STATES * ACTIONS) - GAMMA * follows, reward.reshape(-1))
@@ -41,12 +41,12 @@ def solved(transition, reward, policy):
 
 def slopes(of, at, step=1e-4):
     """Central differences of a scalar function of a float64 array."""
-    found = np.zeros_like(at)
-    for place in np.ndindex(at.shape):
-        moved = np.zeros_like(at)
-        moved[place] = step
-        found[place] = (of(at + moved) - of(at - moved)) / (2 * step)
-    return found
+    result = np.zeros_like(at)
+    for index in np.ndindex(at.shape):
+        shift = np.zeros_like(at)
+        shift[index] = step
+        result[index] = (of(at + shift) - of(at - shift)) / (2 * step)
+    return result
 
 
 def test_log_mass_by_hand():
@@ -84,8 +84,8 @@ def test_penalties_against_numpy_and_their_gradients_against_finite_differences(
         return 0.7 * np.log(np.mean(np.exp(q / 0.7 - density), axis=0)) - data
 
     args = (jnp.asarray(density, jnp.float32), jnp.asarray(data, jnp.float32), 0.7)
-    found = conservative_penalty(jnp.asarray(q, jnp.float32), *args)
-    np.testing.assert_allclose(found, expected(q), atol=1e-5)
+    result = conservative_penalty(jnp.asarray(q, jnp.float32), *args)
+    np.testing.assert_allclose(result, expected(q), atol=1e-5)
     slope = jax.grad(lambda q: conservative_penalty(q, *args).sum())(jnp.asarray(q, jnp.float32))
     np.testing.assert_allclose(slope, slopes(lambda q: expected(q).sum(), q), atol=1e-5)
 
@@ -112,8 +112,8 @@ def test_expectiles_by_hand_and_against_a_root_finder():
             error = targets - value
             return np.sum(np.where(error > 0, tau, 1 - tau) * error)
 
-        found = optimize.brentq(balance, targets.min(), targets.max())
-        slope = jax.grad(lambda v, tau=tau: expectile_loss(arrays - v, tau).sum())(jnp.float32(found))
+        result = optimize.brentq(balance, targets.min(), targets.max())
+        slope = jax.grad(lambda v, tau=tau: expectile_loss(arrays - v, tau).sum())(jnp.float32(result))
         assert float(slope) == pytest.approx(0.0, abs=1e-4)
         differences = slopes(
             lambda v, tau=tau: np.sum(np.where(targets < v, 1 - tau, tau) * (targets - v) ** 2), np.array(0.4)
@@ -125,8 +125,8 @@ def test_expectiles_by_hand_and_against_a_root_finder():
 def test_advantage_weights():
     # exp(0) = 1; exp(3 * 0.5) = 4.48; exp(3 * 2) = 403 is cut off at 100, and so is what overflows.
     advantage = jnp.array([0.0, 0.5, 2.0, 1e6])
-    found = advantage_weights(advantage, 3.0, 100.0)
-    np.testing.assert_allclose(found, [1.0, np.exp(1.5), 100.0, 100.0], rtol=1e-5)
+    result = advantage_weights(advantage, 3.0, 100.0)
+    np.testing.assert_allclose(result, [1.0, np.exp(1.5), 100.0, 100.0], rtol=1e-5)
     slope = jax.grad(lambda a: advantage_weights(a, 3.0, 100.0).sum())(advantage)
     np.testing.assert_array_equal(slope, 0.0)
 
@@ -160,30 +160,30 @@ def test_tabular_conservative_values_have_a_closed_form(world):
     def loss(q):
         policy = jax.nn.softmax(q, axis=1)
         value = jnp.einsum("sax,x->sa", p, jnp.sum(policy * q, axis=1))
-        goal = td_target(r, value, jnp.zeros(r.shape, bool), GAMMA)
-        error = 0.5 * jnp.sum(b * (q - goal) ** 2, axis=1)
+        target = td_target(r, value, jnp.zeros(r.shape, bool), GAMMA)
+        error = 0.5 * jnp.sum(b * (q - target) ** 2, axis=1)
         return jnp.sum(error + alpha * conservative_penalty(q.T, enumerated, jnp.sum(b * q, axis=1)))
 
     step = jax.jit(lambda q: jax.lax.fori_loop(0, 20_000, lambda _, q: q - 0.3 * jax.grad(loss)(q), q))
-    found = np.asarray(step(jnp.zeros((STATES, ACTIONS))), np.float64)
-    policy = np.exp(found) / np.exp(found).sum(axis=1, keepdims=True)
-    expected = solved(transition, reward - alpha * (policy / behaviour - 1.0), policy)
-    np.testing.assert_allclose(found, expected, atol=2e-3)
-    true = solved(transition, reward, policy)
-    below = (policy * found).sum(axis=1) - (policy * true).sum(axis=1)
-    assert (below < 0.0).all(), below
+    result = np.asarray(step(jnp.zeros((STATES, ACTIONS))), np.float64)
+    policy = np.exp(result) / np.exp(result).sum(axis=1, keepdims=True)
+    expected = solve(transition, reward - alpha * (policy / behaviour - 1.0), policy)
+    np.testing.assert_allclose(result, expected, atol=2e-3)
+    true = solve(transition, reward, policy)
+    difference = (policy * result).sum(axis=1) - (policy * true).sum(axis=1)
+    assert (difference < 0.0).all(), difference
 
 
 def test_implicit_values_lie_between_mean_and_best_logged_action(world):
-    """Expectile 0.5 gives the value of the data's own policy; toward 1 it gives the best policy that was ever shown."""
+    """Expectile 0.5 gives the value of the data's policy; near 1 that of the best policy within the data."""
     transition, reward, behaviour = world
-    shown = np.where(np.arange(ACTIONS) == 3, 0.0, behaviour)  # nobody ever does the last
-    shown /= shown.sum(axis=1, keepdims=True)
-    mean = (shown * solved(transition, reward, shown)).sum(axis=1)
+    logged_policy = np.where(np.arange(ACTIONS) == 3, 0.0, behaviour)  # the data lack the last action
+    logged_policy /= logged_policy.sum(axis=1, keepdims=True)
+    mean = (logged_policy * solve(transition, reward, logged_policy)).sum(axis=1)
     best = np.zeros(STATES)
     for _ in range(500):
-        best = np.where(shown > 0, reward + GAMMA * transition @ best, -np.inf).max(axis=1)
-    p, r, b = (jnp.asarray(array, jnp.float32) for array in (transition, reward, shown))
+        best = np.where(logged_policy > 0, reward + GAMMA * transition @ best, -np.inf).max(axis=1)
+    p, r, b = (jnp.asarray(array, jnp.float32) for array in (transition, reward, logged_policy))
 
     def values(tau):
         def improve(_, value):
@@ -200,7 +200,7 @@ def test_implicit_values_lie_between_mean_and_best_logged_action(world):
 
 
 def test_truncated_steps_bootstrap():
-    """A loop that pays 1 for ever is worth 1 / (1 - gamma), however often it is cut off; with ends it is worth less."""
+    """A loop that always pays 1 is worth 1 / (1 - gamma) if truncated; if terminated, it is worth less."""
     reward = jnp.ones(8)
     for terminated, worth in ((jnp.zeros(8, bool), 1 / (1 - GAMMA)), (jnp.arange(8) == 7, None)):
         value = jnp.zeros(8)

@@ -54,7 +54,7 @@ def make_tracks(paths, valid=None, kind=None, size=None, heading=None) -> Tracks
     count, steps = xy.shape[:2]
     velocity = np.gradient(xy, 0.1, axis=1) if steps > 1 else np.zeros_like(xy)
     course = np.arctan2(velocity[..., 1], velocity[..., 0]) if heading is None else np.array(heading, float)
-    seen = np.ones((count, steps), dtype=bool) if valid is None else np.array(valid, dtype=bool)
+    mask = np.ones((count, steps), dtype=bool) if valid is None else np.array(valid, dtype=bool)
     return Tracks(
         xy=xy,
         z=np.zeros((count, steps)),
@@ -63,7 +63,7 @@ def make_tracks(paths, valid=None, kind=None, size=None, heading=None) -> Tracks
         size=np.broadcast_to(
             SIZE if size is None else np.array(size, dtype=np.float64), (count, steps, 3)
         ).copy(),
-        valid=seen,
+        valid=mask,
         kind=np.full(count, AgentKind.VEHICLE, dtype=np.int8)
         if kind is None
         else np.array(kind, dtype=np.int8),

@@ -1,4 +1,4 @@
-"""People's own arrays: what becomes of them, and which argument an error names."""
+"""Recordings and scenarios from plain arrays, and errors that name the argument."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = np.arange(91) * 0.1
 
 @pytest.fixture
 def agents() -> dict[str, Any]:
-    """A car at 10 m/s to the east, and a pedestrian who is seen from step 30 to 59."""
+    """A car at 10 m/s to the east, and a pedestrian that is valid from step 30 to 59."""
     xy = np.zeros((2, 91, 2))
     xy[0, :, 0] = 10.0 * T
     xy[1] = (40.0, 5.0)
@@ -110,11 +110,13 @@ def test_given_velocity_size_and_id_are_kept(agents, roads):
     ]
 
 
-def test_missing_sizes_are_those_of_the_class(agents, roads):
+def test_missing_sizes_are_defaults_of_ego_and_of_the_class(agents, roads):
     del agents["size"], agents["kind"]
     scenario = scenario_from_arrays("a", agents, roads)
     assert Flag.DEFAULT_SIZES in scenario.has
     assert scenario.agent_size[0].tolist() == pytest.approx([4.9, 2.0, 1.5])
+    assert scenario.parked_size[0].tolist() == pytest.approx([4.1, 1.9, 1.6])
+    np.testing.assert_allclose(recording_from_arrays("a", agents, roads).tracks.z[:, 40], [0.75, 0.8])
 
 
 def test_long_recordings_are_cut_into_windows(agents, roads):
@@ -161,6 +163,8 @@ def test_other_errors_name_their_argument(agents, roads):
         scenario_from_arrays("a", agents, roads, route=[7])
     with pytest.raises(UsageError, match=r'lights\[0\]\["states"\] has 3 entries, not 91'):
         scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["red"] * 3}])
+    with pytest.raises(UsageError, match=r'lights\[0\]\["lane"\] names 2 lanes'):
+        scenario_from_arrays("a", agents, roads, [{"lane": [0, 1], "states": ["red"] * 91}])
     with pytest.raises(UsageError, match=r"lights\[0\].*'blue'"):
         scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["blue"] * 91}])
     with pytest.raises(UsageError, match=r"dt_s is 0.5.*resample\(agents, 0.5\)"):
@@ -206,9 +210,9 @@ def test_16_resampling_never_bridges_gaps():
 def test_16_resampling_20_hz_keeps_every_other_step():
     x = np.random.default_rng(0).normal(size=(1, 41, 2))
     fast = {"xy": x, "heading": np.zeros((1, 41)), "valid": np.ones((1, 41), bool), "velocity": x}
-    found = resample(fast, 0.05)
-    np.testing.assert_allclose(found["xy"], x[:, ::2], atol=1e-12)
-    assert "velocity" not in found
+    resampled = resample(fast, 0.05)
+    np.testing.assert_allclose(resampled["xy"], x[:, ::2], atol=1e-12)
+    assert "velocity" not in resampled
     np.testing.assert_allclose(resample(copy.deepcopy(fast), 0.1)["xy"], x, atol=1e-12)
     with pytest.raises(UsageError, match="dt_s is 0"):
         resample(fast, 0)
@@ -220,9 +224,9 @@ def test_velocities_are_differences_within_observed_intervals():
     xy[0, :, 0] = [0, 1, 4, 9, 50, 60, 80]
     valid = np.array([[True, True, True, False, True, False, False]])
     xy[0, ~valid[0]] = 999.0
-    found = differentiate(xy, valid, np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
-    np.testing.assert_allclose(found[0, :, 0], [10, 20, 30, 0, 0, 0, 0])
-    np.testing.assert_array_equal(found[0, :, 1], 0)
+    velocity = differentiate(xy, valid, np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
+    np.testing.assert_allclose(velocity[0, :, 0], [10, 20, 30, 0, 0, 0, 0])
+    np.testing.assert_array_equal(velocity[0, :, 1], 0)
 
 
 def test_light_states_may_be_enumeration_members(agents, roads):

@@ -137,9 +137,9 @@ def test_the_map_is_cropped_but_lanes_of_routes_stay_whole():
 
 
 def test_assembly_is_independent_of_a_distant_map_origin():
-    here, there = assemble(busy_recording()), assemble(moved(busy_recording(), FAR))
-    assert there.origin == pytest.approx(FAR)
-    assert same(here, there, skip=("origin",), atol=2e-4)
+    near, far = assemble(busy_recording()), assemble(moved(busy_recording(), FAR))
+    assert far.origin == pytest.approx(FAR)
+    assert same(near, far, skip=("origin",), atol=2e-4)
 
 
 def test_assembly_is_deterministic():

@@ -7,17 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.errors import DataError, DrivaxError
+from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank import scenario_bank
+from drivax.scenario.bank.columns import LaneRow
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank, Sizes, as_words
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.roadblocks import lane_count
 from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
-from scenes import GLIMPSE, bank_of, car, straight_road
+from scenes import GLIMPSE, SMALL, bank_of, car, straight_road
 
 
 def without_future(scenario: Scenario) -> Scenario:
@@ -50,7 +52,7 @@ def both():
 
 @jax.jit
 def moments(bank):
-    """All that is measured where the logs have ego, and what IDM does there."""
+    """Facts at logged poses of ego, and the actions of IDM there."""
     simulator = Simulator(Task(observation=GLIMPSE))
 
     def one(row, step):
@@ -108,6 +110,44 @@ def test_batches_of_scenarios_stack_as_single_scenarios(monkeypatch, batch):
     for name in (field.name for field in fields(ScenarioBank) if not field.metadata):
         each = np.concatenate([np.asarray(getattr(single, name)) for single in alone])
         np.testing.assert_array_equal(np.asarray(getattr(bank, name)), each, err_msg=name)
+
+
+def test_sizes_that_are_too_small_are_refused_by_name():
+    scenario = assemble(generate_recording(4, 0))
+    used, whole = Sizes.used([scenario]), Sizes.whole(scenario.capacity)
+    for sizes in (used, whole):
+        assert not ScenarioBank.from_scenarios([scenario], trim=sizes).trimmed
+    for name in (field.name for field in fields(Sizes) if field.name != "long_ego"):
+        least = getattr(used, name)
+        small = replace(used, **{name: least - 1})
+        with pytest.raises(UsageError, match=rf"too small: {name} {least - 1} < {least}; use Sizes.used"):
+            ScenarioBank.from_scenarios([scenario], trim=small)
+
+
+def test_segments_of_lanes_that_do_not_fit_have_no_lane():
+    scenario = assemble(straight_road([car(0, 0, 0, 5)]), replace(SMALL, lanes=2))
+    assert scenario.overflow == {"lanes": 1}
+    first, last = scenario.segment_blocks[1:3]
+    lanes = np.asarray(ScenarioBank.from_scenarios([scenario]).lanes)[0, LaneRow.HALF_WIDTH :, : last - first]
+    assert set(np.floor(lanes[2]).tolist()) == {-1.0, 0.0, 1.0}
+    np.testing.assert_allclose(
+        np.unique(lanes[:, scenario.segment_lane[first:last] < 0]), [-1.0, 1.85], rtol=1e-6
+    )
+
+
+def test_ids_of_lanes_may_be_negative():
+    recording = straight_road([car(0, 0, 0, 5)])
+
+    def negated(feature):
+        names = ("successors", "predecessors", "left_neighbours", "right_neighbours")
+        links = {name: tuple(-other for other in getattr(feature, name)) for name in names}
+        return replace(feature, feature_id=-feature.feature_id, **links)
+
+    route = tuple(-lane for lane in recording.route_lanes)
+    negative = replace(recording, features=tuple(map(negated, recording.features)), route_lanes=route)
+    lanes, other = (np.asarray(bank_of(each).lanes) for each in (recording, negative))
+    np.testing.assert_array_equal(lanes, other)
+    assert lane_count(assemble(negative)) == lane_count(assemble(recording)) == 3
 
 
 def test_sizes_cover_the_largest_scenario():

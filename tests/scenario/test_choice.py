@@ -1,12 +1,15 @@
-"""Which scenarios of a set are meant."""
+"""Selection of scenarios by filters, names and number."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+from drivax.api import load
 from drivax.errors import DataError, UsageError
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.select.selection import select_scenarios
+from scenes import car, straight_road
 
 
 def entry(number, dataset="one", **tags):
@@ -81,3 +84,9 @@ def test_invalid_selections_give_one_line(options, error, words, tmp_path, monke
     with pytest.raises(error) as raised:
         select_scenarios(Set(), **options)
     assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("limit", [0, -1])
+def test_impossible_limit_of_own_scenarios_is_refused(limit):
+    with pytest.raises(UsageError, match=f"a limit of {limit} leaves no scenario"):
+        load([assemble(straight_road([car()]))], limit)

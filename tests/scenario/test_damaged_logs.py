@@ -123,7 +123,7 @@ def test_frames_off_their_time_are_resampled_by_time(late_s):
 
 def test_jitter_up_to_twenty_milliseconds_is_played_and_flagged():
     whole = straight_road([car(speed=10.0)])
-    times = whole.timestamps_s + np.where(np.arange(STEPS) % 2, 0.009, 0.0)
+    times = whole.timestamps_s + np.where(np.arange(STEPS) % 2, 0.019, 0.0)
     late = replace(whole, timestamps_s=times)
     assert [each is late for each in windows(late)] == [True]
     assert Flag.JITTERED_TIME in assemble(late).has

@@ -1,4 +1,4 @@
-"""Further egos: who they are, and that their routes are those of a recording with another ego."""
+"""Further egos: their selection; their routes are those of a recording with another ego."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def scenarios(recordings):
     return [assemble(recording, EGOS) for recording in recordings]
 
 
-def pairs(recordings, scenarios):
+def further_egos(recordings, scenarios):
     """Each further ego: index of its scenario, its number, and the scenario in which it is the recorded ego."""
     for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
         for k, slot in enumerate(scenario.ego_slot.tolist()):
@@ -55,7 +55,7 @@ def ids(lanes, scenario):
 
 def test_routes_are_those_of_a_recording_with_this_ego(recordings, scenarios):
     compared = 0
-    for index, k, own in pairs(recordings, scenarios):
+    for index, k, own in further_egos(recordings, scenarios):
         scenario, count = scenarios[index], int(own.route_points[0])
         shift = (own.origin - scenario.origin)[:2]
         assert count == scenario.ego_route_points[k]
@@ -80,7 +80,7 @@ def test_routes_are_those_of_a_recording_with_this_ego(recordings, scenarios):
 
 def test_light_arcs_and_corridors_are_those_of_the_route(recordings, scenarios):
     bank, at_light = ScenarioBank.from_scenarios(scenarios), 0
-    for index, k, own in pairs(recordings, scenarios):
+    for index, k, own in further_egos(recordings, scenarios):
         alone = ScenarioBank.from_scenarios([own])
         arc, own_arc = bank.light_line[index, LightRow.ARC + k + 1], alone.light_line[0, LightRow.ARC]
         known, own_known = (np.asarray(values[values < 1e5]) for values in (arc, own_arc))
@@ -122,12 +122,19 @@ def test_first_egos_of_a_set_keep_their_bank(recordings, scenarios):
     np.testing.assert_array_equal(bank.agents, alone.agents)
 
 
+def test_a_long_further_ego_is_marked():
+    cars = [car(0, 0, 0, 10), car(40, 0, 0, 10, length=11.0, width=2.5)]
+    bank = ScenarioBank.from_scenarios([assemble(straight_road(cars), SMALL.with_egos(2))])
+    assert bank.long_ego
+    assert not ScenarioBank.from_scenarios([assemble(straight_road(cars), SMALL)]).long_ego
+
+
 def test_egos_are_moving_vehicles_near_ego_with_an_unbroken_log():
-    steps, seen = range(91), {step: [*range(step + 1)] for step in (29, 30, 50)}
+    steps, upto = range(91), {step: [*range(step + 1)] for step in (29, 30, 50)}
     cars = [
-        car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10, steps=seen[30]), car(20, 3.7, 0, 10, steps=seen[29]),
+        car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10, steps=upto[30]), car(20, 3.7, 0, 10, steps=upto[29]),
         car(-30, 0, 0, 0.2), car(15, 0, 0, 10, kind=AgentKind.CYCLIST), car(-45, 0, 0, 10, steps=range(11, 91)),
-        car(60, 3.7, 0, 10, steps=[*seen[50], *steps[60:]]), car(150, 0, 0, 30, steps=steps),
+        car(60, 3.7, 0, 10, steps=[*upto[50], *steps[60:]]), car(150, 0, 0, 30, steps=steps),
     ]  # fmt: skip
     scenario = assemble(straight_road(cars), SMALL.with_egos(8))
     # The car that starts at 150 m leaves the surroundings of ego's log (80 m ahead of 80 m) within 2 s.
@@ -140,7 +147,8 @@ def test_egos_are_moving_vehicles_near_ego_with_an_unbroken_log():
 
 
 def test_a_capacity_of_one_ego_stores_what_it_always_did():
-    assert Capacity().with_egos(1) == Capacity()
+    assert Capacity().with_egos(1) == Capacity() and EGOS.with_egos(4) is EGOS
+    assert EGOS.with_egos(1).egos == 1
     # Computed by the version before sets could have further egos.
     table = json.dumps(field_table(Capacity())).encode()
     assert hashlib.sha256(table).hexdigest().startswith("c983bc0aaf54f38f")

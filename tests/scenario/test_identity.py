@@ -1,4 +1,4 @@
-"""Who a scenario is: a number that neither set, order nor company changes."""
+"""The identity of a scenario: a number that set, order and other scenarios do not change."""
 
 import subprocess
 from dataclasses import replace
@@ -16,7 +16,7 @@ from scenes import SMALL, car, straight_road
 def test_identities_equal_an_independent_implementation():
     """``b2sum`` of coreutils, first four bytes, little-endian."""
     names = [("womd", "a"), ("av2", "a"), ("womd", "a")]
-    wanted = []
+    expected = []
     for name, count in zip(names, (0, 0, 1), strict=True):
         try:
             done = subprocess.run(
@@ -25,8 +25,8 @@ def test_identities_equal_an_independent_implementation():
             )  # fmt: skip
         except FileNotFoundError:
             pytest.skip("no b2sum here")
-        wanted.append(int.from_bytes(bytes.fromhex(done.stdout.split()[0].decode()), "little"))
-    assert identities(names).tolist() == wanted and len(set(wanted)) == 3
+        expected.append(int.from_bytes(bytes.fromhex(done.stdout.split()[0].decode()), "little"))
+    assert identities(names).tolist() == expected and len(set(expected)) == 3
 
 
 def test_identity_moves_with_its_scenario():

@@ -91,7 +91,7 @@ def test_lanes_without_any_links_are_chained_by_geometry():
 
 
 def test_chaining_is_independent_of_the_number_of_lanes():
-    """Check-list 24: lanes of a source without a graph, more of them than are looked at at once."""
+    """Check-list 24: lanes of a source without a graph, more than one chunk."""
     rows = 30
     features = [
         lane(100 * row + i, line((20.0 * i, 9.0 * row), (20.0 * i + 20, 9.0 * row), step=20.0))

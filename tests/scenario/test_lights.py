@@ -75,6 +75,6 @@ def test_stop_signs_outside_the_crop_neither_count_nor_take_slots():
     stops = place_stops((*far, corner), graph, ZERO, PATH, 100.0, 2)
     assert stops.xy.tolist() == [[101, 0], [99, 99]]
     assert stops.overflow == {}
-    two = MapFeature(71, RoadKind.STOP_SIGN, np.array([[-50.0, 0, 0]]))
-    stops = place_stops((*far, corner, two), graph, ZERO, PATH, 100.0, 1)
+    near = MapFeature(71, RoadKind.STOP_SIGN, np.array([[-50.0, 0, 0]]))
+    stops = place_stops((*far, corner, near), graph, ZERO, PATH, 100.0, 1)
     assert (stops.xy.tolist(), stops.overflow) == ([[-50, 0]], {"stops": 1})

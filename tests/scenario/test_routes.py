@@ -31,14 +31,14 @@ ZERO = np.zeros(3)
 
 
 def routes_of(features, path, most_routes=12, style: RouteStyle = "graph", **more):
-    """Routes of one log; ``given`` and ``corridor`` name lanes by id, ``valid`` and ``heading`` are the track's."""
-    given, corridor = more.pop("given", ()), more.pop("corridor", ())
+    """Routes of one log; ``intended`` and ``corridor`` name lanes by id, ``valid`` and ``heading`` are the track's."""
+    intended, corridor = more.pop("intended", ()), more.pop("corridor", ())
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
     tracks = local_tracks(make_tracks([path], **more), 0, ZERO)
     ego = ego_log(tracks, 10)
     index = graph.index()
-    intent = Intent(tuple(index[i] for i in given), tuple(index[i] for i in corridor))
+    intent = Intent(tuple(index[i] for i in intended), tuple(index[i] for i in corridor))
     return find_routes(on, ego, intent, style, most_routes, 400), ego, graph
 
 
@@ -102,7 +102,7 @@ def test_route_follows_a_logged_lane_change_smoothly():
     route = found.routes[0]
     assert list(dict.fromkeys(route.lane.tolist())) == [0, 1]
     check_smooth(route, kink=0.03)
-    _, apart = project(route.xyz, ego.seen[:, :2])
+    _, apart = project(route.xyz, ego.positions[:, :2])
     assert apart[-1] < 0.01
     assert apart.mean() < 1.0
     assert np.abs(np.diff(route.xyz[:, 1])).max() < 0.19  # at most 1.875 x 3.5 m / 36 m
@@ -122,15 +122,15 @@ def test_two_lane_changes_share_the_stretch_to_the_goal():
 
 
 def test_intended_route_is_used_unchanged():
-    found, _, graph = routes_of(junction(), driving(speed=3.0), given=(1, 3, 4))
+    found, _, graph = routes_of(junction(), driving(speed=3.0), intended=(1, 3, 4))
     assert found.on_lanes
     assert [graph.lane_id[x] for x in dict.fromkeys(found.routes[0].lane.tolist()) if x >= 0] == [1, 3, 4]
     driven = driving(speed=10.0)  # straight on, although the route turns
-    other, _, graph = routes_of(junction(), driven, given=(1, 3, 4))
+    other, _, graph = routes_of(junction(), driven, intended=(1, 3, 4))
     assert other.on_lanes
     assert other.routes[0].xyz[-1, 1] > 100
     assert other.goal[0] == pytest.approx(65.0, abs=4.0)
-    changing, _, graph = routes_of(two_lanes(), driving(speed=8.0), given=(1, 2))
+    changing, _, graph = routes_of(two_lanes(), driving(speed=8.0), intended=(1, 2))
     assert [graph.lane_id[x] for x in dict.fromkeys(changing.routes[0].lane.tolist())] == [1, 2]
     check_smooth(changing.routes[0], kink=0.04)
 
@@ -200,7 +200,7 @@ def test_log_route_follows_the_log_then_its_lane():
     path = driving(speed=10.0)
     path[:, 1] = 0.5 * np.sin(path[:, 0] / 15)
     found, ego, _ = routes_of(two_lanes(), path)
-    _, apart = project(found.routes[1].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[1].xyz, ego.positions[:, :2])
     assert apart.max() < 0.01
     assert len(found.routes[1].xyz) - 1 >= 90 + PAST_GOAL
     check_smooth(found.routes[1], kink=0.1)
@@ -210,6 +210,7 @@ def test_alternatives_differ_and_include_the_lane_change():
     found, _, _ = routes_of(two_lanes(), driving(speed=10.0))
     assert len(found.routes) >= 3
     assert any(route.xyz[-1, 1] > 3.0 for route in found.routes[2:])
+    assert len({route.xyz.tobytes() for route in found.routes[2:]}) == len(found.routes) - 2
     for route in found.routes:
         check_smooth(route, kink=0.05)
     assert len(routes_of(junction(), driving(), most_routes=2)[0].routes) == 2
@@ -260,7 +261,7 @@ def changing(at_step: int, speed: float = 12.0) -> np.ndarray:
 def test_lane_change_under_way_at_the_current_step_is_continued(at_step):
     path = changing(at_step)
     found, ego, _ = routes_of(two_lanes(), path)
-    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[0].xyz, ego.positions[:, :2])
     assert (apart <= 1.5).mean() >= 0.95
     assert apart[: ego.current + 1].max() <= 1.0 + 0.05  # never more than a metre beside where ego drove
     assert apart[-1] < 0.05  # on its lane in the end
@@ -302,7 +303,7 @@ def test_the_lane_that_fits_the_heading_comes_first():
     path = np.stack([np.interp(60 + np.arange(91) * 0.5, total, curved[:, i]) for i in (0, 1)], axis=-1)
     found, ego, graph = routes_of(crossing_streets(), path)
     assert graph.lane_id[found.routes[0].lane[20]] == 2
-    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    _, apart = project(found.routes[0].xyz, ego.positions[:, :2])
     assert apart.max() < 0.1
 
 
@@ -330,7 +331,7 @@ def search_of(features, need=200.0, corridor=(), xy=(0.0, 0.0), heading=0.0):
 
 
 def test_candidates_are_as_long_as_speed_and_map_require():
-    """At least max(200 m, v x 12 s) ahead and 50 m past the goal, 400 points at 1 m."""
+    """At least max(200 m, v x 12 s) ahead; as many as the capacity has, if the map has as many."""
     fast, ego, _ = routes_of(two_lanes(end=900.0), driving(speed=25.0))
     for route in fast.routes[2:]:
         s, _ = project(route.xyz, ego.xyz[10:11, :2])
@@ -350,9 +351,9 @@ def test_candidates_are_as_long_as_speed_and_map_require():
 
 
 def brute_force(search: LaneSearch) -> dict[tuple[int, ...], float]:
-    """The first ten of all ways without a lane twice, up to the first lane that ends 250 m ahead, and their scores.
+    """Scores of the first ten paths that use no lane twice, up to the first lane that ends 250 m ahead.
 
-    First in the order of breadth-first search: fewer lanes, then the earlier branch.
+    The order is that of breadth-first search: fewer lanes, then the earlier branch.
     """
     complete, ended = [], []
 

@@ -42,7 +42,7 @@ def finer(grid) -> Grid:
 
 
 def unpacked(grid, words) -> np.ndarray:
-    """1 drivable, -1 not, 0 unknown, of every side cell; written apart from the code under test."""
+    """1 drivable, -1 not, 0 unknown, of every side cell; independent of the code under test."""
     side = np.zeros((grid.side * SPLIT, grid.side * SPLIT), dtype=int)
     for cell, word in enumerate(words.tolist()):
         row, column = divmod(cell, grid.side)
@@ -101,7 +101,7 @@ def nearest_side(segments, xy) -> int:
 
 
 def test_sides_beyond_open_edge_ends_are_unknown():
-    # One edge along +x from 0 to 100: left of it is road, right of it is not, beyond its ends nobody knows.
+    # One edge along +x from 0 to 100: left of it is road, right of it is not, beyond its ends the side is unknown.
     grid, _, side = sides_of(edge(1, line((0, 0), (100, 0), step=1.0)))
 
     def at(x, y):

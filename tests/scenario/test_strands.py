@@ -1,4 +1,4 @@
-"""Strands of lanes on hand-made maps: continuation, neighbours, and merges where."""
+"""Strands of lanes on hand-made maps: continuations, neighbours, merges and where they end."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def codes(*features, path=None):
     assert (table[~used] == [-1, -1, -1, -1, NOWHERE_M, NOWHERE_M]).all()
     named = {}
     for number, row in zip(ids[used].tolist(), table[used], strict=True):
-        who = [int(ids[int(x)]) if x >= 0 else None for x in row[:4]]
+        linked = [int(ids[int(x)]) if x >= 0 else None for x in row[:4]]
         end = None if row[4] == NOWHERE_M else tuple(np.round(row[4:] + scenario.origin[:2], 2).tolist())
-        named[number] = (*who, end)
+        named[number] = (*linked, end)
     return named
 
 

@@ -38,7 +38,7 @@ def still(x: float, y: float) -> np.ndarray:
     return np.broadcast_to([float(x), float(y)], (91, 2))
 
 
-def test_every_scenario_has_every_tag_and_only_allowed_values():
+def test_all_tags_exist_with_allowed_values():
     found = tags_of(straight_road())
     assert set(TAGS) <= set(found)
     assert all(found[name] in allowed for name, allowed in TAGS.items())

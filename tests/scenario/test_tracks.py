@@ -33,7 +33,7 @@ def standing(x, y, steps=91):
 def test_masked_median_equals_numpy(seed):
     rng = np.random.default_rng(seed)
     values, valid = rng.normal(size=(6, 9)), rng.random((6, 9)) < 0.5
-    expected = [np.median(row[seen]) if seen.any() else 0.0 for row, seen in zip(values, valid, strict=True)]
+    expected = [np.median(row[mask]) if mask.any() else 0.0 for row, mask in zip(values, valid, strict=True)]
     assert masked_median(values, valid) == pytest.approx(expected)
 
 

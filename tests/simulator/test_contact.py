@@ -87,7 +87,10 @@ def random_pairs(count, seed):
 
 
 def compare_with_simulation(count, seed):
-    """Closed form in float32 against the first millisecond at which boxes overlap; how many meet within 5 s."""
+    """Compare the closed form in float32 with the first millisecond at which boxes overlap.
+
+    Return the number of pairs that meet within 5 s.
+    """
     poses, velocities = random_pairs(count, seed)
     poses, velocities = (part.astype(np.float32).astype(np.float64) for part in (poses, velocities))
     rows = np.concatenate(
@@ -103,8 +106,8 @@ def compare_with_simulation(count, seed):
         [marched_ttc(p[0], v[0], p[1:], v[1:])[0] for p, v in zip(poses, velocities, strict=True)]
     )
     differs = np.abs(found - marched) > 2e-3
-    # A corner may be grazed for less than a millisecond, between two moments of the simulation: without the way that
-    # the boxes move in this time, they never meet.
+    # A corner may graze the other box for less than a millisecond, between two steps of the simulation. Boxes that are
+    # smaller by the distance that they move in a step do not meet then.
     speed = np.hypot(*(velocities[:, 0] - velocities[:, 1]).T)
     smaller = rows.copy()
     smaller[..., 4:] = np.maximum(smaller[..., 4:] - 2e-3 * speed[:, None, None] - 1e-3, 0.01)
@@ -225,19 +228,19 @@ def test_gaps_agree_with_polygons():
     np.testing.assert_allclose(gap(rows[:, 1], rows[:, 0]), expected, atol=1e-9)
     cross = np.array(box(0, 0, 0, 10, 1)), np.array(box(0, 0, np.pi / 2, 10, 1))  # no corner in the other
     assert gap(*cross) == 0.0
-    here = jnp.array(box(0, 0))
-    slope = jax.jit(jax.vmap(jax.grad(lambda x: gap(here, here.at[0].set(x)))))
+    fixed = jnp.array(box(0, 0))
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: gap(fixed, fixed.at[0].set(x)))))
     slopes = slope(jnp.array([0.0, 4.8, 5.8, -6.0]))
     np.testing.assert_allclose(slopes, [0.0, 0.0, 1.0, -1.0], atol=1e-6)
 
 
-def test_nearest_gap_skips_agents_left_out():
+def test_nearest_gap_skips_ignored_agents():
     rows = [box(0, 0), box(8.8, 0), box(0, 3.5), box(-5.8, 0), box(0, -60)]
     now = frame(rows, [[0, 0]] * 5)
     none, nearest = jnp.zeros(5, bool), jax.jit(nearest_gap)
     assert float(nearest(now, jnp.asarray(0), none)) == pytest.approx(1.0)
     assert float(nearest(now, jnp.asarray(0), none.at[3].set(True))) == pytest.approx(1.5)
-    # From the car ahead: 4 m to the first. Another level, and empty slots, do not count.
+    # The car ahead is 4 m from ego. Another level, and empty slots, do not count.
     assert float(nearest(now, jnp.asarray(1), none)) == pytest.approx(4.0)
     above = replace(now, z=now.z.at[3].set(4.0))
     assert float(nearest(above, jnp.asarray(0), none)) == pytest.approx(1.5)

@@ -73,12 +73,12 @@ def oracle_step(state, plan, wheelbase=WHEELBASE_M):
         ]
     )
     if desired <= 0.2 and speed <= 0.2:
-        asked, rate = -0.5 * (speed - desired), 0.0
+        command, rate = -0.5 * (speed - desired), 0.0
     else:
-        asked = -(10.0 / (10.0 + 1.0)) * (speed - desired)
+        command = -(10.0 / (10.0 + 1.0)) * (speed - desired)
         a, b, g = np.eye(3), np.zeros(3), np.zeros(3)
         for n in range(10):
-            held = speed + n * DT * asked
+            held = speed + n * DT * command
             step = np.eye(3)
             step[0, 1], step[1, 2] = held * DT, held * DT / wheelbase
             bend = np.array([0.0, -held * curvatures[min(n, last)] * DT, 0.0])
@@ -87,7 +87,7 @@ def oracle_step(state, plan, wheelbase=WHEELBASE_M):
         z[1:] = wrapped(z[1:])
         q = np.diag([1.0, 10.0, 0.0])
         rate = float(-(b @ q @ z) / (b @ q @ b + 1.0))
-    acceleration = 0.1 / 0.3 * (asked - acceleration) + acceleration
+    acceleration = 0.1 / 0.3 * (command - acceleration) + acceleration
     steering_after = np.clip(0.1 / 0.15 * rate * DT + steering, -np.pi / 3, np.pi / 3)
     x, y = x + speed * DT * np.cos(heading), y + speed * DT * np.sin(heading)
     heading = wrapped(heading + speed * DT * np.tan(steering) / wheelbase)
@@ -190,7 +190,7 @@ def test_closed_loop_equals_double_precision(name):
 
 
 def test_single_steps_by_hand():
-    """At the plan and its speed nothing is asked; 1 m/s too slow: 10/11 m/s2, a third of it through the lag."""
+    """On the plan and at its speed all is zero; at 1 m/s less 10/11 m/s2 are due, of which the lag passes a third."""
     step = jax.jit(partial(track, length_m=jnp.float32(LENGTH_M), config=CONFIG))
     plan = jnp.asarray(centre(line(10.0)), jnp.float32)
     motion = lambda speed, y=0.0: jnp.array([AXLE_M, y, 0.0, speed])  # noqa: E731
@@ -198,7 +198,8 @@ def test_single_steps_by_hand():
     np.testing.assert_allclose(step(motion(9.0), plan, jnp.zeros(3))[0], 10 / 11 / 3, atol=1e-3)
     # The old acceleration decays by a third per step.
     np.testing.assert_allclose(step(motion(10.0), plan, jnp.array([3.0, 0.0, 0.0]))[0], 2.0, atol=1e-3)
-    # Left of the line: to the right. At 10 m/s the held unit rate makes (e, h) = (dt^3 v^2 / L sum of 45, 120 ...).
+    # A car left of the line steers to the right. In ten steps, a steering rate of 1 rad/s turns it by dt^2 v / L times
+    # 0 + 1 + ... + 9 = 45, and moves it aside by dt^3 v^2 / L times 0 + 0 + 1 + 3 + ... + 36 = 120.
     heading_unit = 10.0 / WHEELBASE_M * DT * DT * 45
     lateral_unit = 100.0 / WHEELBASE_M * DT**3 * 120
     rate = -(lateral_unit * 1.0) / (lateral_unit**2 + 10 * heading_unit**2 + 1.0)
@@ -258,14 +259,14 @@ def test_straight_wheels_at_the_start_leave_a_circle(speed, radius, zero_m, logg
     angle = speed * 0.1 * np.arange(-22, 1) / radius
     poses = np.stack([radius * np.sin(angle), radius - radius * np.cos(angle), angle], -1)
     history = jnp.asarray(np.column_stack([centre(poses), np.full(23, speed)]), jnp.float32)
-    for name, right in (("zero", zero_m), ("logged", logged_m)):
+    for name, expected_m in (("zero", zero_m), ("logged", logged_m)):
         first = Trajectory(initial_steering=name).first(history, LENGTH_M)[:3]
         motions, _ = closed_loop(
             lambda n: centre(reference[n : n + 41]), [AXLE_M, 0.0, 0.0, speed], np.asarray(first), 100
         )
         axle = motions[:, :2] - AXLE_M * np.stack([np.cos(motions[:, 2]), np.sin(motions[:, 2])], -1)
         away = np.abs(np.linalg.norm(axle - [0.0, radius], axis=-1) - radius).max()
-        assert away == pytest.approx(right, abs=0.01)
+        assert away == pytest.approx(expected_m, abs=0.01)
 
 
 def test_gradients_are_finite():

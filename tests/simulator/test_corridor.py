@@ -1,4 +1,4 @@
-"""Who is in the corridor of a path that turns: a straight, a quarter circle to the left, a straight."""
+"""Agents in the corridor of a path that turns: a straight, a quarter circle to the left, a straight."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ SLOTS = 12
 
 
 def pose(arc, left=0.0):
-    """Place at an arc length, this far to the left of the path, and heading."""
+    """Return x, y and heading at an arc length, ``left`` metres to the left of the path."""
     arc = np.asarray(arc, float)
     turn = np.clip((arc - BEFORE) / RADIUS, 0.0, np.pi / 2)
     beyond = np.maximum(arc - BEFORE - QUARTER, 0.0)
@@ -34,8 +34,8 @@ def thing(arc, left, size):
 def paths():
     arc = np.linspace(0.0, LENGTH, PATH_POINTS)
     x, y, heading = pose(arc)
-    way = [np.cos(heading), np.sin(heading)]
-    points, profile = np.stack([x, y, *way], -1), np.stack([0 * x, 0 * x + 15.0], -1)
+    direction = [np.cos(heading), np.sin(heading)]
+    points, profile = np.stack([x, y, *direction], -1), np.stack([0 * x, 0 * x + 15.0], -1)
     return AgentPaths(
         slot=jnp.zeros((1, 1), jnp.int16),
         points=jnp.asarray(points, jnp.float32)[None, None],
@@ -92,7 +92,7 @@ def test_agents_next_to_the_corridor_do_not_hide_obstacles():
     assert (alone < 40.0).all()
 
 
-def test_corridor_ends_at_its_length_on_straights_and_in_turns():
+def test_corridor_is_as_wide_as_the_vehicle_and_its_margins():
     border = CAR[1] / 2 + SIDE_M + POST[1] / 2
     cases, inside = [], []
     for arc in (0.0, 6.0, 12.0):

@@ -1,4 +1,4 @@
-"""What a step costs does not grow with the map, and grows with agents no faster than they do; one compilation each."""
+"""Cost of a step: independent of the map, at most proportional to agents; one compilation per configuration."""
 
 from dataclasses import replace
 
@@ -77,24 +77,24 @@ def test_operation_count_detects_pairwise_agent_work(bank):
 
 @pytest.mark.slow
 def test_optional_facts_cost_nothing_unless_requested(bank, monkeypatch):
-    asked = set()
+    called = set()
 
-    def noted(module, name):
+    def record_calls(module, name):
         real = getattr(module, name)
 
         def call(*arguments):
-            asked.add(name)
+            called.add(name)
             return real(*arguments)
 
         monkeypatch.setattr(module, name, call)
 
-    noted(situation.queries, "lane_passage")
-    noted(contact, "nearest_gap")
+    record_calls(situation.queries, "lane_passage")
+    record_calls(contact, "nearest_gap")
     less = operations(bank, Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="published"))))
-    assert asked == set()
+    assert called == set()
     rewards = RewardConfig(preset="published", lane_change=0.2, close=-0.1)
     assert operations(bank, Simulator(Task(observation=GLIMPSE, rewards=rewards))) > less
-    assert asked == {"lane_passage", "nearest_gap"}
+    assert called == {"lane_passage", "nearest_gap"}
 
 
 #: Kinds of traffic with the most bytes that a state may take.
@@ -109,7 +109,7 @@ every_traffic = pytest.mark.parametrize(
 )
 
 
-def told(bank):
+def overridden(bank):
     """The bank, with four agents overridden to stand at the origin."""
     return with_override(bank, jnp.arange(1, 5)[None], jnp.zeros((1, bank.steps, 4, 4)))
 
@@ -118,7 +118,7 @@ def told(bank):
 def test_states_are_small(bank, traffic, most):
     simulator = Simulator(Task(observation=GLIMPSE), traffic)
     state = jax.eval_shape(
-        lambda bank: simulator.reset(told(bank), jnp.zeros((), jnp.int32)), prepare_bank(traffic, bank)
+        lambda bank: simulator.reset(overridden(bank), jnp.zeros((), jnp.int32)), prepare_bank(traffic, bank)
     )
     assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) <= most
 
@@ -128,7 +128,7 @@ def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic
     """Otherwise the step compiles twice and every loop over steps is traced twice."""
     simulator, bank = (
         Simulator(Task(observation=GLIMPSE), traffic),
-        jax.eval_shape(told, prepare_bank(traffic, bank)),
+        jax.eval_shape(overridden, prepare_bank(traffic, bank)),
     )
 
     def types(state):
@@ -159,7 +159,7 @@ def test_one_configuration_is_compiled_once(traffic):
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["reset", "metrics"])
 def test_components_are_timed_on_unmodified_states(part):
-    # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
+    # Empty accumulators are infinite or undefined; the states of the next timed round must be neither.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
     simulator, config = Simulator(Task(observation=GLIMPSE)), BenchConfig(batch=2, steps=3)
     states = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.zeros(2, jnp.int32))

@@ -37,13 +37,13 @@ LENGTH_M = 4.8
 
 @partial(jax.jit, static_argnames=("space", "steps"))
 def drive(space, motion, action, steps, last=None):
-    """Motions and carried-out actions under one action."""
+    """Return the motions and executed actions under one action."""
 
     def one(now, _):
         motion, last = now
-        carried = space.actuate(motion, action, last, LENGTH_M)
-        motion = space.move(motion, carried, LENGTH_M)
-        return (motion, carried), (motion, carried)
+        executed = space.actuate(motion, action, last, LENGTH_M)
+        motion = space.move(motion, executed, LENGTH_M)
+        return (motion, executed), (motion, executed)
 
     first = jnp.zeros(space.size) if last is None else last
     return jax.lax.scan(one, (motion, first), None, steps)[1]
@@ -127,8 +127,8 @@ def test_zero_action_adds_nothing_and_bounds_clip(name):
         expected = [1.0 + 0.4 * np.cos(0.5), 2.0 + 0.4 * np.sin(0.5), 0.5, 4.0]
         np.testing.assert_allclose(after, expected, rtol=1e-6)
     action = jnp.full(space.size, 7.0)
-    carried = np.asarray(space.actuate(motion, action, action.at[:].set(1.0), LENGTH_M))
-    np.testing.assert_allclose(carried, 1.0, rtol=1e-6)
+    executed = np.asarray(space.actuate(motion, action, action.at[:].set(1.0), LENGTH_M))
+    np.testing.assert_allclose(executed, 1.0, rtol=1e-6)
     assert bool(space.exceeds_bounds(action)) and not bool(space.exceeds_bounds(jnp.ones(space.size)))
 
 
@@ -139,9 +139,9 @@ def test_every_space_maps_controls_to_actions(name):
     action = space.action(motion, jnp.float32(1.0), jnp.float32(0.03), LENGTH_M)
     last = space.action(motion, jnp.float32(0.5), jnp.float32(0.02), LENGTH_M)
     after = np.asarray(space.move(motion, space.actuate(motion, action, last, LENGTH_M), LENGTH_M))
-    wanted = np.asarray(bicycle(motion, jnp.float32(1.0), jnp.float32(0.03)))
+    expected = np.asarray(bicycle(motion, jnp.float32(1.0), jnp.float32(0.03)))
     near = 0.05 if name == "discrete" else 0.02
-    np.testing.assert_allclose(after, wanted, atol=near)
+    np.testing.assert_allclose(after, expected, atol=near)
 
 
 @pytest.mark.parametrize("name", ["physical", "published", "delta_local", "direct_state", "limited"])
@@ -159,10 +159,10 @@ def test_expert_actions_of_each_space_follow_a_log(name):
     def follow_all(log):
         def one(now, t):
             motion, last = now
-            wanted = space.expert(motion, log[t + 1], log[t + 2], LENGTH_M)
-            carried = space.actuate(motion, wanted, last, LENGTH_M)
-            motion = space.move(motion, carried, LENGTH_M)
-            return (motion, carried), (motion, space.exceeds_bounds(wanted))
+            action = space.expert(motion, log[t + 1], log[t + 2], LENGTH_M)
+            executed = space.actuate(motion, action, last, LENGTH_M)
+            motion = space.move(motion, executed, LENGTH_M)
+            return (motion, executed), (motion, space.exceeds_bounds(action))
 
         history = jnp.broadcast_to(log[0], (16, 4))
         return jax.lax.scan(one, (log[0], space.first(history, LENGTH_M)), jnp.arange(40))[1]
@@ -194,23 +194,24 @@ def test_invalid_levels_are_refused(options):
 def test_actuator_rates_limit_changes():
     space = Physical(jerk_mps3=10.0, steering_rate=0.2)
     motion, full = jnp.array([0.0, 0.0, 0.0, 5.0]), jnp.array([-1.0, 1.0])
-    carried = np.asarray(drive(space, motion, full, 20)[1])
-    acceleration, curvature = carried[:, 0] * 6, carried[:, 1] * 0.3
+    executed = np.asarray(drive(space, motion, full, 20)[1])
+    acceleration, curvature = executed[:, 0] * 6, executed[:, 1] * 0.3
     np.testing.assert_allclose(acceleration[:6], -np.arange(1, 7), rtol=1e-5)  # 10 m/s3 x 0.1 s a step
     np.testing.assert_allclose(curvature[:15], 0.02 * np.arange(1, 16), rtol=1e-5)
     np.testing.assert_allclose(curvature[15:], 0.3, rtol=1e-5)
     # It stands after less than 2 s; off the brake, it starts at the rate from zero, not from -6.
     stopped = np.asarray(drive(space, motion, full, 20)[0])[-1]
     assert stopped[3] == 0.0
-    begun = drive(space, jnp.asarray(stopped), jnp.array([1.0, 0.0]), 3, last=jnp.asarray(carried[-1]))[1]
-    np.testing.assert_allclose(begun[:, 0] * 6, [1.0, 2.0, 3.0], rtol=1e-5)
-    np.testing.assert_allclose(begun[:, 1] * 0.3, [0.28, 0.26, 0.24], rtol=1e-4)
+    start = jnp.array([1.0, 0.0])
+    restarted = drive(space, jnp.asarray(stopped), start, 3, last=jnp.asarray(executed[-1]))[1]
+    np.testing.assert_allclose(restarted[:, 0] * 6, [1.0, 2.0, 3.0], rtol=1e-5)
+    np.testing.assert_allclose(restarted[:, 1] * 0.3, [0.28, 0.26, 0.24], rtol=1e-4)
 
 
 def test_published_steering_rate_limits_the_angle():
     space, motion = Published(steering_rate=0.5), jnp.array([0.0, 0.0, 0.0, 3.0])
-    carried = np.asarray(drive(space, motion, jnp.array([0.0, 1.0]), 8)[1])
-    np.testing.assert_allclose(carried[:, 1] * 0.3, np.minimum(0.05 * np.arange(1, 9), 0.3), rtol=1e-5)
+    executed = np.asarray(drive(space, motion, jnp.array([0.0, 1.0]), 8)[1])
+    np.testing.assert_allclose(executed[:, 1] * 0.3, np.minimum(0.05 * np.arange(1, 9), 0.3), rtol=1e-5)
 
 
 def test_limited_actuators_start_from_the_logged_command():

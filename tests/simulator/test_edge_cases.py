@@ -1,4 +1,4 @@
-"""Cases that a fresh reader of the simulator found: slopes, no map, other slots, gaps in the log, second contacts."""
+"""Edge cases: slopes, no map, other slots, gaps in the log, followers, right turns on red, lines before the start."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ LIGHTS = Simulator(Task(observation=GLIMPSE, metrics=("red_light",), to_the_end=
 
 def metrics(planner, bank, simulator=SIMULATOR, slot=0, **options):
     keys = jax.random.split(jax.random.key(0), len(bank))
-    # Which agent is driven is told each time, so that one program serves all of them.
+    # The slot is an argument, so that one program serves all agents.
     result = drive(simulator, planner, bank, jnp.arange(len(bank)), keys, slot=slot, **options)
     return {name: float(v.value[0]) if bool(v.defined[0]) else None for name, v in result.metrics.items()}
 
@@ -149,4 +149,4 @@ def test_stop_line_crossed_before_the_episode_does_not_count():
         return jax.lax.scan(one, simulator.reset(bank, 0, begin, 1), None, length=40)[1]
 
     assert not np.asarray(run(bank, 10)).any()
-    assert np.flatnonzero(run(bank, 9)).tolist() == [20]  # found out two seconds later
+    assert np.flatnonzero(run(bank, 9)).tolist() == [20]  # decided two seconds later

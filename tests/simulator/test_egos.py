@@ -26,7 +26,7 @@ from scenes import RED, car, straight_road
 SMALL = replace(CAPACITIES["default"], name="small", agents=40, parked=24, routes=6)
 EGOS = 4
 STEPS = 60
-SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=4, route=6)
+OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=4, route=6)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Everything(Task):
 
 
 SIMULATOR = Simulator(
-    Everything(observation=SEEN, metrics=("success", "progress_ratio", "last_step", "red_light"))
+    Everything(observation=OBSERVATION, metrics=("success", "progress_ratio", "last_step", "red_light"))
 )
 
 
@@ -73,9 +73,9 @@ def roll(bank, index, slot, left_m):
         after, result = SIMULATOR.replay(bank, state, motion, jnp.zeros(2))
         planners = (ConstantSpeed(), IdmPlanner())
         controls = [planner.controls(bank, SIMULATOR.situation(bank, after)) for planner in planners]
-        seen = SIMULATOR.observe(bank, after.context)
+        obs = SIMULATOR.observe(bank, after.context)
         metrics = episode_metrics(bank, after)
-        return after, (after.facts, has_route(bank, after.context), seen, controls, metrics, result.truncated)
+        return after, (after.facts, has_route(bank, after.context), obs, controls, metrics, result.truncated)
 
     def one(index, slot):
         return jax.lax.scan(step, SIMULATOR.reset(bank, index, 10, slot), None, STEPS)[1]
@@ -93,10 +93,10 @@ def both(request, worlds):
 
 
 def test_measurements_and_observations_are_those_of_a_recorded_ego(both, worlds):
-    (facts, routed, seen, controls, _, _), (own, own_routed, own_seen, own_controls, _, _), offset = both
+    (facts, routed, obs, controls, _, _), (own, own_routed, own_obs, own_controls, _, _), offset = both
     lasts = worlds[2][:, 2]
     assert np.asarray(routed).all() and np.asarray(own_routed).all()
-    # Lanes have other numbers; goals and shares of the way differ where a log ends earlier than its scenario.
+    # Lanes have other numbers; goals and completed shares differ where a log ends earlier than its scenario.
     names = set(FACTS | ON_REQUEST) - {"strand", "goal_distance_m", "completed", "early_m"}
     for row, last in enumerate(lasts):
         steps = slice(0, min(last - 10, STEPS))
@@ -104,9 +104,9 @@ def test_measurements_and_observations_are_those_of_a_recorded_ego(both, worlds)
         for name in every:
             values = (np.asarray(getattr(each, name), float)[row, steps] for each in (facts, own))
             np.testing.assert_allclose(*values, atol=5e-3, err_msg=f"{name} of {row}")
-        groups = {"route", "route_mask", "lights"} & set(seen)
+        groups = {"route", "route_mask", "lights"} & set(obs)
         for name in groups if last == 90 else ():
-            np.testing.assert_allclose(seen[name][row, steps], own_seen[name][row, steps], atol=2e-3)
+            np.testing.assert_allclose(obs[name][row, steps], own_obs[name][row, steps], atol=2e-3)
         for pair, own_pair in zip(controls, own_controls, strict=True):
             for control, own_control in zip(pair, own_pair, strict=True):
                 np.testing.assert_allclose(control[row, steps], own_control[row, steps], atol=2e-2)

@@ -30,9 +30,9 @@ SPACES = {
 def rollout(space, motion, actions):
     def one(now, action):
         motion, last = now
-        carried = space.actuate(motion, action, last, LENGTH_M)
-        motion = space.move(motion, carried, LENGTH_M)
-        return (motion, carried), motion
+        executed = space.actuate(motion, action, last, LENGTH_M)
+        motion = space.move(motion, executed, LENGTH_M)
+        return (motion, executed), motion
 
     return jax.lax.scan(one, (motion, jnp.zeros(space.size)), actions)[1]
 
@@ -103,7 +103,7 @@ def together():
 
 @pytest.mark.slow
 def test_simulator_gradients_equal_finite_differences(together):
-    """Through the whole step, with everything that it measures: own actions count, the other's do not (log)."""
+    """Through the whole step and its measurements: an agent depends on its own actions, not on the other's."""
     bank, positions = together
     with jax.enable_x64(True):
         wide, rng = widened(bank), np.random.default_rng(3)
@@ -157,7 +157,7 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.0, 8.0])
 def test_rewards_facts_and_observations_have_finite_gradients(speed):
-    """Not only the trajectory: what a policy sees and is paid for, from a standstill on and through a collision."""
+    """Facts, rewards, observations and motions, from a standstill or at 8 m/s, through a collision."""
     simulator = Simulator(evaluation_task(Task()))
     bank = bank_of(straight_road([car(0, 0, 0, speed), car(25, 0.4, 0, 3), car(20, 3.7, 0, 3)], light=RED))
 
@@ -166,8 +166,8 @@ def test_rewards_facts_and_observations_have_finite_gradients(speed):
     def slope(actions):
         def one(state, action):
             state, transition = simulator.step(bank, state, action)
-            seen = simulator.observe(bank, state.context)
-            leaves = jax.tree.leaves((state.facts, transition.reward, seen, state.context.history))
+            observation = simulator.observe(bank, state.context)
+            leaves = jax.tree.leaves((state.facts, transition.reward, observation, state.context.history))
             return state, sum(leaf.sum() for leaf in leaves if leaf.dtype == jnp.float32)
 
         return jax.lax.scan(one, simulator.reset(bank, 0), actions)[1].sum()

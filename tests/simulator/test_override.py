@@ -36,14 +36,14 @@ def bank():
 
 def _frames(bank, motion, valid):
     """Frames of all agents from step 10 on, with slot 1 overridden and ego standing."""
-    told = with_override(bank, jnp.asarray([[1, -1]]), motion, valid)
+    overridden = with_override(bank, jnp.asarray([[1, -1]]), motion, valid)
 
     def one(context, _):
-        frame = SIMULATOR.frame(told, context, alone(context), 0)
-        traffic = SIMULATOR.traffic.advance(told, context, frame)
+        frame = SIMULATOR.frame(overridden, context, alone(context), 0)
+        traffic = SIMULATOR.traffic.advance(overridden, context, frame)
         return replace(context, step=context.step + 1, traffic=traffic), frame
 
-    return jax.lax.scan(one, SIMULATOR.context(told, 0, 10), None, length=STEPS)[1]
+    return jax.lax.scan(one, SIMULATOR.context(overridden, 0, 10), None, length=STEPS)[1]
 
 
 frames_of = jax.jit(_frames)
@@ -56,13 +56,13 @@ def driven(bank, brakes):
     return motions_of_actions(bank, jnp.asarray([[1, -1]]), actions, TASK.motion)
 
 
-THERE = jnp.ones((1, 91, 2), bool)
+VALID = jnp.ones((1, 91, 2), bool)
 
 
 def test_overridden_agents_follow_given_trajectories_and_others_replay(bank):
     line = np.zeros((1, 91, 2, 4), np.float32)
     line[0, :, 0] = np.stack([np.arange(91) * 0.5, np.full(91, -3.7), np.full(91, 0.1), np.full(91, 5.0)], -1)
-    frames = frames_of(bank, jnp.asarray(line), THERE.at[0, 60:].set(False))
+    frames = frames_of(bank, jnp.asarray(line), VALID.at[0, 60:].set(False))
     np.testing.assert_allclose(frames.box[40, 1, :4], [25.0, -3.7, np.cos(0.1), np.sin(0.1)], rtol=1e-6)
     np.testing.assert_allclose(frames.velocity[40, 1], [5 * np.cos(0.1), 5 * np.sin(0.1)], rtol=1e-5)
     np.testing.assert_array_equal(frames.box[40, 3, :2], bank.agents[0, 50, 3, :2])
@@ -82,7 +82,7 @@ def test_override_actions_drive_like_an_agent(bank):
 
 
 def test_reactive_vehicles_stop_behind_an_overridden_agent(bank):
-    frames = frames_of(bank, driven(bank, -0.5), THERE)
+    frames = frames_of(bank, driven(bank, -0.5), VALID)
     x, speed = np.asarray(frames.box)[:, 1:3, 0], np.asarray(frames.velocity)[:, 2, 0]
     assert (x[:, 0] - x[:, 1] - 4.8 > 1.0).all()
     assert x[-1, 0] - x[-1, 1] - 4.8 == pytest.approx(2.0, abs=1.0) and speed[-1] < 0.8
@@ -98,14 +98,14 @@ def test_ego_collides_with_an_agent_overridden_to_stand_still():
     @jax.jit
     def driven_past(y):
         pose = jnp.stack([bank.agents[0, 10, 1, 0], y, 0.0, 0.0])
-        told = with_override(bank, jnp.asarray([[1]]), jnp.broadcast_to(pose, (1, 91, 1, 4)))
+        overridden = with_override(bank, jnp.asarray([[1]]), jnp.broadcast_to(pose, (1, 91, 1, 4)))
 
         def step(state, _):
-            after, done = simulator.step(told, state, jnp.zeros(2))
-            return after, (done.reward_terms["collision"], done.terminated)
+            after, transition = simulator.step(overridden, state, jnp.zeros(2))
+            return after, (transition.reward_terms["collision"], transition.terminated)
 
-        state, (reward, over) = jax.lax.scan(step, simulator.reset(told, 0), None, length=8)
-        return episode_metrics(told, state), reward, over
+        state, (reward, over) = jax.lax.scan(step, simulator.reset(overridden, 0), None, length=8)
+        return episode_metrics(overridden, state), reward, over
 
     metrics, reward, over = driven_past(0.0)
     assert {name: float(found.value) for name, found in metrics.items()} == {
@@ -113,7 +113,7 @@ def test_ego_collides_with_an_agent_overridden_to_stand_still():
     }  # fmt: skip
     np.testing.assert_array_equal(over, np.arange(8) >= 5)
     np.testing.assert_array_equal(reward, np.where(np.arange(8) >= 5, -1.0, 0.0))
-    # Logged to stand in the lane beside, it is passed.
+    # An agent that stands in the next lane is passed.
     metrics, reward, over = driven_past(3.7)
     assert float(metrics["collision"].value) == 0.0 and not over.any() and not reward.any()
 
@@ -124,7 +124,7 @@ def test_gradients_reach_override_actions(bank):
 
     @jax.jit
     def place(brakes):
-        return _frames(bank, driven(bank, brakes), THERE).box[-1, 2, 0]
+        return _frames(bank, driven(bank, brakes), VALID).box[-1, 2, 0]
 
     slope = float(jax.jit(jax.grad(place))(jnp.float32(-0.1)))
     finite = float(place(jnp.float32(-0.09)) - place(jnp.float32(-0.11))) / 0.02

@@ -37,7 +37,7 @@ def along(x, y):
 
 
 def aside(start_s, metres, rate=1.0):
-    """Metres to the left at every step: from 0 on, at a rate in m/s from a time on."""
+    """Offsets to the left at every step, m: 0 until ``start_s``, then ``rate`` m/s up to ``metres``."""
     return np.clip(rate * (T - start_s), 0.0, abs(metres)) * np.sign(metres)
 
 
@@ -148,7 +148,7 @@ def built_in(family, seed):
 
 
 STAYS = aside(1.0, 1.85)
-#: Scenes with the steps of lane changes and of merges. The line between lanes is at 1.85 m, and counts at 2.15 m.
+#: Scenes with the steps of lane changes and of merges. The boundary of lanes is at 1.85 m; a change counts at 2.15 m.
 SCENES = {
     "left": (straight_road([along(10 * T, aside(1.0, LANE_M))]), [42], []),
     "right": (straight_road([along(10 * T, LANE_M - aside(1.0, LANE_M))]), [42], []),
@@ -193,8 +193,8 @@ def replayed(bank):
     def one(bank, row):
         def step(state, _):
             now = logged_motion(bank, state.context, 1)
-            after, done = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
-            return after, (after.facts, done.reward_terms)
+            after, transition = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
+            return after, (after.facts, transition.reward_terms)
 
         return jax.lax.scan(step, SIMULATOR.reset(bank, row), None, 80)[1]
 

@@ -101,7 +101,7 @@ def test_collision_is_positive_on_overlap_and_zero_beyond_the_margin():
     assert (hit & others).sum() > 50 and (value[hit & others] > 0).all()
     far = others & (exact > MARGIN_M)
     assert far.sum() > 50 and (value[far] == 0.0).all()
-    assert value[0] == 0.0, "nobody collides with oneself"
+    assert value[0] == 0.0, "an agent does not collide with itself"
     # Nose to tail, 0.25 m apart: half a margin. Blended: two of the axes agree (0.03 ln 2), and half a length counts
     # for 1 % less.
     rows[:2] = [[0, 0, 1, 0, 4.8, 2.0], [5.05, 0, 1, 0, 4.8, 2.0]]
@@ -112,15 +112,15 @@ def test_collision_is_positive_on_overlap_and_zero_beyond_the_margin():
 
 def test_absent_agents_and_other_levels_have_no_potential_and_no_gradient():
     rows = np.array([[0, 0, 1, 0, 4.8, 2.0], [1, 0.3, 0, 1, 4.8, 2.0]])
-    here = frame_of_boxes(rows)
-    absent = replace(here, valid=jnp.array([True, False]))
+    present = frame_of_boxes(rows)
+    absent = replace(present, valid=jnp.array([True, False]))
 
     def total(pose, frame):
         frame = replace(frame, box=frame.box.at[0].set(posed(pose)))
         return collision_potential(frame, jnp.int32(0)).sum()
 
     sloped = jax.jit(jax.value_and_grad(total))
-    for frame, empty in ((here, False), (absent, True), (frame_of_boxes(rows, 6.0), True)):
+    for frame, empty in ((present, False), (absent, True), (frame_of_boxes(rows, 6.0), True)):
         value, slope = sloped(jnp.zeros(3), frame)
         assert (float(value) == 0.0) is empty and np.isfinite(slope).all()
         assert (np.asarray(slope) == 0.0).all() == empty

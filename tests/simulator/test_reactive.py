@@ -1,4 +1,4 @@
-"""Reactive traffic on hand-made roads: what every driver does can be worked out on paper."""
+"""Reactive traffic on hand-made roads, against motions computed by hand and the oracle."""
 
 from dataclasses import replace
 from functools import partial
@@ -35,7 +35,7 @@ SIMULATOR = Simulator(Task(), TRAFFIC)
 
 @partial(jax.jit, static_argnums=0)
 def _drive(traffic_model, bank, index, motions):
-    """Ego goes where it is put; the frames, and the state of traffic, of every step from the first on."""
+    """Return frames and traffic states of all steps while ego follows ``motions``."""
     simulator = Simulator(Task(), traffic_model)
     context = simulator.context(bank, index, 10)
 
@@ -49,7 +49,7 @@ def _drive(traffic_model, bank, index, motions):
 
 
 class Run:
-    """What came of a context: boxes, speeds and who is there, by car; time 0 is the current step.
+    """Simulated traffic of a recording: boxes, speeds and validity by car; time 0 is the current step.
 
     Attributes:
         row: Path of each car, -1 for none.
@@ -75,16 +75,16 @@ class Run:
         self.row = [paths.index(slot) if slot in paths else -1 for slot in slots]
         self.slots = slots
 
-    def gap(self, behind, ahead, step=-1):
-        half = (self.box[step, behind, 4] + self.box[step, ahead, 4]) / 2
-        return self.x[step, ahead] - self.x[step, behind] - half
+    def gap(self, follower, leader, step=-1):
+        half = (self.box[step, follower, 4] + self.box[step, leader, 4]) / 2
+        return self.x[step, leader] - self.x[step, follower] - half
 
     def phase(self, number):
         return np.asarray(self.traffic.phase)[:, self.row[number]]
 
 
 def slots_in(recording):
-    """The slot of each car of a recording: the nearest to ego come first, parked ones right behind."""
+    """Return the slot of each car of a recording: moving cars by distance to ego, then parked ones."""
     scenario = assemble(recording, SMALL)
     ids = [*scenario.agent_id[scenario.agent_valid.any(axis=0)], *scenario.parked_id]
     return [ids.index(number) for number in recording.tracks.track_id]
@@ -167,7 +167,7 @@ def test_vehicles_yield_to_ego_that_cuts_in():
 
 
 def test_an_occupied_entry_place_delays_entry():
-    # The log has the car appear at step 30 at x = 20, where ego happens to stand until step 50 (it was elsewhere).
+    # The car appears at step 30, where ego, which is elsewhere in the log, stands: always, or until step 50.
     cars = [car(-60, 0, 0, 0), profile(20, 0, 8.0, steps=range(30, 91))]
     at = float(cars[1]["xy"][30, 0])
     ego = np.tile(np.array([at, 0.0, 0.0, 0.0]), (80, 1))
@@ -178,7 +178,7 @@ def test_an_occupied_entry_place_delays_entry():
     assert not taken.valid[:, 1].any() and (taken.phase(1) == WAITS).all()
     ego[40:] = [-60.0, 3.7, 0.0, 0.0]
     late = Run(straight_road(cars), ego)
-    # Ego is gone in the frame of time 41; that frame decides who is there at time 42.
+    # Ego is gone in the frame of time 41; that frame decides whether the car enters at time 42.
     assert not late.valid[41, 1] and late.valid[42, 1]
     assert late.x[42, 1] == pytest.approx(at, abs=1e-3)
 
@@ -229,8 +229,8 @@ def circle(radius, speed, kind=AgentKind.VEHICLE):
 def test_curves_limit_the_speed():
     run = Run(straight_road([EGO, circle(10.0, 8.0)]))
     logged = 8.0 * 8.0  # m of the path before it goes on straight
-    here = np.asarray(run.traffic.arc)[:, -1, run.row[1]]
-    inside = (here > 20.0) & (here < logged - 10)
+    arc = np.asarray(run.traffic.arc)[:, -1, run.row[1]]
+    inside = (arc > 20.0) & (arc < logged - 10)
     # sqrt(2.5 m/s2 x 10 m)
     np.testing.assert_allclose(run.speed[inside, 1], 5.0, atol=0.1)
     radius = np.hypot(run.x[inside, 1], run.y[inside, 1] - 10.0)

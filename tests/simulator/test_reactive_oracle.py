@@ -15,7 +15,7 @@ from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, WAITS
 from drivax.synthetic.world import generate_recording
-from traffic_oracle import SIMULATOR, TRAFFIC, Path, compare, meetings, rolled, runs_of
+from traffic_oracle import SIMULATOR, TRAFFIC, Path, compare, new_overlaps, rolled, runs_of
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ def test_every_vehicle_follows_idm(bank, runs):
     found = np.concatenate([compare(bank, index, *run) for index, run in enumerate(runs)])
     away, acceleration = found.T
     assert len(found) > 300 and (acceleration < 0).sum() > 60
-    # The path ahead is straight pieces there and all its points here, so gaps differ by some centimetres.
+    # The oracle measures along all points of the path, the simulator along straight pieces: gaps differ by centimetres.
     assert np.quantile(away, 0.99) < 1e-3 and away.max() < 5e-3
 
 
@@ -81,11 +81,11 @@ def test_state_fits_16_kib_with_128_reactive_agents(bank):
 
 def test_reactive_pairs_rarely_overlap_in_the_built_in_world():
     bank = world(40, seed=7)
-    found = [meetings(bank, index, *run) for index, run in enumerate(runs_of(bank))]
+    found = [new_overlaps(bank, index, *run) for index, run in enumerate(runs_of(bank))]
     reacting = sum(len(agents) for _, agents in found)
     between = sum(len([pair for pair in pairs if set(pair) <= set(agents)]) for pairs, agents in found)
     print(
-        f"{reacting} react, {sum(len(p) for p, _ in found)} meetings, {between} of them between two that react"
+        f"{reacting} react, {sum(len(p) for p, _ in found)} new overlaps, {between} of them between two that react"
     )
     # Paths that cross or merge without a light: less than one vehicle in a hundred.
     assert reacting > 500 and between <= 0.01 * reacting

@@ -11,6 +11,7 @@ from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.schema import Flag
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
@@ -47,7 +48,7 @@ def single():
 
 def episodes(simulator, planner, bank, slot=0):
     keys = jax.random.split(jax.random.key(0), len(bank))
-    # Which agent is driven is told each time, so that one program serves all of them.
+    # The slot is an argument, so that one program serves all agents.
     return drive(simulator, planner, bank, jnp.arange(len(bank)), keys, slot=slot)
 
 
@@ -135,10 +136,6 @@ def test_idm_stops_for_red_and_behind_a_standing_car(simulator):
 
 
 def test_metrics_without_lights_are_undefined(simulator):
-    from dataclasses import replace
-
-    from drivax.scenario.schema import Flag
-
     recording = straight_road([car(0, 0, 0, 5)])
     bank = bank_of(replace(recording, flags=recording.flags & ~Flag.LIGHTS))
     result = episodes(simulator, Expert(), bank)
@@ -150,10 +147,9 @@ def test_metrics_without_lights_are_undefined(simulator):
 @pytest.mark.slow
 def test_results_are_invariant_to_translation_and_rotation(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
-    here = straight_road(cars, light=RED)
-    one, other = (
-        episodes(simulator, IdmPlanner(), bank_of(r)) for r in (here, moved(here, 2.1, 4000.0, -7000.0))
-    )
+    recording = straight_road(cars, light=RED)
+    recordings = recording, moved(recording, 2.1, 4000.0, -7000.0)
+    one, other = (episodes(simulator, IdmPlanner(), bank_of(recording)) for recording in recordings)
     for name in one.metrics:
         np.testing.assert_allclose(metric(one, name), metric(other, name), rtol=2e-3, atol=2e-2, err_msg=name)
 
@@ -187,10 +183,10 @@ def test_step_or_reset_equals_step_and_reset(single, world):
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
     same, _ = either(world, state, action, jnp.asarray(False), another)
-    seen = simulator.now(world, state.context)
-    at_hand, _ = either(world, state, action, jnp.asarray(False), another, seen)
-    fresh, transition = either(world, plain, action, jnp.asarray(True), another)
-    for a, b in ((plain, same), (plain, at_hand), (reset(world, rows[3]), fresh)):
+    frame = simulator.now(world, state.context)
+    with_frame, _ = either(world, state, action, jnp.asarray(False), another, frame)
+    restarted, transition = either(world, plain, action, jnp.asarray(True), another)
+    for a, b in ((plain, same), (plain, with_frame), (reset(world, rows[3]), restarted)):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), a, b)
     assert not bool(transition.terminated) and not bool(transition.truncated)
 
@@ -272,7 +268,7 @@ def test_schedule_compares_with_the_log_now_and_a_second_later():
 
     steps, ahead_m, late_m, early_m = np.array(cases, np.float32).T
     facts = schedule(steps.astype(np.int32), ahead_m)
-    # The way on the route never decreases: behind the log it stays at the log's place.
+    # Progress on the route never decreases: behind the log it stays that of the log.
     np.testing.assert_allclose(facts.late_m, np.minimum(late_m, 0.0), atol=1e-3)
     np.testing.assert_allclose(facts.early_m, np.where(late_m > 0, -9.0, early_m), atol=1e-3)
     done = np.clip((9 * (steps - 10) / 10 + np.maximum(ahead_m, 0)) / 72, 0, 1)
@@ -280,7 +276,7 @@ def test_schedule_compares_with_the_log_now_and_a_second_later():
 
 
 def test_schedule_of_a_standing_log():
-    """Nothing is to be gained by driving: a metre ahead is a metre early, and all is completed."""
+    """Driving gains nothing: 3 m ahead is 3 m early, and the path is completed from the start."""
     simulator = Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="pace", completion=1.0)))
     state = jax.jit(simulator.reset)(bank := bank_of(straight_road([car(0, 0, 0, 0)])), 0)
     assert float(state.facts.late_m) == 0.0 and float(state.facts.early_m) == 0.0

@@ -1,4 +1,4 @@
-"""Starts: any step of the log, and after a moment of wrong driving."""
+"""Starts: at any step of the log, and after a second of perturbed driving."""
 
 import jax
 import jax.numpy as jnp
@@ -68,8 +68,8 @@ def test_draws_are_distributed_as_published(speed):
 
 @pytest.mark.slow
 def test_perturbed_history_uses_one_action(open_road):
-    scenes = noisy(open_road, 10, keys(64))
-    history = scenes.history
+    contexts = noisy(open_road, 10, keys(64))
+    history = contexts.history
     logged = LogStart().begin(open_road, jnp.int32(0), jnp.int32(0), jnp.int32(0), None)[0]
     np.testing.assert_allclose(history[:, :-10], np.broadcast_to(logged[-13:], (64, 13, 4)), atol=1e-4)
     between = jax.vmap(jax.vmap(command_between))(history[:, -11:-1], history[:, -10:])
@@ -78,10 +78,10 @@ def test_perturbed_history_uses_one_action(open_road):
     grip = GRIP_MPS2 / np.asarray(history[:, -11:-1, 3]) ** 2
     free = (np.abs(curvature) < 0.95 * grip).all(axis=1)
     assert free.sum() > 32 and np.ptp(curvature[free], axis=1).max() < 1e-3
-    # They are all at step 10 of the log, hardly behind where the log is (some turned), and different.
-    assert (np.asarray(scenes.step) == 10).all()
+    # All are at step 10 of the log, at most 0.3 m behind the logged position (some turn), and differ.
+    assert (np.asarray(contexts.step) == 10).all()
     assert (history[:, -1, 0] >= -0.3).all() and len(np.unique(np.asarray(history[:, -1, 1]))) > 48
-    travelled = np.asarray(scenes.route_m - open_road.log_progress[0, 0])
+    travelled = np.asarray(contexts.route_m - open_road.log_progress[0, 0])
     np.testing.assert_allclose(travelled, np.asarray(history[:, -1, 0] - logged[-1, 0]), atol=0.3)
 
 
@@ -99,7 +99,7 @@ def test_no_start_collides_or_is_off_the_road():
 
 
 def test_episode_starts_as_logged_when_every_draw_fails():
-    # Half a metre behind a car, a hand's breadth beside a column.
+    # 0.5 m behind a car, and 0.1 m beside a column.
     beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
     bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
     strong = Simulator(Task(), start=NoisyStart(strong=1.0))
@@ -111,13 +111,13 @@ def test_episode_starts_as_logged_when_every_draw_fails():
 
 @pytest.mark.slow
 def test_noisy_start_does_not_collide_with_overridden_agents():
-    # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
+    # In the log no agent is near; the other car is overridden to stand where some draws would lead.
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
-    told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
-    given = with_override(bank, jnp.asarray([[1]]), told)
+    motion = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
+    overridden = with_override(bank, jnp.asarray([[1]]), motion)
     simulator = Simulator(Task(metrics=("collision",)), OverrideTraffic(), NoisyStart(tries=16))
-    state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
-    # Who overlaps at the start is ignored.
+    state = jax.jit(jax.vmap(lambda key: simulator.reset(overridden, 0, 10, 0, key)))(keys(256))
+    # An agent that overlaps ego at the start would be ignored.
     assert not (np.asarray(state.contacts) == Contact.IGNORED).any()
     alone = [noisy(bank, 10, part).history for part in keys(256).reshape(4, 64)]
     beside = np.concatenate(alone)[:, -1]

@@ -1,4 +1,4 @@
-"""Several driven agents in one scenario, and overridden agents."""
+"""Several driven agents in one scenario."""
 
 from functools import partial
 
@@ -16,10 +16,10 @@ from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road
 
-SEEN = ObservationConfig(agents=8, steps=1, road=0, lights=1, route=2)
-REACTIVE = Simulator(Task(observation=SEEN, metrics="training"), IdmTraffic())
+OBSERVATION = ObservationConfig(agents=8, steps=1, road=0, lights=1, route=2)
+REACTIVE = Simulator(Task(observation=OBSERVATION, metrics="training"), IdmTraffic())
 #: With all that can be measured: half a minute of compilation.
-MEASURED = Simulator(Task(observation=SEEN), IdmTraffic())
+MEASURED = Simulator(Task(observation=OBSERVATION), IdmTraffic())
 CARS = [car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10), car(-50, 0, 0, 10)]
 
 
@@ -30,12 +30,12 @@ def bank():
 
 @partial(jax.jit, static_argnums=0)
 def together(simulator, bank, slots, actions):
-    """Actions per step for a stack of agents: states and transitions of every step, and what each sees last."""
+    """Return states and transitions of every step of a stack of agents, and their last observations."""
     states = simulator.reset_together(bank, 0, slots)
 
     def one(states, action):
-        after, done = simulator.step_together(bank, states, action)
-        return after, (after, done)
+        after, transitions = simulator.step_together(bank, states, action)
+        return after, (after, transitions)
 
     last, out = jax.lax.scan(one, states, actions)
     return out, simulator.observe_together(bank, last)
@@ -44,8 +44,8 @@ def together(simulator, bank, slots, actions):
 @partial(jax.jit, static_argnums=0)
 def single(simulator, bank, actions):
     def one(state, action):
-        after, done = simulator.step(bank, state, action)
-        return after, (after, done)
+        after, transitions = simulator.step(bank, state, action)
+        return after, (after, transitions)
 
     last, out = jax.lax.scan(one, simulator.reset(bank, 0), actions)
     return out, simulator.observe(bank, last.context)
@@ -53,7 +53,7 @@ def single(simulator, bank, actions):
 
 @pytest.fixture(scope="module")
 def braking(bank):
-    """The leader (slot 1 is 15 m to the side, so the order is by distance to ego) brakes hard, ego keeps its speed."""
+    """The leader brakes hard, ego keeps its speed. The leader is in slot 2: the car of slot 1 is closer to ego."""
     leader = int(np.argmax(np.asarray(bank.agents[0, 10, :, 0])))
     slots = slots_of(bank, 0, jnp.isin(jnp.arange(16), jnp.asarray([0, leader])), 3)
     actions = np.zeros((30, 3, 2), np.float32)
@@ -61,19 +61,19 @@ def braking(bank):
     return slots, leader, together(REACTIVE, bank, slots, jnp.asarray(actions))
 
 
-def test_slots_are_present_agents_of_the_mask(bank):
+def test_slots_are_present_agents_of_the_mask():
     cars = [car(0, 0, 0, 5), car(20, 0, 0, 5), car(40, 0, 0, 5, steps=range(30, 91)), car(60, 0, 0, 5)]
-    here = bank_of(straight_road(cars))
-    there = np.flatnonzero(np.asarray(here.agents[0, 10, :, AgentColumn.VALID]) > 0)
-    assert there.size == 3
+    bank = bank_of(straight_road(cars))
+    present = np.flatnonzero(np.asarray(bank.agents[0, 10, :, AgentColumn.VALID]) > 0)
+    assert present.size == 3
     mask = jnp.ones(16, bool)
-    assert slots_of(here, 0, mask, 5).tolist() == [*there, 16, 16]
-    assert slots_of(here, 0, mask, 2).tolist() == there[:2].tolist()
-    assert slots_of(here, 0, mask, 5, step=40).tolist() == [0, 1, 2, 3, 16]
+    assert slots_of(bank, 0, mask, 5).tolist() == [*present, 16, 16]
+    assert slots_of(bank, 0, mask, 2).tolist() == present[:2].tolist()
+    assert slots_of(bank, 0, mask, 5, step=40).tolist() == [0, 1, 2, 3, 16]
 
 
-def test_driven_agents_see_and_hit_each_other(bank, braking):
-    slots, leader, ((states, _), seen) = braking
+def test_driven_agents_observe_each_other_where_they_drive(bank, braking):
+    slots, leader, ((states, _), observations) = braking
     assert slots.tolist() == [0, leader, 16]
     x = np.asarray(states.context.history)[:, :, -1, 0]
     # 10 m/s braked with 6 m/s2 stands after 8.33 m; ego drives on.
@@ -82,31 +82,31 @@ def test_driven_agents_see_and_hit_each_other(bank, braking):
     # Bumpers meet when ego has driven 40 - 4.8 + 8.33 m: not yet. Both see the same distance.
     assert not np.asarray(states.facts.collision)[:, :2].any()
     ahead = x[-1, 1] - x[-1, 0]
-    first = np.asarray(seen["agents"])[:, :, -1, 0] * 50
+    first = np.asarray(observations["agents"])[:, :, -1, 0] * 50
     assert np.isclose(first[0], ahead, atol=0.02).any() and np.isclose(first[1], -ahead, atol=0.02).any()
 
 
 def test_padding_agents_do_nothing(bank, braking):
-    _, _, ((states, done), _) = braking
+    _, _, ((states, transitions), _) = braking
     assert np.asarray(is_driven(bank, jax.tree.map(lambda leaf: leaf[0], states))).tolist() == [
         True,
         True,
         False,
     ]
-    assert not np.asarray(done.reward)[:, 2].any() and not np.asarray(done.terminated)[:, 2].any()
-    assert not np.asarray(done.truncated)[:, 2].any()
-    check_finite(states, done)
+    for name in ("reward", "terminated", "truncated"):
+        assert not np.asarray(getattr(transitions, name))[:, 2].any()
+    check_finite(states, transitions)
 
 
-def check_finite(states, done):
-    for leaf in jax.tree.leaves((states.facts, done.reward)):
+def check_finite(states, transitions):
+    for leaf in jax.tree.leaves((states.facts, transitions.reward)):
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
 
 
 def test_reactive_traffic_sees_every_driven_agent(bank, braking):
     slots, _, ((states, _), _) = braking
-    behind = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
-    row = int(np.flatnonzero(np.asarray(data_of(bank, AgentPaths).slot[0]) == behind)[0])
+    last_slot = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
+    row = int(np.flatnonzero(np.asarray(data_of(bank, AgentPaths).slot[0]) == last_slot)[0])
     free = np.asarray(states.context.traffic.speed)[:, :, -1, row]
     # All states of the stack hold the same traffic.
     np.testing.assert_array_equal(free[:, 0], free[:, 1])
@@ -120,11 +120,14 @@ def test_reactive_traffic_sees_every_driven_agent(bank, braking):
 def test_stack_of_one_equals_a_single_agent(bank):
     actions = jax.random.uniform(jax.random.key(0), (30, 3, 2), minval=-0.5, maxval=0.3)
     slots = jnp.asarray([0, 16, 16])
-    (states, done), seen = together(MEASURED, bank, slots, actions)
-    check_finite(states, done)
-    (wanted, wanted_done), observation = single(MEASURED, bank, actions[:, 0])
-    pairs = (states.context.history[:, 0], wanted.context.history), (done.reward[:, 0], wanted_done.reward)
-    for got, expected in (*pairs, *((seen[name][0], observation[name]) for name in observation)):
+    (states, transitions), observations = together(MEASURED, bank, slots, actions)
+    check_finite(states, transitions)
+    (expected_states, expected_transitions), observation = single(MEASURED, bank, actions[:, 0])
+    pairs = (
+        (states.context.history[:, 0], expected_states.context.history),
+        (transitions.reward[:, 0], expected_transitions.reward),
+    )
+    for got, expected in (*pairs, *((observations[name][0], observation[name]) for name in observation)):
         np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
 
 
@@ -139,9 +142,9 @@ def test_agents_whose_episode_ended_get_no_reward_and_no_metrics(bank):
 
         def one(carry, _):
             states, over = carry
-            after, done = simulator.step_together(bank, states, jnp.zeros((2, 2)), over)
-            over |= done.terminated | done.truncated
-            return (after, over), (done.reward[0], done.terminated[0], after.episode.total[0])
+            after, transitions = simulator.step_together(bank, states, jnp.zeros((2, 2)), over)
+            over |= transitions.terminated | transitions.truncated
+            return (after, over), (transitions.reward[0], transitions.terminated[0], after.episode.total[0])
 
         return jax.lax.scan(one, (states, jnp.zeros(2, bool)), None, length=40)[1]
 

@@ -31,7 +31,7 @@ def test_effect_sizes_by_hand():
 
 
 def test_textbook_numbers():
-    """Cohen 1988, tables 2.4.1: 64 in each of two groups for d = 0.5; pairs as everywhere since."""
+    """Cohen 1988, table 2.4.1: 64 in each of two groups for d = 0.5; 34 and 199 pairs for 0.5 and 0.2."""
     assert scenarios_needed(0.5) == 34 and scenarios_needed(0.2) == 199
     assert scenarios_needed(0.5, share=0.5) == 128 and scenarios_needed(0.8, share=0.5) in (51, 52)
     # Minus one: not enough.
@@ -73,6 +73,7 @@ def test_power_at_its_ends():
     [
         lambda: power(1.0, 10, confidence=1.0),
         lambda: scenarios_needed(0.0),
+        lambda: scenarios_needed(math.nan),
         lambda: scenarios_needed(0.1, 1.0),
     ],
 )

@@ -218,7 +218,7 @@ def test_interquartile_bootstrap_of_equal_seeds_is_that_of_their_episodes():
     one, alone = interquartile_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
     assert one.mean == pytest.approx(alone.mean)
     assert (one.low, one.high) == pytest.approx((alone.low, alone.high), abs=0.02)
-    # Agents that differ widen it, and nothing defined is nothing.
+    # Seeds that differ widen it; without defined values it is undefined.
     assert interquartile_bootstrap([row - 1, row, row + 1], seed=0).low < one.low - 0.2
     assert interquartile_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
     assert interquartile_bootstrap([[1.0, 2.0]], ["a", "a"], seed=0) == Interval(1.5, None, None, 2)
@@ -299,8 +299,8 @@ def test_interquartile_bootstrap_is_the_exact_distribution():
     result = interquartile_bootstrap(values, confidence=0.8, resamples=20_000, seed=0)
     assert result.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and result.n == 6
     means = [
-        interquartile_mean([values[a, list(drawn)].mean() for a in agents])
-        for agents in itertools.product(range(3), repeat=3) for drawn in itertools.product(range(2), repeat=2)
+        interquartile_mean([values[seed, list(drawn)].mean() for seed in seeds])
+        for seeds in itertools.product(range(3), repeat=3) for drawn in itertools.product(range(2), repeat=2)
     ]  # fmt: skip
     assert result.low == pytest.approx(np.quantile(means, 0.1), abs=0.06)
     assert result.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)

@@ -1,4 +1,4 @@
-"""Scenes made by hand on a straight road with two lanes one way and one lane the other way; shared by tests."""
+"""Hand-made roads, egos and users, by default on two lanes one way and one the other way; shared by tests."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ TIMES = np.arange(91) * 0.1
 def road(lanes=(1, 1, -1), turn=None):
     """A road along +x; lane 0 is the rightmost at y = 0, the next ones are to its left; -1 leads back.
 
-    ``turn`` replaces the centre of lane 0 (and leaves the edges to the caller).
+    ``turn`` replaces the centre of lane 0; the edges stay those of the straight road.
     """
     built = []
-    for k, way in enumerate(lanes):
-        begin = Pose(0.0, k * WIDTH, 0.0) if way > 0 else Pose(LENGTH, k * WIDTH, math.pi)
+    for k, direction in enumerate(lanes):
+        begin = Pose(0.0, k * WIDTH, 0.0) if direction > 0 else Pose(LENGTH, k * WIDTH, math.pi)
         curve = straight(begin, LENGTH)
         if k == 0 and turn is not None:
             curve = turn
-        left = k + 1 if way > 0 and lanes[k + 1 : k + 2] == (1,) else -1
-        built.append(Lane(curve, WIDTH, LIMIT, left=left, right=k - 1 if way > 0 and k else -1))
+        left = k + 1 if direction > 0 and lanes[k + 1 : k + 2] == (1,) else -1
+        built.append(Lane(curve, WIDTH, LIMIT, left=left, right=k - 1 if direction > 0 and k else -1))
     low, high = -WIDTH / 2 - 0.8, (len(lanes) - 0.5) * WIDTH + 0.8
     ring = np.array([[-20.0, low], [LENGTH + 20.0, low], [LENGTH + 20.0, high], [-20.0, high]])
     return RoadNetwork("by_hand", tuple(built), (Line(RoadKind.EDGE_BOUNDARY, ring),))
@@ -58,7 +58,7 @@ def user(xy, heading=0.0, size=CAR, kind=AgentKind.VEHICLE, velocity=(0.0, 0.0),
 
 
 def scene(network, speed, users=(), at=30.0, lanes=(0,)):
-    """Ego on a lane at constant speed among users who do not care: the roles and the motion."""
+    """Roles and motion of ego on a lane at constant speed, among users that do not react."""
     driver = replace(draw_expert(np.random.default_rng(0)), size_m=np.array([CAR]))
     path = lane_path(network, lanes, Sway())
     roles = Roles(network, [path], driver, np.array([at]), np.array([speed]), lanes)
@@ -67,14 +67,14 @@ def scene(network, speed, users=(), at=30.0, lanes=(0,)):
     xy = np.stack([np.interp(distance, grid, path.curve.xy[:, k]) for k in (0, 1)], axis=-1)
     heading = np.interp(distance, grid, path.curve.heading)
     ego = (AgentKind.VEHICLE, CAR, xy, heading, np.full(len(TIMES), speed))
-    everybody = [ego, *users]
+    kinds, sizes, positions, headings, speeds = zip(ego, *users, strict=True)
     motion = Motion(
-        kind=np.array([one[0] for one in everybody], np.int8),
-        size_m=np.array([one[1] for one in everybody], float),
-        xy=np.stack([one[2] for one in everybody]),
-        heading=np.stack([one[3] for one in everybody]),
-        speed=np.stack([one[4] for one in everybody]),
-        valid=np.ones((len(everybody), len(TIMES)), bool),
+        kind=np.array(kinds, np.int8),
+        size_m=np.array(sizes, float),
+        xy=np.stack(positions),
+        heading=np.stack(headings),
+        speed=np.stack(speeds),
+        valid=np.ones((len(kinds), len(TIMES)), bool),
         distance_m=distance[None],
         acceleration=np.zeros((1, len(TIMES))),
         paths=[path],
@@ -83,7 +83,7 @@ def scene(network, speed, users=(), at=30.0, lanes=(0,)):
 
 
 def driven(motion, plan: EgoPlan):
-    """The motion with ego where its plan says; no user reacts."""
+    """The motion with ego on its plan; no other user reacts."""
     xy, heading, speed = motion.xy.copy(), motion.heading.copy(), motion.speed.copy()
     xy[0, plan.first_step :], heading[0, plan.first_step :] = plan.xy, plan.heading
     speed[0, plan.first_step :] = plan.speed

@@ -22,8 +22,8 @@ TRAIN = 8
 def small(tmp_path_factory):
     path = tmp_path_factory.mktemp("benchmark") / "sets"
     progress = []
-    made = generate_benchmark(path, train=TRAIN, progress=lambda done, total: progress.append((done, total)))
-    return path, made, progress
+    sets = generate_benchmark(path, train=TRAIN, progress=lambda done, total: progress.append((done, total)))
+    return path, sets, progress
 
 
 def test_sizes_follow_the_table_or_scale():
@@ -34,16 +34,24 @@ def test_sizes_follow_the_table_or_scale():
         sizes(0)
 
 
+def test_existing_set_is_refused_before_others_are_written(tmp_path):
+    (tmp_path / "test-rare").mkdir()
+    (tmp_path / "test-rare" / "manifest.json").touch()
+    with pytest.raises(UsageError, match="test-rare: output folder already exists"):
+        generate_benchmark(tmp_path, train=1)
+    assert [child.name for child in tmp_path.iterdir()] == ["test-rare"]
+
+
 @pytest.mark.slow
 def test_benchmark_sets_share_no_map(small):
-    path, made, progress = small
-    assert sorted(made) == sorted(SPLITS) == sorted(child.name for child in path.iterdir())
+    path, sets, progress = small
+    assert sorted(sets) == sorted(SPLITS) == sorted(child.name for child in path.iterdir())
     total = sum(sizes(TRAIN).values())
     assert progress == [(done, total) for done in range(1, total + 1)]
     segments = []
     for name, split in SPLITS.items():
         scenarios = ScenarioSet.open(path / name)
-        assert len(scenarios) == sizes(TRAIN)[name] == made[name].scenarios
+        assert len(scenarios) == sizes(TRAIN)[name] == sets[name].scenarios
         source = scenarios.manifest["source"]
         assert (source["benchmark"], source["split"]) == (BENCHMARK_VERSION, name)
         assert (source["world"], source["seed"]) == (WORLD_VERSION, split.seed)
@@ -55,7 +63,7 @@ def test_benchmark_sets_share_no_map(small):
 
 
 @pytest.mark.slow
-def test_smaller_benchmark_is_a_prefix_of_the_full_one(small, tmp_path):
+def test_smaller_benchmark_is_a_prefix_of_a_larger_one(small, tmp_path):
     path, *_ = small
     generate_benchmark(tmp_path / "less", Generation(), train=1)
     for name in SPLITS:

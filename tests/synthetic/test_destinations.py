@@ -76,7 +76,7 @@ def test_rearranged_traffic_is_clear_ahead_with_a_follower():
     others = Placement((1, 1, 2, 3, 4, 7), (60.0, 5.0, 3.0, 30.0, 10.0, 50.0))
     rng = np.random.default_rng(0)
     found = rearrange(others, way, (1, 40.0), rng)
-    # Somebody stands where the follower would be, or so near that there is no room.
+    # The vehicle at 5 m leaves no room for a follower at 12 to 24 m.
     assert (found.lane, found.along_m) == ((1, 4, 7), (5.0, 10.0, 50.0))
     found = rearrange(Placement((7,), (50.0,)), way, (1, 40.0), rng)
     assert found.lane == (7, 1) and 12.0 <= found.along_m[1] <= 24.0

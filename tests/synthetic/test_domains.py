@@ -24,10 +24,10 @@ def test_domain_shares_cover_all_families():
 def test_families_are_drawn_by_their_shares():
     rng = np.random.default_rng(0)
     for domain in DOMAINS.values():
-        found = Counter(domain.draw_family(rng).name for _ in range(4000))
+        counts = Counter(domain.draw_family(rng).name for _ in range(4000))
         for family, share in domain.families:
             # Four standard deviations of a binomial count.
-            assert abs(found[family.name] / 4000 - share) < 4 * np.sqrt(share * (1 - share) / 4000)
+            assert abs(counts[family.name] / 4000 - share) < 4 * np.sqrt(share * (1 - share) / 4000)
 
 
 def test_domains_differ_in_roads():

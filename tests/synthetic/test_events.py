@@ -99,7 +99,7 @@ def test_required_braking_avoids_the_actor_and_constant_speed_does_not(kind):
             start, v = follow(actor, start, v, begin)
         hit, ttc = march(motion, actor, begin, 0.0, start, v)
         close += hit or ttc < 1.0
-        # Ego brakes from 0.4 s later on. The margins allow for steps of 0.1 s in when an actor has passed.
+        # Ego brakes 0.4 s after the first step. The margins allow for the step in which an actor leaves the path.
         brakes, at = begin + 4, start + 0.4 * v
         assert not march(motion, actor, brakes, 1.1 * staged.severity_mps2 + 0.3, at, v)[0]
         assert march(motion, actor, brakes, 0.85 * staged.severity_mps2 - 0.1, at, v)[0]
@@ -162,18 +162,20 @@ def test_standing_ego_has_no_event(kind):
     assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
-def test_red_light_runner_enters_at_red():
+def test_red_light_runner_crosses_its_line_at_speed_during_the_event():
+    staged_count = 0
     for seed in range(6):
         rng = np.random.default_rng(seed)
         roles, motion = suitable(EventKind.RED_LIGHT_RUNNER, rng)
         staged = stage(EventKind.RED_LIGHT_RUNNER, EgoView(roles, motion, FIRST), 2.5, rng)
         if staged is not None:
+            staged_count += 1
             (extra,) = staged.staging.extras
             front = extra.xy[:, 1] + extra.size_m[0] / 2
             passes = int(np.argmax(front > -15.0))
             assert staged.first_step < passes < staged.last_step
-            # Ego's light is green until 40 s after the recording's start.
             assert extra.speed[passes] > 8.0
+    assert staged_count >= 3
 
 
 def test_queue_before_the_red_light_runner_is_removed():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -307,6 +308,13 @@ def test_roundabout_entries_yield_to_circulating_traffic():
                 x, y = lane.curve.xy[0]
                 assert x * math.sin(lane.curve.heading[0]) - y * math.cos(lane.curve.heading[0]) > 0
     assert {arms for arms, _ in layouts} == {3, 4} and {count for _, count in layouts} == {1, 2}
+
+
+@pytest.mark.parametrize("name", ["all_way_stop", "roundabout", "midblock_crosswalk"])
+def test_families_with_a_highest_limit_use_the_lowest_one_of_faster_styles(name):
+    style = replace(GRID, limits_mps=(25.0, 20.0))
+    network = NAMED[name].build(np.random.default_rng(0), style)
+    assert max(lane.limit_mps for lane in network.lanes) == 20.0
 
 
 def test_streets_have_the_features_of_their_family():

@@ -19,7 +19,6 @@ from drivax.evaluation.audit import audit
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic import generate as generation
-from drivax.synthetic import generate as portable
 from drivax.synthetic.generate import (
     RESERVED_SEED,
     FamilyCount,
@@ -58,7 +57,7 @@ def test_worker_count_does_not_change_the_bytes(one_worker, tmp_path):
 
 
 def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
-    """NumPy and OpenBLAS use other routines there, whose last bits differ."""
+    """The command runs with and without these instructions, whose routines differ in the last bits of results."""
     newer = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
     if not newer:
         pytest.skip("this processor has none of the newer instructions that NumPy knows")
@@ -74,8 +73,8 @@ def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
     assert hashes[0] == hashes[1]
 
 
-def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
-    """Compare sines and solutions of equations in processes with and without newer instructions."""
+def test_portable_workers_use_no_newer_instructions_or_kernels(tmp_path, monkeypatch):
+    """Compare sines and solutions of equations in workers of parents with different kernels of OpenBLAS."""
     script = tmp_path / "computes.py"
     script.write_text(
         "import hashlib, numpy as np\n"
@@ -86,25 +85,25 @@ def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
         "print(any(u.__cpu_features__[name] for name in u.__cpu_dispatch__), hashlib.sha256(found).hexdigest())\n"
     )
 
-    def numbers():
+    def run_script():
         call = [sys.executable, str(script)]
         return subprocess.run(call, env=os.environ, capture_output=True, text=True, check=True).stdout
 
-    found = []
+    outputs = []
     for kernel in (None, "SkylakeX"):
         if kernel is not None:
             monkeypatch.setenv("OPENBLAS_CORETYPE", kernel)
         before = dict(os.environ)
         with portable_workers():
-            found.append(numbers())
+            outputs.append(run_script())
         assert dict(os.environ) == before
-    assert found[0] == found[1] and found[0].startswith("False")
+    assert outputs[0] == outputs[1] and outputs[0].startswith("False")
 
 
 def test_workers_inherit_disabled_features(monkeypatch):
     """A worker lacks the processor features that its parent disabled."""
     has = {"A": True, "B": False, "C": False}
-    monkeypatch.setattr(portable, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))
+    monkeypatch.setattr(generation, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))
     monkeypatch.setenv("NPY_DISABLE_CPU_FEATURES", "B")
     with portable_workers():
         assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "A B"
@@ -119,9 +118,9 @@ def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_pa
     assert all(scenario.audit["clean"] and scenario.id.startswith("w2-grid-s3-t161-") for scenario in made)
     assert {int(scenario.event_end.max()) <= 90 for scenario in made if scenario.event_kind.any()} == {True}
     assert max(np.hypot(*(s.agent_xy[160, 0] - s.agent_xy[90, 0])) for s in made) > 20.0
-    for wrong, words in ((4.0, "use 8 to 60"), (61.0, "use 2 to 60")):
-        with pytest.raises(UsageError, match=f"future_s is {wrong:g}; {words}"):
-            generate(tmp_path / "no", 1, 0, Generation(future_s=wrong))
+    for future_s in (4.0, 61.0):
+        with pytest.raises(UsageError, match=f"future_s is {future_s:g}; use 8 to 60"):
+            generate(tmp_path / "no", 1, 0, Generation(future_s=future_s))
     with pytest.raises(UsageError, match="its world is fixed but for its domain"):
         generation.generate_benchmark(tmp_path / "no", Generation(future_s=15.0), 1)
 
@@ -166,12 +165,12 @@ def test_set_matches_the_request(one_worker):
         scenario = scenarios[index]
         assert entry["tags"]["domain"] == "grid" and entry["tags"]["dataset"] == "drivax"
         assert entry["overflow"] == {}
-        wanted = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
-        assert wanted in scenario.has and Flag.NO_FUTURE not in scenario.has
+        flags = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
+        assert flags in scenario.has and Flag.NO_FUTURE not in scenario.has
         assert Flag.LIGHTS in scenario.has
-        lit = bool(generate_one(5, index, WorldConfig()).recording.lights)
-        assert (scenario.light_state >= 0).any() == lit
-        # The route leads along the way that the expert drives, and on.
+        has_lights = bool(generate_one(5, index, WorldConfig()).recording.lights)
+        assert (scenario.light_state >= 0).any() == has_lights
+        # The route follows the expert's log and continues beyond it.
         n = int(scenario.route_points[0])
         route = scenario.route_xy[0, :n]
         ego = scenario.agent_xy[:, 0]
@@ -334,18 +333,8 @@ def test_flags_override_the_configuration_file(tmp_path):
 def test_signal_leaves_nothing(tmp_path):
     """SIGTERM while scenarios are drawn; the first shard would be full after 512."""
     code = "from drivax.cli import main; raise SystemExit(main())"
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        "generate",
-        tmp_path / "set",
-        "--scenarios",
-        "512",
-        "--workers",
-        "1",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    words = ["generate", tmp_path / "set", "--scenarios", "512", "--workers", "1"]
+    process = subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not (tmp_path / ".set.partial" / "content").is_dir() and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -168,7 +168,7 @@ def test_sidewalks_follow_the_edge_outside_the_road(family, style, seed):
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_most_streets_have_sidewalks_and_some_have_none(style):
+def test_streets_have_sidewalks_at_about_the_rate_of_their_style(style):
     sidewalks = [bool(built(f, style, seed).sidewalks) for f in JUNCTIONS[:3] for seed in range(10)]
     assert np.mean(sidewalks) == pytest.approx(STYLES[style].sidewalk_share, abs=0.25)
 

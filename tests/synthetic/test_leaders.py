@@ -13,25 +13,25 @@ from drivax.synthetic.traffic.paths import Sway, lane_path
 from .traffic_scenes import drivers, road
 
 
-def leaders(ways, at, table, active=None, **roads):
+def leaders(routes, at, table, active=None, **roads):
     network, _ = road(300.0, **roads)
-    worlds = Worlds([network], [len(ways)])
-    tables = PathTables(worlds, [lane_path(network, way, Sway()) for way in ways], table)
-    there = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(worlds, table).find(tables, np.array(at, float), there)
+    worlds = Worlds([network], [len(routes)])
+    tables = PathTables(worlds, [lane_path(network, route, Sway()) for route in routes], table)
+    is_active = np.ones(len(at), bool) if active is None else np.array(active)
+    return Leaders(worlds, table).find(tables, np.array(at, float), is_active)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_leader_is_the_nearest_vehicle_ahead_on_the_path(seed):
     # Three lanes in three sections of 100 m: lane 3k + j is the j-th section of the k-th column.
     rng = np.random.default_rng(seed)
-    column, at, there = rng.integers(0, 3, 14), rng.uniform(5.0, 290.0, 14), rng.random(14) < 0.8
+    column, at, is_active = rng.integers(0, 3, 14), rng.uniform(5.0, 290.0, 14), rng.random(14) < 0.8
     table = drivers(14, seed)
     gap, leader = leaders(
-        [(3 * k, 3 * k + 1, 3 * k + 2) for k in column.tolist()], at, table, there, lanes=3, sections=3
+        [(3 * k, 3 * k + 1, 3 * k + 2) for k in column.tolist()], at, table, is_active, lanes=3, sections=3
     )
     for i in range(14):
-        ahead = [j for j in range(14) if there[j] and column[j] == column[i] and at[j] > at[i]]
+        ahead = [j for j in range(14) if is_active[j] and column[j] == column[i] and at[j] > at[i]]
         if not ahead:
             assert gap[i] == np.inf
             continue

@@ -62,13 +62,13 @@ def test_extents_are_those_of_the_corners(turned):
     network, _ = road(100.0)
     path = lane_path(network, (0,), Sway())
     boxes = Boxes(np.array([[40.0, 2.0]]), np.array([turned]), np.zeros(1), np.array([[4.0, 1.8]]))
-    seen, which = extents(path, boxes)
+    extent, rows = extents(path, boxes)
     corners = np.array(box_corners((40.0, 2.0), turned, 4.0, 1.8))
-    assert which.tolist() == [0]
-    assert seen.near_m[0] == pytest.approx(corners[:, 0].min()) and seen.far_m[0] == pytest.approx(
+    assert rows.tolist() == [0]
+    assert extent.near_m[0] == pytest.approx(corners[:, 0].min()) and extent.far_m[0] == pytest.approx(
         corners[:, 0].max()
     )
-    assert seen.right_m[0] == pytest.approx(corners[:, 1].min()) and seen.left_m[0] == pytest.approx(
+    assert extent.right_m[0] == pytest.approx(corners[:, 1].min()) and extent.left_m[0] == pytest.approx(
         corners[:, 1].max()
     )
 
@@ -103,12 +103,12 @@ def test_detours_yield_to_oncoming_traffic():
     assert not touches(motion, 0, 1) and not touches(motion, 0, 2)
     assert motion.acceleration[1].min() > -1.5
     assert motion.xy[0, :, 0].max() > 180.0
-    # They meet before the first one swings out.
-    met = int(np.flatnonzero(motion.xy[0, :, 0] > motion.xy[1, :, 0])[0])
-    assert motion.xy[0, met, 1] < 0.5
+    # Row 1 has passed before row 0 swings out.
+    meeting = int(np.flatnonzero(motion.xy[0, :, 0] > motion.xy[1, :, 0])[0])
+    assert motion.xy[0, meeting, 1] < 0.5
 
 
-@pytest.mark.parametrize(("x", "y", "meets"), [
+@pytest.mark.parametrize(("x", "y", "is_blocked"), [
     (40.0, 0.0, True),
     (40.0, 2.1, True),  # 2.1 - 0.95 m is nearer than 1.2 m
     (40.0, 2.2, False),
@@ -117,24 +117,24 @@ def test_detours_yield_to_oncoming_traffic():
     (69.0, 0.0, True),
     (20.0, 0.0, False),  # passed: its rear is more than half a metre behind the front
 ])  # fmt: skip
-def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
+def test_obstacles_in_the_band_ahead_are_detected(x, y, is_blocked):
     path = lane_path(street(), (0,), Sway())
     boxes = boxes_at((parked(x, y, 1),), 0)
     standing = StaticObstacles(Worlds([street()], [1]), [boxes], [extents(path, boxes)[0]], np.array([1.9]))
-    assert standing.is_blocked(0, 22.0, 1.2, 45.0) == meets
+    assert standing.is_blocked(0, 22.0, 1.2, 45.0) == is_blocked
 
 
 def test_cars_next_to_the_lane_change_nothing():
     table = drivers(1)
     free = run(street(), [(0,)], table, [20.0], [10.0], 15.0)
-    beside = run(street(), [(0,)], table, [20.0], [10.0], 15.0, parked=(parked(150.0, -2.6, 150),))
-    assert np.array_equal(free.xy[0], beside.xy[0])
+    with_parked = run(street(), [(0,)], table, [20.0], [10.0], 15.0, parked=(parked(150.0, -2.6, 150),))
+    assert np.array_equal(free.xy[0], with_parked.xy[0])
 
 
 def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     steps = 150
     times = np.arange(steps) / 10
-    # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
+    # From 4 s on it walks from the right at 1.5 m/s to the middle of the lane at x = 120 m and stops there.
     y = np.clip(-5.0 + 1.5 * np.maximum(times - 4.0, 0.0), -5.0, 0.0)
     pedestrian = ScriptedUser(
         kind=AgentKind.PEDESTRIAN,
@@ -168,7 +168,7 @@ def test_displaced_path_keeps_its_offset():
     shifted = detour_path(path, DetourPositions(40.0, 60.0, 90.0, 115.0), 2.0)
     y = np.interp([20.0, 75.0, 150.0], shifted.curve.xy[:, 0], shifted.curve.xy[:, 1])
     assert y == pytest.approx([0.0, 2.0, 0.0], abs=1e-6)
-    # Longer by what the detour costs, and what lies beyond is still where it was in the world.
+    # The new path is as long as its curve, and its lane still ends at the path's end.
     longer = np.hypot(*np.diff(shifted.curve.xy, axis=0).T).sum() - 200.0
     assert shifted.length_m == pytest.approx(200.0 + longer, abs=0.01) and longer > 0.2
     last = shifted.spans[0]
@@ -183,13 +183,13 @@ def test_displaced_path_keeps_its_offset():
 
 def test_lane_change_starts_at_the_vehicle():
     network, columns = road(300.0, lanes=2)
-    here, there = (lane_path(network, (column[0],), Sway((0.2,), (0.05,), (0.3,))) for column in columns)
-    path, at = lane_change_path(there, here, 80.3, 50.0)
+    present, target = (lane_path(network, (column[0],), Sway((0.2,), (0.05,), (0.3,))) for column in columns)
+    path, at = lane_change_path(target, present, 80.3, 50.0)
     xy = [np.interp(at, path.step_m * np.arange(len(path.curve.xy)), path.curve.xy[:, k]) for k in (0, 1)]
-    old = [np.interp(80.3, here.step_m * np.arange(len(here.curve.xy)), here.curve.xy[:, k]) for k in (0, 1)]
+    old = [np.interp(80.3, present.curve.arc_m, present.curve.xy[:, k]) for k in (0, 1)]
     assert np.hypot(*(np.array(xy) - old)) < 0.02
     end = path.curve.xy[path.step_m * np.arange(len(path.curve.xy)) > at + 51.0]
-    assert distance_to_polyline(end, there.curve.xy).max() < 0.02
-    both = set(path.lane[round((at + 10.0) / path.step_m)]) - {-1}
+    assert distance_to_polyline(end, target.curve.xy).max() < 0.02
+    during = set(path.lane[round((at + 10.0) / path.step_m)]) - {-1}
     after = set(path.lane[round((at + 45.0) / path.step_m)]) - {-1}
-    assert both == {columns[0][0], columns[1][0]} and after == {columns[1][0]}
+    assert during == {columns[0][0], columns[1][0]} and after == {columns[1][0]}

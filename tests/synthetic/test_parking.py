@@ -12,7 +12,7 @@ from drivax.synthetic.traffic.placement import parked_cars
 
 
 def street(width=3.5, oncoming=True):
-    """A lane along +x at y = 0, maybe one the other way, and 20 bays of 6.5 m on the right."""
+    """A lane along +x at y = 0, and one the other way if ``oncoming``, and 20 bays of 6.5 m on the right."""
     draft = Draft()
     draft.lane(straight(Pose(0.0, 0.0, 0.0), 200.0), width, 12.0)
     if oncoming:
@@ -52,15 +52,15 @@ def test_double_parked_cars_leave_room_to_pass():
     # A lane of 3.5 m without a neighbour leaves no room to pass.
     for seed in range(20):
         assert parked_cars(street(oncoming=False), 0.0, 1.0, np.random.default_rng(seed), 5) == ()
-    # 5 m are enough for both.
+    # A lane of 5 m leaves room to pass.
     assert parked_cars(street(5.0, oncoming=False), 0.0, 1.0, np.random.default_rng(0), 5)
 
 
 def test_double_parking_uses_neighbour_lanes_away_from_lane_ends():
     network = street(oncoming=False)
     lane = dataclasses.replace(network.lanes[0], left=0)
-    beside = dataclasses.replace(network, lanes=(lane,))
-    cars = parked_cars(beside, 0.0, 1.0, np.random.default_rng(0), 5)
+    with_neighbour = dataclasses.replace(network, lanes=(lane,))
+    cars = parked_cars(with_neighbour, 0.0, 1.0, np.random.default_rng(0), 5)
     assert cars
     assert all(15.0 < car.xy[0, 0] < 185.0 for car in cars)
     junction = dataclasses.replace(network, lanes=(dataclasses.replace(lane, connector=True),))
@@ -68,5 +68,5 @@ def test_double_parking_uses_neighbour_lanes_away_from_lane_ends():
 
 
 def test_equal_seeds_park_equal_cars():
-    one, other = (parked_cars(street(), 0.5, 0.1, np.random.default_rng(4), 5) for _ in range(2))
-    assert all(np.array_equal(a.xy, b.xy) for a, b in zip(one, other, strict=True)) and len(one) == len(other)
+    cars, same = (parked_cars(street(), 0.5, 0.1, np.random.default_rng(4), 5) for _ in range(2))
+    assert all(np.array_equal(a.xy, b.xy) for a, b in zip(cars, same, strict=True))

@@ -29,12 +29,12 @@ def test_path_follows_its_lanes(family):
     assert path.length_m == pytest.approx(sum(network.lanes[i].length_m for i in lanes), abs=0.05)
     assert path.step_m == pytest.approx(STEP_M, abs=0.01)
     # Where a path says that the vehicle is on a lane, it is there.
-    for place in range(0, len(path.curve.xy), 37):
-        lane, along = network.lanes[path.lane[place, 0]], path.lane_m[place, 0]
+    for sample in range(0, len(path.curve.xy), 37):
+        lane, along = network.lanes[path.lane[sample, 0]], path.lane_m[sample, 0]
         arc = lane.curve.arc_m
-        there = [np.interp(along, arc, lane.curve.xy[:, k]) for k in (0, 1)]
-        assert np.hypot(*(there - path.curve.xy[place])) < 0.06
-        assert path.limit_mps[place] == lane.limit_mps
+        expected = [np.interp(along, arc, lane.curve.xy[:, k]) for k in (0, 1)]
+        assert np.hypot(*(expected - path.curve.xy[sample])) < 0.06
+        assert path.limit_mps[sample] == lane.limit_mps
     assert tangent_error(path) < 0.01
 
 
@@ -64,9 +64,9 @@ def two_lane_road():
 
 def test_lane_change_is_smooth_between_lane_centres():
     network = two_lane_road()
-    beside = network.lanes[2].right
+    neighbour = network.lanes[2].right
     change = LaneChange(section=2, begin_m=8.0, length_m=56.0)
-    lanes = (0, 1, 2, *random_lanes(network, beside, np.random.default_rng(0)))
+    lanes = (0, 1, 2, *random_lanes(network, neighbour, np.random.default_rng(0)))
     path = lane_path(network, lanes, Sway(), change)
     begin = next(s.begin_m for s in path.spans if s.lane == 2)
     old, new = (join_curves(*(network.lanes[i].curve for i in ids)).xy for ids in ((0, 1, 2), lanes[3:]))
@@ -81,8 +81,8 @@ def test_lane_change_is_smooth_between_lane_centres():
     assert gap(begin + 100.0, new) < 0.05
     assert tangent_error(path) < 0.01
     # The car is on both lanes while it changes, on one before and after.
-    here = {at: set(path.lane[round((begin + at) / path.step_m)]) - {-1} for at in (-20.0, 30.0, 75.0)}
-    assert here[-20.0] == {1} and here[30.0] == {2, beside} and here[75.0] == {beside}
+    lanes_at = {at: set(path.lane[round((begin + at) / path.step_m)]) - {-1} for at in (-20.0, 30.0, 75.0)}
+    assert lanes_at[-20.0] == {1} and lanes_at[30.0] == {2, neighbour} and lanes_at[75.0] == {neighbour}
     # Curvature: that of the road plus the quintic's 10 / sqrt(3) x width / length^2.
     calm = lane_path(network, random_lanes(network, 0, np.random.default_rng(0)), Sway())
     assert np.abs(path.curvature).max() < np.abs(calm.curvature).max() * 1.15 + 5.8 * width / 56.0**2 + 0.002

@@ -23,32 +23,32 @@ def test_placed_vehicles_keep_their_distance(seed):
     assert len(points) > 20
     for i, (lane, along) in enumerate(points):
         assert 0 < along < network.lanes[lane].length_m
-        for other, there in points[i + 1 :]:
+        for other, other_along in points[i + 1 :]:
             if other == lane:
-                assert abs(along - there) > 15.0
+                assert abs(along - other_along) > 15.0
             elif other in network.lanes[lane].successors:
-                assert network.lanes[lane].length_m - along + there > 15.0
+                assert network.lanes[lane].length_m - along + other_along > 15.0
 
 
 def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     network, _ = road(600.0, lanes=2)
     lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
     network = dataclasses.replace(network, lanes=lanes)
-    stands = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
+    obstacle = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
     density = Density(spacing_m=(4.0, 6.0), vehicles=200, leader_share=0.0)
-    found = [
+    places = [
         place
         for seed in range(20)
         for place in zip(
             *dataclasses.astuple(
-                place_vehicles(network, 0, 20.0, density, np.random.default_rng(seed), (stands,))
+                place_vehicles(network, 0, 20.0, density, np.random.default_rng(seed), (obstacle,))
             ),
             strict=True,
         )
     ]
-    here = np.array([along for lane, along in found if lane == 0])
-    assert not np.any((here > 275.0) & (here < 310.0)) and np.any((here > 240.0) & (here < 275.0))
-    assert max(along for lane, along in found if lane == 1) <= 525.0
+    along_m = np.array([along for lane, along in places if lane == 0])
+    assert not np.any((along_m > 275.0) & (along_m < 310.0)) and np.any((along_m > 240.0) & (along_m < 275.0))
+    assert max(along for lane, along in places if lane == 1) <= 525.0
 
 
 def test_vehicle_types_match_their_shares():
@@ -82,7 +82,7 @@ def test_cyclists_ride_at_the_right_side_of_the_lane():
 
 
 def test_tables_of_drivers_are_joined_and_chosen_in_order():
-    both = join_drivers(drivers(2, 1), drivers(3, 2))
-    assert both.size_m.shape == (5, 3)
-    assert np.array_equal(both.headway_s[2:], drivers(3, 2).headway_s)
-    assert np.array_equal(both.select(np.array([4, 0])).headway_s, both.headway_s[[4, 0]])
+    joined = join_drivers(drivers(2, 1), drivers(3, 2))
+    assert joined.size_m.shape == (5, 3)
+    assert np.array_equal(joined.headway_s[2:], drivers(3, 2).headway_s)
+    assert np.array_equal(joined.select(np.array([4, 0])).headway_s, joined.headway_s[[4, 0]])

@@ -26,7 +26,7 @@ from .oracles import box_corners, shared_area
 from .staged_scenes import CAR, TIMES, crossed, road, scene, user
 
 
-def way_of(roles, shift=None, reach=60.0):
+def candidate_of(roles, shift=None, reach=60.0):
     pose = Pose(30.0, 0.0, 0.0)
     return shift_path(roles.paths[0], roles.drivers, pose, 30.0, reach, shift or Shift())
 
@@ -44,36 +44,35 @@ def test_conflicts_agree_with_clipped_polygons(seed):
         for k in range(6)
     ]  # fmt: skip
     roles, motion = scene(road(), 10.0, others)
-    way = way_of(roles, Shift(2.5, 5.0, 25.0, 35.0, 55.0))
+    candidate = candidate_of(roles, Shift(2.5, 5.0, 25.0, 35.0, 55.0))
     box = user_boxes(motion)[1:, ::15]
     valid = rng.random(box.shape[:2]) < 0.9
     pedestrians = motion.kind[1:] == AgentKind.PEDESTRIAN
-    got = find_conflicts(way, motion.size_m[0], box, valid, pedestrians)
+    got = find_conflicts(candidate, motion.size_m[0], box, valid, pedestrians)
     result = dict(zip(zip(got.user, got.step, got.point, strict=True), got.hard, strict=True))
-    brute = {}
+    expected = {}
     for u in range(len(box)):
         near = NEAR_VULNERABLE_M if pedestrians[u] else NEAR_M
         for t in np.flatnonzero(valid[u]):
-            theirs = box_corners(
+            box_of_user = box_corners(
                 box[u, t, :2], np.arctan2(box[u, t, 3], box[u, t, 2]), box[u, t, 4], box[u, t, 5]
             )
-            for p in range(0, len(way.xy), 3):
-                pose = way.xy[p], way.heading[p]
+            for p in range(0, len(candidate.xy), 3):
+                pose = candidate.xy[p], candidate.heading[p]
                 wide, tight = (
                     box_corners(*pose, CAR[0] + 2 * along, CAR[1] + 2 * aside)
                     for along, aside in (near, HARD_M)
                 )
-                if shared_area(wide, theirs) > 1e-9:
-                    brute[u, t, p] = shared_area(tight, theirs) > 1e-9
-    assert {key: hard for key, hard in result.items() if key[2] % 3 == 0} == brute
-    assert len(brute) > 20
+                if shared_area(wide, box_of_user) > 1e-9:
+                    expected[u, t, p] = shared_area(tight, box_of_user) > 1e-9
+    assert {key: hard for key, hard in result.items() if key[2] % 3 == 0} == expected
+    assert len(expected) > 20
 
 
 def test_static_users_conflict_at_all_steps():
     roles, motion = scene(road(), 10.0, [user((60.0, 0.0))])
-    got = find_conflicts(
-        way_of(roles), motion.size_m[0], user_boxes(motion)[1:], motion.valid[1:], np.zeros(1, dtype=bool)
-    )
+    others, valid, vulnerable = user_boxes(motion)[1:], motion.valid[1:], np.zeros(1, bool)
+    got = find_conflicts(candidate_of(roles), motion.size_m[0], others, valid, vulnerable)
     # Centres closer than a car's length and the room kept: 4.6 + 0.35 m.
     places = 30.0 + np.unique(got.point[got.hard]) * SPACING_M
     assert places.tolist() == np.arange(55.5, 64.6, 0.5).tolist()
@@ -85,23 +84,23 @@ def test_red_lights_close_the_stop_line_and_late_yellow_is_avoided():
     network = crossed(100.0, Control.SIGNAL)
     network = replace(network, signals=plan)
     roles, _ = scene(network, 10.0, lanes=(0, 1, 2))
-    (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
+    (line,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
     # Half a metre before the front bumper reaches the line.
-    assert wall.base_m == pytest.approx(100.0 - 2.3 - 0.5 - 30.0)
+    assert line.base_m == pytest.approx(100.0 - 2.3 - 0.5 - 30.0)
     colour = plan.colours(TIMES, 3)[0][:, 1]
-    assert wall.closed.tolist() == (colour == Colour.RED).tolist()
+    assert line.closed.tolist() == (colour == Colour.RED).tolist()
     # Green ends at 2 s, yellow at 5 s.
-    assert TIMES[wall.late].min() == pytest.approx(4.1, abs=0.11)
-    assert not wall.closed[TIMES < 4.95].any()
-    assert wall.closed[TIMES > 5.05][:10].all()
+    assert TIMES[line.late].min() == pytest.approx(4.1, abs=0.11)
+    assert not line.closed[TIMES < 4.95].any()
+    assert line.closed[TIMES > 5.05][:10].all()
     assert stop_lines(network, roles.paths[0], (98.0, 2.3), TIMES, 98.0 + TIMES, {}) == []
 
 
 def test_stop_signs_open_after_stopping_and_yield_signs_after_traffic():
     network = crossed(100.0, Control.STOP)
     roles, _ = scene(network, 10.0, lanes=(0, 1, 2))
-    (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
-    assert wall.closed.tolist() == (30.0 + 10.0 * TIMES + 2.3 <= 100.0).tolist()
+    (line,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})
+    assert line.closed.tolist() == (30.0 + 10.0 * TIMES + 2.3 <= 100.0).tolist()
     lanes = list(crossed(100.0, Control.YIELD).lanes)
     lanes[1] = replace(lanes[1], yields_to=(2,))
     network = replace(network, lanes=tuple(lanes))
@@ -112,6 +111,6 @@ def test_stop_signs_open_after_stopping_and_yield_signs_after_traffic():
     )  # fmt: skip
     assert TIMES[first[2]].min() == pytest.approx(2.8)
     assert first[2][28:].all()
-    (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, first)
-    assert wall.late.tolist() == first[2].tolist()
-    assert not wall.closed.any()
+    (line,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, first)
+    assert line.late.tolist() == first[2].tolist()
+    assert not line.closed.any()

@@ -14,7 +14,7 @@ from drivax.synthetic.traffic.role_assignment import add_feeders, conflicts_on, 
 from .traffic_scenes import crossroads, road
 
 
-def built(name, seed):
+def draw_roads(name, seed):
     family = next(family for family in FAMILIES if family.name == name)
     return family.build(np.random.default_rng(seed))
 
@@ -47,11 +47,11 @@ def test_the_target_lane_of_a_lane_change_conflicts():
 
 def test_feeders_are_the_lanes_within_reach_against_shortest_paths():
     for seed in range(4):
-        network = built("corridor", seed)
+        network = draw_roads("corridor", seed)
         target = next(k for k, lane in enumerate(network.lanes) if lane.connector and lane.predecessors)
         # Going back from a lane to the one before costs the lane's own length.
         edges = [(i, k, lane.length_m) for i, lane in enumerate(network.lanes) for k in lane.predecessors]
         begin, end, cost = zip(*edges, strict=True)
         away = dijkstra(csr_array((cost, (begin, end)), shape=[len(network.lanes)] * 2), indices=target)
-        wanted = set(np.flatnonzero(away < 160.0).tolist())
-        assert add_feeders(network, frozenset({target})) == wanted
+        expected = set(np.flatnonzero(away < 160.0).tolist())
+        assert add_feeders(network, frozenset({target})) == expected

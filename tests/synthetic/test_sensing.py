@@ -31,11 +31,11 @@ def look(rows, heights, blocks=None, config=SENSOR):
 EGO = (0.0, 0.0, 0.0, 4.6, 1.9)
 
 
-def test_vans_occlude_pedestrians_and_pedestrians_occlude_no_agent():
-    van, is_pedestrian = (10.0, 0.0, 0.0, 5.0, 2.0), (15.0, 0.0, 0.0, 0.6, 0.6)
-    assert look([EGO, van, is_pedestrian], [1.5, 2.4, 1.75]) == [True, True, False]
-    assert look([EGO, van, is_pedestrian], [1.5, 2.4, 1.75], [True, False, True]) == [True, True, True]
-    # Beside the van it is in view.
+def test_vans_hide_pedestrians_unless_masked():
+    van, pedestrian = (10.0, 0.0, 0.0, 5.0, 2.0), (15.0, 0.0, 0.0, 0.6, 0.6)
+    assert look([EGO, van, pedestrian], [1.5, 2.4, 1.75]) == [True, True, False]
+    assert look([EGO, van, pedestrian], [1.5, 2.4, 1.75], [True, False, True]) == [True, True, True]
+    # 3 m to the side the van does not hide it.
     assert look([EGO, van, (15.0, 3.0, 0.0, 0.6, 0.6)], [1.5, 2.4, 1.75]) == [True, True, True]
 
 
@@ -56,8 +56,8 @@ def test_range_is_to_the_centre_and_invalid_users_are_not_visible():
     assert look(rows, [1.5, 1.5, 1.5], config=SensorConfig(range_m=100.0))[2]
     valid = np.array([[True, True, False], [True, False, True]])
     box = np.repeat(boxes(*rows[:2]), 3, axis=1)
-    seen = visible(box, np.array([1.5, 1.5]), valid, np.ones(2, bool), SENSOR)
-    assert seen.tolist() == [[True, True, False], [True, False, False]]
+    is_visible = visible(box, np.array([1.5, 1.5]), valid, np.ones(2, bool), SENSOR)
+    assert is_visible.tolist() == [[True, True, False], [True, False, False]]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -73,7 +73,7 @@ def test_visibility_agrees_with_shapely_in_crowds(seed):
     blocks = rng.random(users) < 0.7
     valid = rng.random((users, steps)) < 0.9
     valid[0] = True
-    seen = visible(box, np.full(users, 100.0), valid, blocks, SENSOR)
+    is_visible = visible(box, np.full(users, 100.0), valid, blocks, SENSOR)
     shapes = shapely.polygons(corners(box))
     eye = xy[0, 0]
     total = 0
@@ -88,9 +88,9 @@ def test_visibility_agrees_with_shapely_in_crowds(seed):
                 )
                 for end in ends
             ]
-            wanted = valid[i, t] and any(free) and np.hypot(*xy[i, t]) <= 80.0
-            assert seen[i, t] == wanted, (t, i)
-            total += int(wanted)
+            expected = valid[i, t] and any(free) and np.hypot(*xy[i, t]) <= 80.0
+            assert is_visible[i, t] == expected, (t, i)
+            total += int(expected)
     assert 10 < total < 90
 
 
@@ -202,24 +202,26 @@ def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
     count = 100
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, count))
     ego = np.array([0.0, 0.0, 1.0, 0.0, 4.6, 1.9])
-    way = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     near, far = np.zeros(count), np.full(count, 20.0)
-    one = np.ones((2, 1), bool)
+    one_step = np.ones((2, 1), bool)
 
     def box(distance, k):
-        return np.array([*(distance * way[k]), np.cos(heading[k]), np.sin(heading[k]), length, width])
+        return np.array([*(distance * direction[k]), np.cos(heading[k]), np.sin(heading[k]), length, width])
 
     for k in range(count):
         for _ in range(30):
             middle = (near[k] + far[k]) / 2
             touches = (
-                first_overlap_step(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min()
+                first_overlap_step(
+                    np.stack([ego, box(middle, k)])[:, None], one_step, np.ones((2, 2), bool)
+                ).min()
                 < 1
             )
             near[k], far[k] = (middle, far[k]) if touches else (near[k], middle)
     plain = tracks(count + 1, 4)
     plain.valid[:] = True
-    plain.xy[1:], plain.heading[1:] = (far[:, None] * way)[:, None], heading[:, None]
+    plain.xy[1:], plain.heading[1:] = (far[:, None] * direction)[:, None], heading[:, None]
     plain.velocity[:] = 10.0 * np.stack([np.cos(plain.heading), np.sin(plain.heading)], axis=-1)
     room = shapely.Polygon(corners(ego))
     for seed in range(8):

@@ -19,10 +19,10 @@ def braking(steps=40):
 
 def test_constant_speed_is_unchanged():
     at, speed = np.arange(51) * 1.0, np.full(51, 10.0)
-    drive = smooth_speeds(at, speed, 0.0, bounds(50))
-    assert drive.excess <= 0.0
-    assert np.allclose(drive.speed, 10.0)
-    assert np.allclose(drive.at_m, at)
+    profile = smooth_speeds(at, speed, 0.0, bounds(50))
+    assert profile.excess <= 0.0
+    assert np.allclose(profile.speed, 10.0)
+    assert np.allclose(profile.at_m, at)
 
 
 @pytest.mark.filterwarnings("ignore:delta_grad")
@@ -32,10 +32,12 @@ def test_smoothing_solves_the_quadratic_programme(high):
     steps = 21
     at, speed = braking(steps)
     limits = bounds(steps, high=high, acceleration=(-4.5, 2.0), jerk=8.0)
-    drive = smooth_speeds(at, speed, -0.5, limits)
+    profile = smooth_speeds(at, speed, -0.5, limits)
     tril = np.tril(np.ones((steps, steps)))
     rate = tril * 0.1
-    place = np.array([[(n - m + 0.5) * 0.01 if m <= n else 0.0 for m in range(steps)] for n in range(steps)])
+    position = np.array(
+        [[(n - m + 0.5) * 0.01 if m <= n else 0.0 for m in range(steps)] for n in range(steps)]
+    )
 
     spline = np.zeros((steps, 8))
     for t in range(steps):
@@ -46,7 +48,7 @@ def test_smoothing_solves_the_quadratic_programme(high):
 
     def cost(knots):
         a = spline @ knots
-        v, s = 12.0 + rate @ a, 12.0 * 0.1 * np.arange(1, steps + 1) + place @ a
+        v, s = 12.0 + rate @ a, 12.0 * 0.1 * np.arange(1, steps + 1) + position @ a
         return (
             smoothing._ACCELERATION * np.sum(a**2)
             + smoothing._JERK * np.sum(jerk(a) ** 2)
@@ -58,30 +60,30 @@ def test_smoothing_solves_the_quadratic_programme(high):
     first = np.zeros(steps)
     first[0] = -5.0
     constraints = [
-        LinearConstraint(place @ spline, -np.inf, np.minimum(high, 1e6) - 1.2 * np.arange(1, steps + 1)),
+        LinearConstraint(position @ spline, -np.inf, np.minimum(high, 1e6) - 1.2 * np.arange(1, steps + 1)),
         LinearConstraint(rate @ spline, -12.0, 28.0),
         LinearConstraint(spline, -4.5, 2.0),
         LinearConstraint(difference @ spline, first - 8.0, first + 8.0),
     ]
-    found = minimize(
+    solution = minimize(
         cost, np.zeros(8),
         method="trust-constr", constraints=constraints,
         options={"gtol": 1e-9, "xtol": 1e-12, "maxiter": 3000},
     )  # fmt: skip
-    got = np.diff(drive.speed) / 0.1
-    assert drive.excess < 0.01
-    assert np.abs(got - spline @ found.x).max() < 0.1
+    got = np.diff(profile.speed) / 0.1
+    assert profile.excess < 0.01
+    assert np.abs(got - spline @ solution.x).max() < 0.1
 
 
 def test_bounds_are_kept():
     at, speed = braking()
-    drive = smooth_speeds(at, speed, 0.0, bounds(40, high=19.0))
-    a = np.diff(drive.speed) / 0.1
-    assert drive.excess < 0.02
-    assert drive.at_m.max() < 19.02
+    profile = smooth_speeds(at, speed, 0.0, bounds(40, high=19.0))
+    a = np.diff(profile.speed) / 0.1
+    assert profile.excess < 0.02
+    assert profile.at_m.max() < 19.02
     assert a.min() > -6.02
     assert np.abs(np.diff(np.concatenate([[0.0], a]))).max() / 0.1 < 25.3
-    assert np.all(drive.speed >= 0.0)
+    assert np.all(profile.speed >= 0.0)
 
 
 def test_excess_of_infeasible_bounds_is_reported():
@@ -92,6 +94,6 @@ def test_excess_of_infeasible_bounds_is_reported():
 
 def test_stopped_drives_stand():
     at, speed = braking(80)
-    drive = smooth_speeds(at, speed, 0.0, bounds(80))
-    assert drive.speed[-1] == 0.0
-    assert np.ptp(drive.at_m[-3:]) < 0.01
+    profile = smooth_speeds(at, speed, 0.0, bounds(80))
+    assert profile.speed[-1] == 0.0
+    assert np.ptp(profile.at_m[-3:]) < 0.01

@@ -16,9 +16,9 @@ def occupancy(steps=STEPS, length_m=100.0):
     return Occupancy(0.5, np.zeros((steps + 1, places), bool), np.zeros((steps + 1, places)))
 
 
-def run(occupied, speed, liked=12.0, bound=30.0):
+def run(occupied, speed, preferred=12.0, bound=30.0):
     places = occupied.hard.shape[1]
-    return search(occupied, np.full(places, liked), np.full(places, bound), speed)
+    return search(occupied, np.full(places, preferred), np.full(places, bound), speed)
 
 
 def test_free_path_has_no_cost():
@@ -32,13 +32,13 @@ def test_free_path_has_no_cost():
 
 @pytest.mark.parametrize("speed", [3.0, 5.2])
 def test_search_finds_the_best_speeds(speed):
-    """Brute force over every sequence of accelerations, costs written out again."""
+    """Compare with all sequences of accelerations, whose costs are computed independently."""
     occupied = occupancy(steps=4 * COARSE, length_m=40.0)
     occupied.hard[:, 18:22] = True
     occupied.hard[14:, :] = False
     occupied.near[:, 15:18] = 1.0
     occupied.near[14:, :] = 0.0
-    plan = run(occupied, speed, liked=7.0)
+    plan = run(occupied, speed, preferred=7.0)
     unit = speed / int(np.ceil(speed / 0.75 - 0.3)) / 0.5
     choices = np.arange(int(np.ceil(-6.05 / unit)), int(2.3 / unit) + 1) * unit
     top = max(7.0, speed)
@@ -49,7 +49,7 @@ def test_search_finds_the_best_speeds(speed):
     assert not plan.touches
 
 
-def _cost(occupied, v, sequence, liked, top):
+def _cost(occupied, v, sequence, preferred, top):
     s, total = 0.0, 0.0
     for k, a in enumerate(sequence, start=1):
         after = v + a * 0.5
@@ -57,7 +57,7 @@ def _cost(occupied, v, sequence, liked, top):
             return np.inf
         s, v = s + (v + after) * 0.25, max(after, 0.0)
         total += 0.5 * (a**2 + 3.0 * max(-3.0 - a, 0.0) ** 2)
-        total += 0.5 * (speed_search._FAST if v > liked else speed_search._SLOW) * (v - liked) ** 2
+        total += 0.5 * (speed_search._FAST if v > preferred else speed_search._SLOW) * (v - preferred) ** 2
         pace = min(v / 5.0, 2.0)
         for j in range(-2, 3):
             t = min(k * COARSE + j, len(occupied.hard) - 1)

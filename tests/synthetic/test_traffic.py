@@ -49,8 +49,8 @@ def light(green_s, offset_s=0.0):
 
 
 def run(network, table, at, speed, seconds, overrides=()):
-    ways = [(0, 1, 2)] * len(at)
-    return traffic_scenes.run(network, ways, table, at, speed, seconds, Staging(overrides=overrides))
+    routes = [(0, 1, 2)] * len(at)
+    return traffic_scenes.run(network, routes, table, at, speed, seconds, Staging(overrides=overrides))
 
 
 def test_speed_profile_equals_brute_force():
@@ -135,11 +135,11 @@ def test_no_vehicle_enters_while_another_still_crosses(crossing):
     network = crossroads()
     assert np.argwhere(network.conflicts).tolist() == [[1, 4], [4, 1]]
     table = drivers(2, speed_factor=0.9)
-    # The first one creeps across the junction, or has crossed it already.
+    # Row 0 creeps across the junction, or has crossed it already.
     at = [104.0 if crossing else 140.0, 50.0]
     creep = Override(vehicle=0, first_step=0, last_step=75, acceleration_mps2=0.0)
-    ways = ((0, 1, 2), (3, 4, 5))
-    motion = traffic_scenes.run(network, ways, table, at, [2.0, 10.0], 15.0, Staging(overrides=(creep,)))
+    routes = ((0, 1, 2), (3, 4, 5))
+    motion = traffic_scenes.run(network, routes, table, at, [2.0, 10.0], 15.0, Staging(overrides=(creep,)))
     front = motion.distance_m[1] + table.size_m[1, 0] / 2
     rear = motion.distance_m[0] - table.size_m[0, 0] / 2
     entered = int(np.flatnonzero(front > 100.0)[0])
@@ -246,14 +246,14 @@ def test_cars_stop_for_pedestrians_on_a_crossing():
 def test_repeated_runs_are_equal_and_users_keep_their_order():
     network, _ = road(400.0)
     steps = 50
-    stands = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
-    comes = ScriptedUser.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
+    parked = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
+    extra = ScriptedUser.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     pedestrians = (Pedestrian(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
     scene = roles(
-        network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(stands,)
+        network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(parked,)
     )
     traffic = Traffic(scene, np.arange(steps) / 10)
-    staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(comes,))
+    staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(extra,))
     first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
     assert first.kind.tolist() == [1, 1, AgentKind.PEDESTRIAN, AgentKind.VEHICLE, AgentKind.CYCLIST]
     assert first.vehicles == 2 and first.xy.shape == (5, steps, 2) and calm.xy.shape == (4, steps, 2)
@@ -299,11 +299,11 @@ def test_dense_traffic_has_no_overlaps(family, seed):
     # Traffic flows, and speeds match the positions.
     assert np.ptp(motion.distance_m, axis=1).mean() > 25.0
     moved = np.hypot(*np.moveaxis(np.diff(motion.xy, axis=1), -1, 0))
-    there = motion.valid[:, 1:]
-    assert np.abs(moved - (motion.speed[:, 1:] + motion.speed[:, :-1]) * 0.05)[there].max() < 0.15
+    travelled = (motion.speed[:, 1:] + motion.speed[:, :-1]) * 0.05
+    assert np.abs(moved - travelled)[motion.valid[:, 1:]].max() < 0.15
 
 
-def busy_scenario(seed):
+def draw_roles(seed):
     """Roles on drawn roads, and the times of their steps."""
     domain, rng, times = DOMAINS["grid"], np.random.default_rng(seed), (np.arange(131) - 40) * 0.1
     network = domain.draw_family(rng).build(rng, domain.style)
@@ -312,21 +312,21 @@ def busy_scenario(seed):
 
 def staged_run(seed, world):
     """A run on drawn roads; every second one has a plan of ego, and every third one an event."""
-    cast, times = busy_scenario(2 * seed + world % 2)
-    traffic = Traffic(cast, times[: 131 - 7 * world])
+    drawn, times = draw_roles(2 * seed + world % 2)
+    traffic = Traffic(drawn, times[: 131 - 7 * world])
     ego, staging = None, Staging()
     if world % 2:
         motion = traffic.run()
         ego = EgoPlan(53, motion.xy[0, 53:], motion.heading[0, 53:], motion.speed[0, 53:] / 2)
     if world % 3 == 0:
-        steps, pose = len(traffic.times_s), Pose(*cast.paths[1].curve.xy[-80], 0.0)
-        comes = ScriptedUser.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), pose, steps)
-        comes.valid[:20] = False
-        stands = ScriptedUser.standing(
-            AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(*cast.paths[0].curve.xy[300], 0.0), steps
+        steps, poses = (
+            len(traffic.times_s),
+            [Pose(*drawn.paths[k].curve.xy[n], 0.0) for k, n in ((1, -80), (0, 300))],
         )
-        brakes = Override(1, 66, 90, -5.0)
-        staging = Staging((brakes,), (comes, stands), (Tailgate(2, 0.5),), (3,))
+        pedestrian = ScriptedUser.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), poses[0], steps)
+        pedestrian.valid[:20] = False
+        car = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), poses[1], steps)
+        staging = Staging((Override(1, 66, 90, -5.0),), (pedestrian, car), (Tailgate(2, 0.5),), (3,))
     return Run(traffic, staging, ego)
 
 

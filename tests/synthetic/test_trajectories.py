@@ -28,12 +28,12 @@ def bend():
 @pytest.mark.parametrize("pose", [Pose(30.0, 0.0, 0.0), Pose(31.3, 0.8, 0.06), Pose(29.0, -1.1, -0.1)])
 def test_candidate_starts_at_ego_with_tangent_headings(shift, pose):
     roles, _ = scene(road(turn=bend()), 8.0)
-    way = shift_path(roles.paths[0], roles.drivers, pose, 30.0, 110.0, shift)
-    assert np.hypot(*(way.xy[0] - [pose.x, pose.y])) < 0.03
-    assert way.heading[0] == pytest.approx(pose.heading, abs=0.01)
-    chords = np.diff(way.xy, axis=0)
+    candidate = shift_path(roles.paths[0], roles.drivers, pose, 30.0, 110.0, shift)
+    assert np.hypot(*(candidate.xy[0] - [pose.x, pose.y])) < 0.03
+    assert candidate.heading[0] == pytest.approx(pose.heading, abs=0.01)
+    chords = np.diff(candidate.xy, axis=0)
     assert np.allclose(np.hypot(*chords.T), SPACING_M, atol=0.003)
-    middle = (way.heading[1:] + way.heading[:-1]) / 2
+    middle = (candidate.heading[1:] + candidate.heading[:-1]) / 2
     turned = np.arctan2(chords[:, 1], chords[:, 0]) - middle
     assert np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max() < 0.01
 
@@ -41,21 +41,23 @@ def test_candidate_starts_at_ego_with_tangent_headings(shift, pose):
 def test_shifted_candidate_has_its_offset_and_returns():
     roles, _ = scene(road(turn=bend()), 8.0)
     shift = Shift(3.0, 5.0, 25.0, 40.0, 60.0)
-    way = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, shift)
-    gap = distance_to_polyline(way.xy, roles.paths[0].curve.xy)
-    assert np.allclose(gap[(way.base_m > 26) & (way.base_m < 39)], 3.0, atol=0.02)
-    assert gap[(way.base_m < 5) | (way.base_m > 60)].max() < 0.02
-    assert np.all(np.diff(way.base_m) > 0)
+    candidate = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, shift)
+    gap = distance_to_polyline(candidate.xy, roles.paths[0].curve.xy)
+    assert np.allclose(gap[(candidate.base_m > 26) & (candidate.base_m < 39)], 3.0, atol=0.02)
+    assert gap[(candidate.base_m < 5) | (candidate.base_m > 60)].max() < 0.02
+    assert np.all(np.diff(candidate.base_m) > 0)
     # Only the part that is not on the path is checked against the edges: 4 corners each metre.
-    assert len(candidate_corners(way, np.array(CAR))) == pytest.approx(4 * 59, abs=12)
-    assert candidate_boxes(way, np.array(CAR)).shape == (len(way.xy), 6)
+    assert len(candidate_corners(candidate, np.array(CAR))) == pytest.approx(4 * 59, abs=12)
+    assert candidate_boxes(candidate, np.array(CAR)).shape == (len(candidate.xy), 6)
 
 
 def test_bends_bound_the_speed():
     roles, _ = scene(road(turn=bend()), 8.0)
-    way = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, Shift())
-    curvature = np.abs(np.gradient(way.heading, SPACING_M)).max()
-    assert way.limit_mps.min() == pytest.approx(min((4.2 / curvature) ** 0.5, 0.8 / curvature), rel=0.05)
+    candidate = shift_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), 30.0, 110.0, Shift())
+    curvature = np.abs(np.gradient(candidate.heading, SPACING_M)).max()
+    assert candidate.limit_mps.min() == pytest.approx(
+        min((4.2 / curvature) ** 0.5, 0.8 / curvature), rel=0.05
+    )
     driver = roles.drivers.lateral_mps2[0]
-    assert way.preferred_mps.min() == pytest.approx((driver / curvature) ** 0.5, rel=0.05)
-    assert np.all(way.preferred_mps <= way.limit_mps + 1e-9)
+    assert candidate.preferred_mps.min() == pytest.approx((driver / curvature) ** 0.5, rel=0.05)
+    assert np.all(candidate.preferred_mps <= candidate.limit_mps + 1e-9)

@@ -54,9 +54,9 @@ def test_inside_agrees_with_winding_numbers(family, seed):
     around = np.concatenate([lane.curve.xy[::25] for lane in network.lanes])
     points = around + rng.normal(0.0, 4.0, around.shape)
     got = inside(points, rings)
-    brute = [sum(winding_number(p, ring) for ring in rings) == 1 for p in points]
-    assert got.tolist() == brute
-    assert 0.1 < np.mean(brute) < 0.98
+    expected = [sum(winding_number(p, ring) for ring in rings) == 1 for p in points]
+    assert got.tolist() == expected
+    assert 0.1 < np.mean(expected) < 0.98
 
 
 def test_touching_agrees_with_clipped_polygons():
@@ -65,12 +65,12 @@ def test_touching_agrees_with_clipped_polygons():
     heading = rng.uniform(-4, 4, (12, 3))
     size = np.repeat(rng.uniform(1.5, 7.0, (12, 1, 2)), 3, axis=1)
     valid = rng.random((12, 3)) < 0.8
-    skinless = size.copy()
-    skinless[0] -= 0.2  # ego is tested with a skin of that much
+    reduced_size = size.copy()
+    reduced_size[0] -= 0.2  # ego is tested with a margin of 0.1 m on each side
     cos, sin = np.cos(heading)[..., None], np.sin(heading)[..., None]
     tested = ~np.eye(12, dtype=bool)
     tested[3, 7] = tested[7, 3] = False
-    got = first_overlap_step(np.concatenate([xy, cos, sin, skinless], axis=-1), valid, tested)
+    got = first_overlap_step(np.concatenate([xy, cos, sin, reduced_size], axis=-1), valid, tested)
     for i in range(12):
         for j in range(i + 1, 12):
             steps = [
@@ -116,7 +116,7 @@ def test_running_red_requires_red_before_and_after():
     times = np.arange(0.0, network.signals.cycle_s, 0.1)
     colour = network.signals.colours(times, len(network.lanes))[0][:, way]
     roles, motion = scene(network, 1.2, lanes=(first, way, *network.lanes[way].successors))
-    seen = set()
+    outcomes = set()
     for step in range(0, len(times) - 92, 7):
         window = times[step : step + 91]
         at = line - CAR[0] / 2 - 0.5 + np.where(np.arange(91) <= 45, 0.1 * (np.arange(91) - 45), 0.0)
@@ -128,8 +128,8 @@ def test_running_red_requires_red_before_and_after():
         red = colour[step + 45] == Colour.RED and colour[step + 46] == Colour.RED
         violation = find_violation(roles, moved, window, 0, Staging(), 4.0).cause
         assert (violation == "ego_runs_red") == red
-        seen.add(red)
-    assert seen == {True, False}
+        outcomes.add(red)
+    assert outcomes == {True, False}
 
 
 def test_a_stop_sign_requires_standing():
@@ -154,9 +154,9 @@ def test_violations_of_ego():
     roles, motion = scene(road(), 12.0)
     assert cause(roles, motion) == ""
     assert cause(roles, with_speed(motion, np.full(91, 0.5))) == "ego_hardly_moves"
-    gone = motion.valid.copy()
-    gone[0, -1] = False
-    assert cause(roles, replace(motion, valid=gone)) == "ego_leaves_map"
+    valid = motion.valid.copy()
+    valid[0, -1] = False
+    assert cause(roles, replace(motion, valid=valid)) == "ego_leaves_map"
     braking = np.maximum(12.0 - 0.5 * np.arange(91), 0.0)
     assert cause(roles, with_speed(motion, braking)) == "ego_brakes_hard"
     assert cause(roles, with_speed(motion, braking), hardest=5.0) == ""
@@ -170,7 +170,7 @@ def test_collisions_of_ego_and_of_others():
     roles, motion = scene(road(), 12.0, lane_left)
     assert cause(roles, motion) == "others_collide"
     roles, motion = scene(road(), 12.0, [user((60.0, WIDTH)), user((62.0, WIDTH))])
-    assert cause(roles, motion) == ""  # both were put there and never move
+    assert cause(roles, motion) == ""  # two static users are not tested
     pedestrians = [
         user((60.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
         user((61.0, WIDTH), size=PEDESTRIAN, kind=AgentKind.PEDESTRIAN),
@@ -212,38 +212,38 @@ def test_lights_apply_to_their_own_lane():
     ("aside_m", "counts"), [(0.0, False), (1.8, False), (2.5, True), (WIDTH, True), (6.0, False)]
 )
 def test_lights_of_other_lanes_apply_off_the_route(aside_m, counts):
-    # Two lanes side by side, lights only for the left one; ego goes along the right one, or aside of it.
-    one = crossed(100.0, Control.SIGNAL).lanes
-    beside = [
+    # Two lanes side by side with lights only for the left one; ego is ``aside_m`` left of the middle of the right one.
+    lanes = crossed(100.0, Control.SIGNAL).lanes
+    left_lanes = [
         replace(
             lane,
             curve=lane.curve.parallel(WIDTH),
             successors=tuple(k + 3 for k in lane.successors),
             predecessors=tuple(k + 3 for k in lane.predecessors),
         )
-        for lane in one
+        for lane in lanes
     ]
     network = replace(
         road((1, 1, 1)),
-        lanes=(*one, *beside),
+        lanes=(*lanes, *left_lanes),
         signals=SignalPlan((LightGroup((4,), False),), ((0,),), (5.0,), offset_s=-40.0),
     )
     roles, motion = scene(network, 10.0, lanes=(0, 1, 2))
     step = int((100.0 - 32.3) / 1.0)
-    seen = set()
+    outcomes = set()
     for offset_s in np.arange(0.0, 40.0, 4.0):
         plan = replace(network.signals, offset_s=float(-offset_s))
         red = plan.colours(TIMES, 6)[0][:, 4] == Colour.RED
         moved = replace(motion, xy=motion.xy + np.array([0.0, aside_m]))
         roles = replace(roles, network=replace(network, signals=plan))
-        seen.add(bool(red[step] and red[step + 1]))
+        outcomes.add(bool(red[step] and red[step + 1]))
         violation = cause(roles, moved) == "ego_runs_red"
         assert violation == (counts and bool(red[step] and red[step + 1])), (offset_s, cause(roles, moved))
-    assert seen == {True, False}
+    assert outcomes == {True, False}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("domain", "index"), [("grid", 657), ("ring", 154)])
 def test_no_expert_passes_a_stalled_car_over_the_line_of_a_red_light(domain, index):
-    made = assemble(generate_recording(1, index, WorldConfig(domain=domain, rare_rate=1.0)))
-    assert audit([made])[0]["log_runs_red"] is False
+    scenario = assemble(generate_recording(1, index, WorldConfig(domain=domain, rare_rate=1.0)))
+    assert audit([scenario])[0]["log_runs_red"] is False

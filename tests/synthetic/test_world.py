@@ -35,7 +35,7 @@ def drawn(index, config=EXACT):
 
 
 def fields_of(recording):
-    """Flat list of all values of a recording."""
+    """Id, tracks, lights, map features, route and events of a recording, for comparison."""
     tracks = [getattr(recording.tracks, f.name).tobytes() for f in dataclasses.fields(recording.tracks)]
     lights = [
         (light.lane_id, light.stop_point.tobytes(), light.states.tobytes()) for light in recording.lights
@@ -62,7 +62,7 @@ def test_no_users_overlap(index):
         is_pedestrian = tracks.kind == AgentKind.PEDESTRIAN
         for i in present:
             for j in present[present > i]:
-                # Pedestrians pass each other as they like.
+                # Pedestrians may overlap each other.
                 if (
                     not (is_pedestrian[i] and is_pedestrian[j])
                     and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0
@@ -117,7 +117,7 @@ def test_motion_is_that_of_a_bicycle_at_the_box_centre(index):
         assert np.all(turned <= 0.3 * np.maximum(d, 0.0) + 1e-3)
 
 
-def test_expert_is_comfortable_and_yields():
+def test_expert_brakes_and_turns_within_comfort_limits_and_moves():
     hardest, turning, moved = [], [], []
     for index in range(COUNT):
         tracks = drawn(index).recording.tracks
@@ -134,7 +134,7 @@ def test_expert_is_comfortable_and_yields():
 
 
 def test_constant_velocity_fails_often():
-    """Constant velocity leaves the road or collides in three of ten scenarios, lights ignored."""
+    """Constant velocity leaves the road or collides in at least three of ten scenarios, lights ignored."""
     failed = 0
     for index in range(COUNT):
         recording = drawn(index).recording
@@ -159,15 +159,15 @@ def test_constant_velocity_fails_often():
 def test_recordings_are_complete():
     families = set()
     for index in range(COUNT):
-        one = drawn(index)
-        recording, tracks = one.recording, one.recording.tracks
-        families.add(one.family)
+        generated = drawn(index)
+        recording, tracks = generated.recording, generated.recording.tracks
+        families.add(generated.family)
         assert recording.dataset == "drivax" and recording.current_step == CURRENT_STEP
-        assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s{SEED}-{index:06d}-{one.family}"
+        assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s{SEED}-{index:06d}-{generated.family}"
         if not recording.events:
-            place = f"m{index // EXACT.scenarios_per_map:06d}"
-            assert recording.segment.startswith(f"w{WORLD_VERSION}-grid-s{SEED}-{place}.")
-        assert recording.tags["family"] == one.family and recording.tags["domain"] == "grid"
+            number = index // EXACT.scenarios_per_map
+            assert recording.segment.startswith(f"w{WORLD_VERSION}-grid-s{SEED}-m{number:06d}.")
+        assert recording.tags["family"] == generated.family and recording.tags["domain"] == "grid"
         assert np.allclose(np.diff(recording.timestamps_s), 0.1)
         assert tracks.xy.shape == (len(tracks.kind), STEPS, 2) and tracks.valid.any(axis=1).all()
         assert np.all(np.abs(tracks.heading) <= np.pi)
@@ -175,11 +175,10 @@ def test_recordings_are_complete():
         assert len(set(tracks.track_id)) == len(tracks.track_id)
         ids = {f.feature_id: f for f in recording.features}
         for a, b in pairwise(recording.route_lanes):
-            beside = ids[a].left_neighbours + ids[a].right_neighbours
-            assert b in ids[a].successors + beside
-        # The world knows where there are no lights.
+            assert b in ids[a].successors + ids[a].left_neighbours + ids[a].right_neighbours
+        # All lights are known, also where there are none.
         assert Flag.LIGHTS in recording.flags
-        assert recording.lights or one.family != "signalised_junction"
+        assert recording.lights or generated.family != "signalised_junction"
         for light in recording.lights:
             assert np.array_equal(light.stop_point, ids[light.lane_id].points[0])
     assert len(families) >= 6 and families <= {family.name for family, _ in DOMAINS["grid"].families}
@@ -211,7 +210,7 @@ def test_domains_determine_roads():
         for config in (EXACT, ring)
     }
     assert widths["ring"] < widths["grid"] - 0.2
-    with pytest.raises(UsageError, match="no domain 'city'"):
+    with pytest.raises(UsageError, match="unknown domain 'city'"):
         generate_one(0, 0, WorldConfig(domain="city"))
 
 
@@ -230,12 +229,12 @@ def test_world_needs_no_jax():
 
 
 def test_noise_changes_other_agents_only():
-    """Noise moves other agents by decimetres at most, and changes neither ego nor validity nor visibility."""
+    """Noise moves other agents by less than 10 cm, and changes neither ego's positions, validity nor visibility."""
     exact, noisy = drawn(1).recording, generate_recording(SEED, 1)
     assert np.array_equal(exact.tracks.valid, noisy.tracks.valid) and np.array_equal(exact.seen, noisy.seen)
     assert np.array_equal(exact.tracks.xy[0], noisy.tracks.xy[0])
-    apart = np.hypot(*np.moveaxis(exact.tracks.xy - noisy.tracks.xy, -1, 0))[1:][exact.tracks.valid[1:]]
-    assert 0.003 < apart.std() < 0.03 and apart.max() < 0.1
+    shift = np.hypot(*np.moveaxis(exact.tracks.xy - noisy.tracks.xy, -1, 0))[1:][exact.tracks.valid[1:]]
+    assert 0.003 < shift.std() < 0.03 and shift.max() < 0.1
     assert exact.seen is not None and exact.seen[0].all() and not exact.seen[~exact.tracks.valid].any()
 
 
@@ -257,7 +256,7 @@ def test_noise_changes_other_agents_only():
         ),
         ({"noise": NoiseConfig(level=float("nan"))}, "noise.level is nan; use a finite number"),
         ({"noise": NoiseConfig(level=-3.0)}, "noise.level is -3.0; use a finite number that is not negative"),
-        ({"noise": NoiseConfig(level=2.0)}, "noise.level 2.0 could make a recorded vehicle touch ego"),
+        ({"noise": NoiseConfig(level=2.0)}, "(noise.level 2.0) could exceed the margin of 0.1 m around ego"),
     ],
 )
 def test_invalid_settings_are_refused(settings, message):
@@ -270,10 +269,10 @@ def test_invalid_settings_are_refused(settings, message):
 def test_another_kind_replaces_an_event_that_cannot_be_staged(monkeypatch):
     tried = []
 
-    def refused(kind, scene, severity, rng):
+    def refuse(kind, view, severity, rng):
         tried.append(kind)
 
-    monkeypatch.setattr(world, "stage", refused)
+    monkeypatch.setattr(world, "stage", refuse)
     monkeypatch.setattr(world, "possible", lambda kind, network: True)
     monkeypatch.setattr(world, "_PER_KIND", 1)
     monkeypatch.setattr(world, "_ATTEMPTS", 12)
@@ -284,39 +283,31 @@ def test_another_kind_replaces_an_event_that_cannot_be_staged(monkeypatch):
 
 @pytest.mark.slow
 def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
-    """Lights and poses are those of the traffic from the critical step on."""
-    kept = {}
-
-    def run(traffic, *args, **more):
-        kept.setdefault("traffic", traffic)
-        kept.setdefault("motion", result := original(traffic, *args, **more))
-        return result
+    """The red lights and ego's first pose are those of the traffic from the critical step on."""
+    traffic = {}
 
     def select(network, motion, colour, steps):
-        kept["found"] = steps[critical_steps(network, motion, colour, steps)].tolist()
-        return critical_steps(network, motion, colour, steps)
+        is_critical = critical_steps(network, motion, colour, steps)
+        traffic.update(motion=motion, colour=colour, steps=steps[is_critical].tolist())
+        return is_critical
 
-    original = world.Traffic.run
-    monkeypatch.setattr(world.Traffic, "run", run)
     monkeypatch.setattr(world, "critical_steps", select)
     config = dataclasses.replace(EXACT, rare_rate=0.0, critical_share=1.0)
-    begins, lit = set(), 0
+    first_steps, changing_lights = set(), 0
     for index in range(0, 60, 2):
-        kept.clear()
-        made = generate_one(6, index, config)
-        if "critical" not in made.recording.tags or made.rejected:
+        generated = generate_one(6, index, config)
+        if "critical" not in generated.recording.tags or generated.rejected:
             continue
-        lights, traffic = made.recording.lights, kept["traffic"]
-        # Before the recording nobody knows of ego's plan: the first poses tell where it begins.
-        apart = np.hypot(*(kept["motion"].xy[0] - made.recording.tracks.xy[0, 0]).T)
-        first = int(apart.argmin())
-        assert apart[first] < 1e-9 and first in kept["found"]
-        begins.add(first)
-        for light in lights:
-            shown = traffic.colour[first : first + STEPS, light.lane_id - 1]
+        # No plan of ego begins before the recording, so its first pose is that of a critical step of the traffic.
+        distance = np.hypot(*(traffic["motion"].xy[0] - generated.recording.tracks.xy[0, 0]).T)
+        first = int(distance.argmin())
+        assert distance[first] < 1e-9 and first in traffic["steps"]
+        first_steps.add(first)
+        for light in generated.recording.lights:
+            colour = traffic["colour"][first : first + STEPS, light.lane_id - 1]
             red = np.isin(light.states, [int(state) for state in RED])
-            assert np.array_equal(red, shown == Colour.RED)
-            lit += len(set(shown.tolist())) > 1
-        if len(begins) > 2 and lit > 2:
+            assert np.array_equal(red, colour == Colour.RED)
+            changing_lights += len(set(colour.tolist())) > 1
+        if len(first_steps) > 2 and changing_lights > 2:
             return
-    raise AssertionError(f"begins {begins}, {lit} lights that change")
+    raise AssertionError(f"first steps {first_steps}, {changing_lights} lights that change")

@@ -30,15 +30,15 @@ def twins(count, **values):
     return drivers(1, **values).select(np.zeros(count, int))
 
 
-def roles(network, ways, table, at, speed, **more):
-    """Vehicles on the middle of their lanes."""
-    paths = [lane_path(network, way, Sway()) for way in ways]
-    return Roles(network, paths, table, np.array(at, float), np.array(speed, float), ways[0], **more)
+def roles(network, routes, table, at, speed, **more):
+    """Roles of vehicles in the middle of their lanes."""
+    paths = [lane_path(network, route, Sway()) for route in routes]
+    return Roles(network, paths, table, np.array(at, float), np.array(speed, float), routes[0], **more)
 
 
-def run(network, ways, table, at, speed, seconds, staging=None, ego=None, **more):
+def run(network, routes, table, at, speed, seconds, staging=None, ego=None, **more):
     times = np.arange(round(seconds * 10)) / 10
-    return Traffic(roles(network, ways, table, at, speed, **more), times).run(staging, ego)
+    return Traffic(roles(network, routes, table, at, speed, **more), times).run(staging, ego)
 
 
 def road(length_m=600.0, limit=15.0, lanes=1, sections=1, width_m=3.5):
@@ -85,6 +85,6 @@ def crossroads(arms=2, limit=15.0, **rules):
 
 
 def entered(motion, row, line_m, length_m):
-    """First step at which a front bumper is beyond a line (the number of steps where it never is)."""
+    """First step at which a front bumper is beyond a line; the number of steps if it never is."""
     beyond = np.flatnonzero(motion.distance_m[row] + length_m / 2 > line_m)
     return int(beyond[0]) if len(beyond) else motion.distance_m.shape[1]

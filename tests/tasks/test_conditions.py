@@ -91,8 +91,8 @@ def test_observation_is_scaled_by_the_range(bank):
     simulator = Simulator(TASK)
     context = simulator.context(bank, 0)
     for values, scaled in (([0.5, 0.7, 0.8], [-1, -1, -1]), ([2.0, 0.95, 1.65], [1, 0, 0])):
-        seen = simulator.observe(bank, replace(context, conditions=jnp.array(values, jnp.float32)))
-        np.testing.assert_allclose(seen["conditions"], scaled, atol=1e-6)
+        obs = simulator.observe(bank, replace(context, conditions=jnp.array(values, jnp.float32)))
+        np.testing.assert_allclose(obs["conditions"], scaled, atol=1e-6)
     assert Driving(simulator).shapes(bank)["conditions"] == (3,)
     assert "conditions" not in Driving(Simulator(replace(TASK, conditions=()))).shapes(bank)
 

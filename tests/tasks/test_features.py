@@ -1,4 +1,4 @@
-"""Features chosen one by one: values worked out on paper, columns in the order of the table, presets, mistakes."""
+"""Optional features: values by hand, columns in the order of ``COLUMNS``, presets, error messages."""
 
 from dataclasses import replace
 
@@ -58,8 +58,8 @@ def bend(cars, **more):
 
 
 @pytest.fixture(scope="module")
-def seen():
-    """What is seen of one context under every configuration of this file, in one program, at three places."""
+def obs():
+    """Observations at three poses under every configuration of this file, by one program."""
     cars = [car(0, 0, 0, 9), car(20, 0.5, np.pi / 2, 6, 5.0, 2.0), car(-12, 3.7, 0, 3)]
     bank = bank_of(bend(cars))
     configs = {"everything": EVERYTHING, "few": FEW, "cut": CUT, "uncut": UNCUT}
@@ -76,57 +76,57 @@ def seen():
             results[name] = simulator.observe(bank, context)
         return results
 
-    # Where the log has ego; on the arc, 20 m behind its begin, 1 m left of the lane; and facing across the road.
+    # The logged pose; 20 m along the arc, 1 m left of the lane; and facing across the road.
     angle = 20.0 / RADIUS_M
     on_arc = STRAIGHT_M + (RADIUS_M - 1) * np.sin(angle), RADIUS_M - (RADIUS_M - 1) * np.cos(angle)
     places = np.array([(0, 0, 0, 0), (*on_arc, angle, 60.0), (0, 0, np.pi / 2, 0)], np.float32)
     return jax.device_get(jax.jit(jax.vmap(look, (None, 0, 0, 0, 0)))(bank, *places.T))
 
 
-def column(seen, group, name, place=0, of="everything", config=EVERYTHING):
-    shapes = {name: value.shape[1:] for name, value in seen[of].items()}
-    return seen[of][group][place][..., feature_names(config.features, shapes)[group].index(name)]
+def column(obs, group, name, place=0, of="everything", config=EVERYTHING):
+    shapes = {name: value.shape[1:] for name, value in obs[of].items()}
+    return obs[of][group][place][..., feature_names(config.features, shapes)[group].index(name)]
 
 
-def test_optional_features_of_ego_and_agents(seen):
-    np.testing.assert_allclose(column(seen, "ego", "time"), [-0.1, 0.0], atol=1e-6)
-    np.testing.assert_allclose(column(seen, "ego_static", "height"), 1.5 / 5)
+def test_optional_features_of_ego_and_agents(obs):
+    np.testing.assert_allclose(column(obs, "ego", "time"), [-0.1, 0.0], atol=1e-6)
+    np.testing.assert_allclose(column(obs, "ego_static", "height"), 1.5 / 5)
     # Nearest first: the slower car behind (12.6 m), then the one that crosses (20.0 m).
     np.testing.assert_allclose(
-        column(seen, "agents", "relative_velocity ahead")[:2, -1], [-6 / 15, -9 / 15], atol=1e-5
+        column(obs, "agents", "relative_velocity ahead")[:2, -1], [-6 / 15, -9 / 15], atol=1e-5
     )
     np.testing.assert_allclose(
-        column(seen, "agents", "relative_velocity left")[:2, -1], [0, 6 / 15], atol=1e-5
+        column(obs, "agents", "relative_velocity left")[:2, -1], [0, 6 / 15], atol=1e-5
     )
-    np.testing.assert_allclose(column(seen, "agents", "height")[:2], np.full((2, 2), 1.5 / 5))
-    np.testing.assert_allclose(column(seen, "agents", "time")[:2], [[-0.1, 0.0]] * 2, atol=1e-6)
-    assert not seen["everything"]["agents"][0, 2].any()
+    np.testing.assert_allclose(column(obs, "agents", "height")[:2], np.full((2, 2), 1.5 / 5))
+    np.testing.assert_allclose(column(obs, "agents", "time")[:2], [[-0.1, 0.0]] * 2, atol=1e-6)
+    assert not obs["everything"]["agents"][0, 2].any()
     # Seen from an ego that faces across the road at the same speed, everything is turned by 90 degrees.
-    relative = seen["everything"]["agents"][2, 1, -1]
+    relative = obs["everything"]["agents"][2, 1, -1]
     at = feature_names(EVERYTHING.features, {"agents": (13,)})["agents"].index("relative_velocity ahead")
     np.testing.assert_allclose(relative[at : at + 2], [(6 - 9) / 15, 0], atol=1e-5)
 
 
-def test_agents_relate_to_the_route_and_approach(seen):
-    """The car behind loses 6 m/s; the one that crosses reaches ego's lane at once, too late to be hit."""
-    along, left = (column(seen, "agents", f"route {part}")[:2, -1] for part in ("along", "left"))
+def test_agents_relate_to_the_route_and_approach(obs):
+    """The car behind is 6 m/s slower; the one that crosses leaves ego's path before ego arrives."""
+    along, left = (column(obs, "agents", f"route {part}")[:2, -1] for part in ("along", "left"))
     np.testing.assert_allclose(along * 50, [-12, 20], atol=0.05)
     np.testing.assert_allclose(left * 5, [3.7, 0.5], atol=0.05)
-    sine, cosine = (column(seen, "agents", f"route {part}")[:2, -1] for part in ("sin", "cos"))
+    sine, cosine = (column(obs, "agents", f"route {part}")[:2, -1] for part in ("sin", "cos"))
     np.testing.assert_allclose([sine, cosine], [[0, 1], [1, 0]], atol=1e-3)
     behind, across = np.array([-12.0, 3.7]), np.array([20.0, 0.5])
     speeds = [-behind @ [-6, 0] / np.hypot(*behind), -across @ [-9, 6] / np.hypot(*across)]
-    np.testing.assert_allclose(column(seen, "agents", "closing_speed")[:2, -1] * 15, speeds, atol=1e-3)
+    np.testing.assert_allclose(column(obs, "agents", "closing_speed")[:2, -1] * 15, speeds, atol=1e-3)
     # Ego's front is at 2.4 m; the crossing car is 2 m wide and leaves ego's lane after (1 + 2.5 - 0.5) / 6 s.
     assert (20 - 1 - 2.4) / 9 > (1 + 2.5 - 0.5) / 6
-    np.testing.assert_array_equal(column(seen, "agents", "time_to_overlap")[:2, -1], 0.0)
+    np.testing.assert_array_equal(column(obs, "agents", "time_to_overlap")[:2, -1], 0.0)
     # At the second place, the car behind is not alongside the route.
-    assert column(seen, "agents", "route left", place=1)[:2, -1].max() == pytest.approx(20 / 5)
+    assert column(obs, "agents", "route left", place=1)[:2, -1].max() == pytest.approx(20 / 5)
 
 
-def test_ego_on_its_route(seen):
+def test_ego_on_its_route(obs):
     """On the straight; 1 m left of the arc; and across the road."""
-    left, sine = (seen["everything"]["ego_static"][:, -2 + column] for column in (0, 1))
+    left, sine = (obs["everything"]["ego_static"][:, -2 + column] for column in (0, 1))
     np.testing.assert_allclose(left, [0, 1, 0], atol=0.02)
     np.testing.assert_allclose(sine, [0, 0, 1], atol=0.02)
 
@@ -146,11 +146,11 @@ def test_time_to_overlap_of_a_leader():
     assert found["none"]["time_to_overlap"] == pytest.approx(1 - 3.8 / 8, abs=1e-3)
 
 
-def test_curvature_of_road_and_route(seen):
-    mask = seen["everything"]["road_mask"][0]
-    x, y = (column(seen, "road", f"position {axis}")[mask] * 50 for axis in "xy")
-    lane = column(seen, "road", "type lane")[mask] > 0
-    curvature = column(seen, "road", "curvature")[mask]
+def test_curvature_of_road_and_route(obs):
+    mask = obs["everything"]["road_mask"][0]
+    x, y = (column(obs, "road", f"position {axis}")[mask] * 50 for axis in "xy")
+    lane = column(obs, "road", "type lane")[mask] > 0
+    curvature = column(obs, "road", "curvature")[mask]
     arc = lane & (np.abs(np.hypot(x - STRAIGHT_M, y - RADIUS_M) - RADIUS_M) < 0.5) & (x > STRAIGHT_M + 5)
     straight = lane & (x < STRAIGHT_M - 5)
     assert arc.sum() >= 5 and straight.sum() >= 5
@@ -160,22 +160,22 @@ def test_curvature_of_road_and_route(seen):
     along = np.arange(1, 17) * 5.0
     expected = np.where(along > STRAIGHT_M + 2, 1 / RADIUS_M, 0.0)
     clear = np.abs(along - STRAIGHT_M) > 3
-    found = column(seen, "route", "curvature")
+    found = column(obs, "route", "curvature")
     np.testing.assert_allclose(found[clear] * 0.1, expected[clear], atol=1e-3)
-    speed = column(seen, "route", "recommended_speed")
+    speed = column(obs, "route", "recommended_speed")
     np.testing.assert_allclose(speed[clear] * 15, 30 - 25 * expected[clear], atol=0.03)
-    np.testing.assert_allclose(seen["everything"]["recommended_speed"][0, :10, 0], speed[:10], rtol=1e-6)
+    np.testing.assert_allclose(obs["everything"]["recommended_speed"][0, :10, 0], speed[:10], rtol=1e-6)
 
 
-def test_goal_is_in_the_ego_frame(seen):
-    goal = np.stack([column(seen, "route", f"goal {axis}") for axis in "xy"], axis=-1)
+def test_goal_is_in_the_ego_frame(obs):
+    goal = np.stack([column(obs, "route", f"goal {axis}") for axis in "xy"], axis=-1)
     assert (goal == goal[:1]).all() and 0 < goal[0, 0] <= 5
-    turned = np.stack([column(seen, "route", f"goal {axis}", place=2) for axis in "xy"], axis=-1)
+    turned = np.stack([column(obs, "route", f"goal {axis}", place=2) for axis in "xy"], axis=-1)
     np.testing.assert_allclose(turned[0], [goal[0, 1], -goal[0, 0]], atol=1e-5)
 
 
-def test_selected_columns_equal_those_of_all_features(seen):
-    names = feature_names(FEW.features, {name: value.shape[1:] for name, value in seen["few"].items()})
+def test_selected_columns_equal_those_of_all_features(obs):
+    names = feature_names(FEW.features, {name: value.shape[1:] for name, value in obs["few"].items()})
     assert names == {
         "ego": ("position x", "position y", "time"),
         "ego_static": ("width",),
@@ -186,19 +186,19 @@ def test_selected_columns_equal_those_of_all_features(seen):
     for group, columns in names.items():
         for number, name in enumerate(columns):
             np.testing.assert_array_equal(
-                seen["few"][group][0, ..., number], column(seen, group, name), f"{group} {name}"
+                obs["few"][group][0, ..., number], column(obs, group, name), f"{group} {name}"
             )
-    assert seen["few"]["agents_mask"].shape == (3, 3, 2) and "lights_mask" not in seen["few"]
+    assert obs["few"]["agents_mask"].shape == (3, 3, 2) and "lights_mask" not in obs["few"]
 
 
-def test_road_pieces_are_cut_into_equal_rows(seen):
-    lanes = seen["uncut"]["road"][0]
-    assert seen["uncut"]["road_mask"][0].all() and (lanes[:, 5] == 1).all()
-    rows = seen["cut"]["road"][0].reshape(12, 5, -1)
+def test_road_pieces_are_cut_into_equal_rows(obs):
+    lanes = obs["uncut"]["road"][0]
+    assert obs["uncut"]["road_mask"][0].all() and (lanes[:, 5] == 1).all()
+    rows = obs["cut"]["road"][0].reshape(12, 5, -1)
     whole = rows.mean(axis=1)
     apart = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1) * 50
     length = whole[:, 4] * 10
-    there = seen["cut"]["road_mask"][0].reshape(12, 5)
+    there = obs["cut"]["road_mask"][0].reshape(12, 5)
     assert (there == there[:, :1]).all() and there.any()
     np.testing.assert_allclose(apart, np.broadcast_to(length[:, None], apart.shape), atol=1e-4)
     assert length[there[:, 0]].max() <= 2.0 and length[there[:, 0]].max() > 1.5
@@ -209,8 +209,8 @@ def test_road_pieces_are_cut_into_equal_rows(seen):
     np.testing.assert_allclose(rows[one, :, 5:], np.broadcast_to(lanes[other, 5:], (5, 5)))
 
 
-def test_examples(seen):
-    own = seen["everything"]
+def test_examples(obs):
+    own = obs["everything"]
     at = feature_names(EVERYTHING.features, {"agents": (13,)})["agents"].index("relative_velocity ahead")
     np.testing.assert_allclose(
         own["relative_velocity"][0, :2], own["agents"][0, :2, -1, at : at + 2], atol=1e-6
@@ -225,11 +225,11 @@ def test_examples(seen):
     np.testing.assert_allclose(own["stop_line"][:2], [[37.6 / 50, 1, 1], [1, 0, 0]], atol=0.02)
 
 
-def test_car_following_has_the_inputs_of_idm(seen):
+def test_car_following_has_the_inputs_of_idm(obs):
     """The car that stands across the route leads, 16.6 m ahead, at no speed along it; nothing leads on the arc."""
     curve = np.sqrt(2.5 * RADIUS_M)
     expected = [[16.6 / 50, 9 / 15, 0, 1, 13.4 / 15], [90 / 50, 0, 0, 0, curve / 15]]
-    np.testing.assert_allclose(seen["everything"]["car_following"][:2], expected, atol=0.01)
+    np.testing.assert_allclose(obs["everything"]["car_following"][:2], expected, atol=0.01)
 
 
 @pytest.mark.slow
@@ -259,7 +259,7 @@ def test_presets_by_name_in_yaml():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (
             "{preset: minimum}",
@@ -276,8 +276,8 @@ def test_presets_by_name_in_yaml():
         ("{perception: {noise_m: -1}}", r"noise_m is -1\.0; use 0 or a positive"),
     ],
 )
-def test_mistakes_are_reported_in_one_line(text, said):
-    with pytest.raises(UsageError, match=said) as error:
+def test_mistakes_are_reported_in_one_line(text, message):
+    with pytest.raises(UsageError, match=message) as error:
         load(text)
     assert "\n" not in str(error.value)
 

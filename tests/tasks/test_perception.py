@@ -75,8 +75,8 @@ def test_lines_of_sight_by_hand():
     eye, blocks = jnp.zeros(2), jnp.ones(3, bool)
     bus = shown(10, 0, 0, 10.0, 3.0)
     behind = jnp.stack([bus, shown(25, 0, 0, 4.0, 2.0), shown(25, 3.0, 0, 4.0, 2.0)])
-    # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x: beyond the corners of the second car
-    # (y up to 4 at x = 27, where it reaches 8.1), so both are hidden; one as far off as y = 7 shows a corner.
+    # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x, at x = 23 at 6.9, beyond all corners of
+    # the two cars (|y| at most 4). With its centre at y = 7 the last car shows a corner.
     assert in_view(eye, behind, blocks).tolist() == [True, False, False]
     behind = behind.at[2, 1].set(7.0)
     assert in_view(eye, behind, blocks).tolist() == [True, False, True]
@@ -106,7 +106,7 @@ ERRORS = {
 
 
 @pytest.fixture(scope="module")
-def seen(bank):
+def obs(bank):
     """Observations at every step from 15 on with each kind of error, by one program; and the contexts."""
     simulators = {
         name: Simulator(Task(observation=replace(SMALL, perception=one))) for name, one in ERRORS.items()
@@ -119,34 +119,34 @@ def seen(bank):
     return jax.device_get(jax.jit(jax.vmap(look, (None, 0)))(bank, jnp.arange(FIRST, 91)))
 
 
-def lengths(seen, step=0):
+def lengths(obs, step=0):
     """Lengths of the observed boxes at a step, m."""
-    rows, mask = seen["agents"][step, :, -1], seen["agents_mask"][step, :, -1]
+    rows, mask = obs["agents"][step, :, -1], obs["agents_mask"][step, :, -1]
     return sorted(np.round(rows[mask, 2].astype(np.float64) * 5, 1).tolist())
 
 
-def test_agents_behind_a_bus_are_occluded(seen):
-    assert lengths(seen["none"]) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
+def test_agents_behind_a_bus_are_occluded(obs):
+    assert lengths(obs["none"]) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
     # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m, far to the left, is seen past it.
-    assert lengths(seen["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
+    assert lengths(obs["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
     for name in ("occlusion", "all"):
         # An agent that is not seen now has no past, and leaves no gap among the nearest.
-        mask = seen[name]["agents_mask"]
+        mask = obs[name]["agents_mask"]
         assert not (mask.any(axis=2) & ~mask[..., -1]).any()
         assert (np.sort(mask[..., -1], axis=1)[:, ::-1] == mask[..., -1]).all()
     # Of the agents in view, all but that at 61 m are within 50 m, and each is seen at some steps.
-    observed = {length for step in range(76) for length in lengths(seen["all"], step)}
+    observed = {length for step in range(76) for length in lengths(obs["all"], step)}
     assert observed == {0.6, 4.2, 4.4, 12.0}
 
 
-def errors(seen, group="agents"):
+def errors(obs, group="agents"):
     """Position errors, m."""
-    return (seen["noise"][group][..., :2] - seen["none"][group][..., :2]) * 50
+    return (obs["noise"][group][..., :2] - obs["none"][group][..., :2]) * 50
 
 
-def test_noise_has_its_standard_deviation_and_is_independent(seen):
-    truth, noisy = seen["none"], seen["noise"]
-    error = errors(seen)[:, :6, -1]
+def test_noise_has_its_standard_deviation_and_is_independent(obs):
+    truth, noisy = obs["none"], obs["noise"]
+    error = errors(obs)[:, :6, -1]
     count = error.size
     assert truth["agents_mask"][:, :6, -1].all() and not truth["agents_mask"][:, 6:].any() and count > 800
     assert abs(error.mean()) < 4 * 0.1 / np.sqrt(count)
@@ -156,16 +156,16 @@ def test_noise_has_its_standard_deviation_and_is_independent(seen):
         other = np.delete(error, 0, axis=axis).ravel()
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(len(one))
     for group in ("road", "lights"):
-        mask, error = truth[f"{group}_mask"], errors(seen, group)
+        mask, error = truth[f"{group}_mask"], errors(obs, group)
         assert error[mask].all() and not error[~mask].any() and abs(error[mask].std() - 0.1) < 0.02
         np.testing.assert_array_equal(noisy[group][..., 2:], truth[group][..., 2:])
     np.testing.assert_array_equal(noisy["ego"], truth["ego"])
 
 
-def test_past_steps_keep_their_perception(seen):
+def test_past_steps_keep_their_perception(obs):
     """Ego drives straight on at 4 m/s: what it saw a step ago is 0.4 m further behind now."""
     for name in ("noise", "all"):
-        rows, mask = seen[name]["agents"], seen[name]["agents_mask"]
+        rows, mask = obs[name]["agents"], obs[name]["agents_mask"]
         compared = 0
         for step in range(1, len(rows)):
             for row in np.flatnonzero(mask[step, :, -1]):
@@ -180,9 +180,9 @@ def test_past_steps_keep_their_perception(seen):
         assert compared > 60
 
 
-def test_range_and_dropout_by_distance(bank, seen):
+def test_range_and_dropout_by_distance(bank, obs):
     """Lights are seen at a share exp(-distance / 40 m) of the steps, and never beyond the range."""
-    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["context"])
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), obs["context"])
     distance = jnp.array([1.0, 15.0, 40.0, 90.0])
 
     def look(perception):
@@ -199,9 +199,9 @@ def test_range_and_dropout_by_distance(bank, seen):
     assert abs(np.corrcoef(one[:, 2], other[:, 2])[0, 1]) < 4 / np.sqrt(4000)
     assert near.all(axis=0).tolist() == [True, True, True, False] and not near[:, 3].any()
     # Agents follow the same rule, independently at every step.
-    free = np.linalg.norm(seen["occlusion"]["agents"][:, :5, -1, :2] * 50, axis=-1)
+    free = np.linalg.norm(obs["occlusion"]["agents"][:, :5, -1, :2] * 50, axis=-1)
     expected = np.where(free <= 50.0, np.exp(-free / 40.0), 0.0)
-    found = seen["all"]["agents_mask"][..., -1].sum(axis=1)
+    found = obs["all"]["agents_mask"][..., -1].sum(axis=1)
     assert abs(found.sum() - expected.sum()) < 4 * np.sqrt((expected * (1 - expected)).sum())
     assert len(np.unique(found)) > 2
 
@@ -226,12 +226,12 @@ def test_unseen_lights_are_hidden_from_custom_groups():
 
 
 @pytest.mark.slow
-def test_replayed_perception_equals_live_perception(bank, seen):
+def test_replayed_perception_equals_live_perception(bank, obs):
     """A stored context, observed alone in another program, has the observation of the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
-    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["context"])
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), obs["context"])
     for name, value in jax.jit(simulator.observe)(bank, context).items():
-        np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(value, obs["all"][name][25], atol=1e-6, err_msg=name)
 
 
 def test_perception_without_errors_draws_no_random_numbers(bank):

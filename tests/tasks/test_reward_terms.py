@@ -33,7 +33,7 @@ FLAGS = {
     "straddling", "off_route", "lane_changed", "merged",
 }  # fmt: skip
 WHOLE = {"collision_type": np.int8, "ignored": np.int16, "strand": np.int16}
-#: A quiet moment: 10 m/s under a limit of 13.4 m/s, on the route, nobody near.
+#: A quiet moment: 10 m/s under a limit of 13.4 m/s, on the route, no agent near.
 QUIET = {
     "speed_mps": 10.0, "limit_mps": 13.4, "routed": True, "logged": True, "ttc_s": 5.0, "ttc_defined": True,
     "gap_m": 50.0, "progress_m": 20.0, "goal_distance_m": 60.0, "strand": 3, "moved_m": 1.0,

@@ -111,6 +111,6 @@ def test_lag_is_the_distance_behind_the_log(x, y, heading, lag):
         motion = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, motion + shift, jnp.zeros(2))
 
-    after, done = displaced(bank, jnp.asarray([x, y, heading, 0.0]))
+    after, transition = displaced(bank, jnp.asarray([x, y, heading, 0.0]))
     assert float(after.facts.lag_m) == pytest.approx(lag, abs=1e-3)
-    assert float(done.reward_terms["lag"]) == pytest.approx(-max(lag, 0.0), abs=1e-3)
+    assert float(transition.reward_terms["lag"]) == pytest.approx(-max(lag, 0.0), abs=1e-3)

@@ -206,6 +206,7 @@ class WrongConfig:
         "width": "with width 3", "state": "not parameters", "seed": "other initial parameters",
         "batch": "differs in a batch", "constant": "all observations equally", "mask": "changes with masked rows",
         "nobody": "without rows is not finite", "gradient": "non-finite gradients",
+        "blind": "ignores the group 'agents'",
     }.items(),
 )  # fmt: skip
 def test_invalid_encoders_fail(fault, words):

@@ -178,7 +178,10 @@ class _Backend:
         return row
 
     def convert_actions(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
-        """Return checked actions ``[*lead, D]`` of the simulator; choices become the levels of ``Discrete``."""
+        """Return checked actions ``[*lead, D]`` of the simulator; choices become the levels of ``Discrete``.
+
+        Values beyond [-1, 1] pass: the simulator clips them.
+        """
         space = self.task.actions
         if isinstance(space, Discrete):
             choices = np.asarray(actions)
@@ -200,10 +203,10 @@ class _Backend:
 class DrivingEnv(gymnasium.Env[Observation, Any]):
     """Drive ego from the current step of a scenario to the end of its log, one episode at a time.
 
-    Observations are the task's groups: ``Box`` for features, ``MultiBinary`` for masks (1 for a valid row). Actions are
-    the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is ``terminated``, the end of log
-    or map is ``truncated``. ``info`` has ``scenario_id`` and, after the last step, ``metrics``: all defined episode
-    metrics. The simulation runs on the CPU.
+    Observations are the task's groups that are not empty: ``Box`` for features, ``MultiBinary`` for masks (1 for a
+    valid row). Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is
+    ``terminated``, the end of log or map is ``truncated``. ``info`` has ``scenario_id`` and, after the last step,
+    ``metrics``: all defined episode metrics. The simulation runs on the CPU.
 
     Args:
         data: Result of ``drivax.load``, folder of a scenario set, or number of scenarios to generate.
@@ -253,7 +256,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         """Step the simulation by 0.1 s.
 
         Raises:
-            UsageError: The action is not in the action space.
+            UsageError: The action has another shape, is not finite, or is no choice of ``Discrete``.
             gymnasium.error.ResetNeeded: No episode is running.
         """
         if self._state is None:
@@ -318,7 +321,7 @@ class VectorDrivingEnv(VectorEnv):
             options: ``{"scenarios": [i, ...]}`` chooses a row per environment.
 
         Raises:
-            UsageError: Unknown option or row.
+            UsageError: Unknown option or row, or another number of rows than environments.
         """
         super().reset(seed=seed)
         backend, scenarios = self._backend, _option(options, "scenarios")
@@ -336,7 +339,7 @@ class VectorDrivingEnv(VectorEnv):
         """Step every environment by 0.1 s; if its episode has ended, start the next one instead.
 
         Raises:
-            UsageError: The actions are not in the action space.
+            UsageError: The actions have another shape, are not finite, or are no choices of ``Discrete``.
             gymnasium.error.ResetNeeded: ``reset`` was never called.
         """
         if self._state is None:

@@ -54,7 +54,7 @@ class Command:
 _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of tables and help that are not printed to a terminal, and the largest width of tables that are.
 _COLUMNS = 100
-#: Files of Python's functions that no exception may interrupt.
+#: Ends of the paths of Python files whose functions no exception may interrupt.
 _BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
 #: Delay until a signal that came at a bad moment is sent again, and time after which it is obeyed at any moment, s.
 _RESEND_S, _PATIENCE_S = 0.01, 10.0
@@ -142,9 +142,10 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _stop_at_signals() -> Iterator[None]:
-    """Raise Stopped at SIGTERM or SIGHUP, so that partial output is removed, and ignore them from then on.
+    """Raise Stopped at SIGTERM or SIGHUP, and KeyboardInterrupt at Ctrl-C, so that partial output is removed.
 
-    A signal that the process ignores already (nohup) stays ignored. Python handles signals in its main thread only.
+    After the first, SIGTERM and SIGHUP are ignored. A signal that the process ignores already (nohup) stays ignored.
+    Python handles signals in its main thread only.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
@@ -219,7 +220,7 @@ class _SignalHandler:
 
 
 def _is_bad_moment(frame: FrameType | None) -> bool:
-    """Return whether the command imports a module or starts a process, directly or not."""
+    """Return whether the command imports a module or starts a worker process, directly or not."""
     while frame is not None and frame.f_code is not main.__code__:
         if frame.f_code.co_filename.endswith(_BAD_MOMENTS):
             return True

@@ -25,11 +25,11 @@ _OBSERVED_SCENARIOS = 256
 class Inspect:
     """Summarise a scenario set: sources, sizes, tags, flags, audit, integrity.
 
-    Compares several sets in one table.
+    Compares several sets side by side.
 
     Example: drivax inspect sets/womd sets/nuplan --filter agents>=20 --html sets.html
 
-    Example: drivax inspect sets/womd --observations --planner runs/ppo --draw seen.png
+    Example: drivax inspect sets/womd --observations --planner runs/ppo --draw observation.png
     """
 
     sets: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
@@ -59,7 +59,7 @@ class Inspect:
 
 
 def run(args: Inspect) -> int:
-    """Verify the sets, then print tables or JSON, or write a page."""
+    """Verify the sets, then print tables or JSON, write a page, or describe observations."""
     from drivax.errors import UsageError
     from drivax.report.inspection import Inspection
     from drivax.scenario.select.selection import Selection
@@ -111,6 +111,7 @@ def _print(inspections: list[Inspection]) -> None:
 def _check_flags(args: Inspect) -> None:
     """Refuse flags that exclude each other, and an existing picture."""
     from drivax.errors import UsageError
+    from drivax.files import check_output
     from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
@@ -122,10 +123,8 @@ def _check_flags(args: Inspect) -> None:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
         raise UsageError("a trained policy has its own task", cure="leave out --task")
-    if args.draw is not None and args.draw.exists() and not args.overwrite:
-        raise UsageError(
-            "output file already exists", file=args.draw, cure="choose another name or pass --overwrite"
-        )
+    if args.draw is not None:
+        check_output(args.draw, args.overwrite)
 
 
 def _observe(args: Inspect, inspection: Inspection) -> None:

@@ -23,7 +23,7 @@ class Report:
 
     Example: drivax report runs/policy --video worst:20 --out videos
 
-    Example: drivax report runs/idm runs/policy --side-by-side w2-grid-s0-000012 --out videos
+    Example: drivax report runs/idm runs/policy --side-by-side w2-grid-s0-000011-t_junction --out videos
 
     Example: drivax report runs/idm runs/policy --tables --out tables
     """
@@ -37,9 +37,9 @@ class Report:
     episodes: int = 12
     """Number of playable episodes; a page with 0 has no rollouts and no tags."""
     video: str | None = None
-    """Write mp4 files of the last run's episodes: worst:N, all, or the id of a scenario."""
+    """Write mp4 files of the last evaluation's episodes: worst:N, all, or the id of a scenario."""
     side_by_side: str | None = None
-    """Write mp4 files with all runs in one picture: worst:N, all, or the id of a scenario."""
+    """Write mp4 files with all comparable evaluations in one picture: worst:N, all, or the id of a scenario."""
     theme: Literal["light", "dark"] = "light"
     """Colours of videos; the page follows the browser's setting."""
     tables: bool = False

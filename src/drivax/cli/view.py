@@ -27,7 +27,7 @@ class View:
     out: Path | None = None
     """HTML file to write; SET.html next to the set by default."""
     limit: int = 50
-    """Only the first N scenarios."""
+    """At most N scenarios."""
     ids: tuple[str, ...] = ()
     """Only these scenarios, in this order."""
     scores: Path | None = None
@@ -40,20 +40,16 @@ def run(args: View) -> int:
     """Write the page; print its path and the number of scenarios."""
     from drivax.curation.scores import read_scores
     from drivax.curation.subset import top_rows
-    from drivax.report.pages.viewer import criticality_html, select, write_player
+    from drivax.report.pages.viewer import criticality_html, select_rows, write_player
     from drivax.scenario.store import ScenarioSet
 
     data = ScenarioSet.open(args.set)
     folder = args.set.resolve()
-    details: list[str] = []
-    if args.scores is None:
-        scenarios = select(data, args.limit, args.ids)
-    else:
-        table = read_scores(args.scores, data)
-        ids = args.ids or [table.scenario_ids[row] for row in top_rows(table, len(data))]
-        scenarios = select(data, args.limit, ids)
-        row_of = {scenario_id: row for row, scenario_id in enumerate(table.scenario_ids)}
-        details = [criticality_html(table, row_of[scenario.id]) for scenario in scenarios]
+    table = None if args.scores is None else read_scores(args.scores, data)
+    order = None if table is None else top_rows(table, len(data))
+    rows = select_rows(data, args.limit, args.ids, order)
+    scenarios = [data[row] for row in rows]
+    details = [] if table is None else [criticality_html(table, row) for row in rows]
     out = args.out or folder.with_name(f"{folder.name}.html")
     path = write_player(scenarios, out, args.overwrite, title=folder.name, details=details)
     show(f"{path} ({len(scenarios)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")

@@ -64,7 +64,7 @@ class Conversion:
             training with `egos: moving` drives.
         stride: Steps between the starts of two windows of a longer recording.
         split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
-        workers: Processes that read; 1 reads in the main process.
+        workers: Processes that read, each a file at a time; 1 reads in the main process.
         strict: Stop at the first unreadable record instead of skipping it.
         overwrite: Replace an existing scenario set, or start again after another, interrupted conversion.
         shard_size: Scenarios per shard of the set, the unit of resume.
@@ -123,17 +123,26 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
     except DataError as error:
         yield BadRecord.of(error, path)
         return
-    count = 0
+    keys: set[tuple[str, str]] = set()  # of a file's duplicates the set keeps one
     for item in _read(with_steps(reader, options.sizes.steps), path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
-            count += isinstance(result, Scenario)
-            if count == options.limit and not options.filters:
+            if isinstance(result, Scenario):
+                keys.add(_key(result))
+            if len(keys) == options.limit and not options.filters:
                 return
 
 
+def _key(scenario: Scenario) -> tuple[str, str]:
+    """Return data set and id of a scenario, which no two scenarios of a set share."""
+    return scenario.text("dataset"), scenario.id
+
+
 def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
-    """Yield the recordings of a file; a file or disk that cannot be read is a bad record, unlike a full process."""
+    """Yield the recordings of a file, and a bad record for a file or disk that cannot be read.
+
+    Limits of this process (open files, memory) are raised.
+    """
     try:
         yield from reader.read(path)
     except OSError as error:
@@ -145,13 +154,14 @@ def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
     """Yield the scenario of each window of a recording, or a bad record in its place."""
     capacity = options.sizes
-    cut = partial(windows, recording, options.stride, capacity.steps)
-    pieces = _attempt(lambda: list(cut()), path, recording.scenario_id)
-    if isinstance(pieces, BadRecord):
-        yield pieces
+    cut = _attempt(
+        lambda: list(windows(recording, options.stride, capacity.steps)), path, recording.scenario_id
+    )
+    if isinstance(cut, BadRecord):
+        yield cut
         return
-    for piece in pieces:
-        yield _attempt(partial(assemble, piece, capacity, options.routes), path, piece.scenario_id)
+    for window in cut:
+        yield _attempt(partial(assemble, window, capacity, options.routes), path, window.scenario_id)
 
 
 def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
@@ -219,7 +229,7 @@ def convert(
         src: A file, or a folder that is searched to any depth.
         out: The scenario set to write.
         options: How to convert.
-        progress: Called after every scenario and every file.
+        progress: Called after every scenario, bad record and file.
         audit: Called in this process with batches of scenarios; its results are stored with them.
         announce: Called once before the work begins.
 
@@ -268,7 +278,7 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return all that the bytes of the set depend on; only a conversion with the same identity resumes another."""
+    """Return what must not have changed for a conversion to resume another; of a file only its ends are compared."""
     digest = hashlib.sha256()
     for entry in data.inputs:
         size, ends = _ends(entry.path)
@@ -283,7 +293,7 @@ def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, A
 
 
 def _ends(path: Path) -> tuple[int, str]:
-    """Return the size of a file and the SHA-256 (hex) of its head and tail; a file that cannot be read has none."""
+    """Return the size of a file and the SHA-256 (hex) of its head and tail; -1 and "" if it cannot be read."""
     try:
         with path.open("rb") as file:
             head, size = file.read(_ENDS), file.seek(0, os.SEEK_END)
@@ -325,7 +335,7 @@ class _Sink:
 
     @property
     def scenarios(self) -> int:
-        """Number of scenarios taken so far, including those that wait."""
+        """Number of scenarios written or waiting; some that wait may be duplicates or fail the filters."""
         return len(self._writer) + self._scenarios_waiting
 
     @property
@@ -343,7 +353,7 @@ class _Sink:
             self._write_batch()
 
     def flush(self) -> None:
-        """Audit and write all that wait."""
+        """Audit and write all that wait, up to the limit."""
         while self._waiting and not self.full:
             self._write_batch()
 
@@ -364,7 +374,7 @@ class _Sink:
         return min(_BATCH, self._writer.room, remaining)
 
     def _write_batch(self) -> None:
-        """Audit all that wait, and write it up to the end of the shard or limit; the others wait on."""
+        """Audit all that wait; write them up to the end of the shard or the limit, the rest is audited again."""
         batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
         items = self._drop_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
@@ -388,7 +398,7 @@ class _Sink:
         keys: set[tuple[str, str]] = set()
         for item, (file, _) in batch:
             if isinstance(item, Scenario):
-                key = item.text("dataset"), item.id
+                key = _key(item)
                 if key in self._writer or key in keys:
                     problem, cure = "the scenario is in the set already", "give each file once"
                     item = BadRecord(self._data.inputs[file].path, item.id, problem, cure)
@@ -420,8 +430,10 @@ def _drain(
 ) -> int:
     """Move results into the sink until its limit; return the number of files read."""
     report = progress or (lambda done, total, scenarios: None)
-    # Of the first file, an interrupted conversion has taken ``skip`` items.
+    # An interrupted conversion has taken ``skip`` items of the first file, and perhaps reached the limit.
     first, skip = sink.place
+    if sink.full:
+        return first + 1
     total = len(data.inputs)
     with closing(_results(data, options, first, writer.folder)) as results:
         for number, items in enumerate(results, start=first):

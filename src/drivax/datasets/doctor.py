@@ -18,13 +18,13 @@ from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 
-#: Files of a format that are inspected; they stand for the others.
+#: Most files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
-#: Files of a format whose scenarios are counted; where there are more, the sample is scaled by file size.
+#: Most files of a format whose scenarios are counted; where there are more, the count is scaled by file size.
 _COUNT_FILES = 48
-#: Damaged or unknown files that are named.
+#: Most files of unknown format that are named.
 _MOST_NAMES = 10
-#: Notes and flavours that are listed for files of one kind, and runs of missing shards for a family.
+#: Most notes and flavours that are listed for files of one kind, and runs of missing shards for a family.
 _NOTES, _FLAVOURS, _RUNS = 6, 3, 8
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
@@ -50,12 +50,13 @@ class Diagnosis:
     Attributes:
         path: The file or folder.
         parts: What can be read in it.
-        files: Number of files by format; ``input_bytes`` is their size.
+        files: Number of files by recognised format.
+        input_bytes: Size of these files and of those that only have the name of a format's files.
         companions: Number of files that are read along with them; ``ignored`` ones belong to no format.
         scenarios: Estimated number of scenarios after conversion; ``set_bytes`` is their size.
         free_bytes: Free space on the disk of ``path``.
         shards: One sentence per family of numbered shards.
-        problems: What is wrong, and what to do about it; most important first.
+        problems: What is wrong, and what to do about it: the folder, files of unknown format, damaged files.
         convertible: Whether ``drivax convert`` can convert some of it.
     """
 
@@ -107,7 +108,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
-    """Describe a sample of the files of each format, and list damaged files of it and files of no format."""
+    """Describe a sample of the files of each format; list files of no format, and damaged ones of the sample."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
     unknown = data.paths(None)[:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
@@ -149,21 +150,25 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Describe missing shards of numbered families (``NAME-00003-of-00150``) in a sentence each, with up to 8 runs."""
+    """Return a sentence per folder and family of numbered shards (``NAME-00003-of-00150``): how many are there.
+
+    Missing numbers are named if they form at most 8 runs.
+    """
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
             families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
-    sentences = []
-    for (_, prefix, total), numbers in sorted(families.items()):
+    sentences, folders = [], Counter(prefix for _, prefix, _ in families)
+    for (folder, prefix, total), numbers in sorted(families.items()):
+        name = prefix if folders[prefix] == 1 else f"{folder.name}/{prefix}"
         missing = sorted(set(range(total)) - numbers)
         if not missing:
-            sentences.append(f"{prefix}: all {total:,} shards")
+            sentences.append(f"{name}: all {total:,} shards")
             continue
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         names = (f"{run[0]:05d}" if len(run) == 1 else f"{run[0]:05d} to {run[-1]:05d}" for run in runs)
         names_text = f", missing {', '.join(names)}" if len(runs) <= _RUNS else ""
-        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{names_text}")
+        sentences.append(f"{name}: {total - len(missing):,} of {total:,} shards{names_text}")
     return sentences
 
 
@@ -186,7 +191,7 @@ class Estimate:
 
 
 def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
-    """Estimate a conversion by counting scenarios, in a sample of the files where there are many.
+    """Estimate a conversion without filters by counting scenarios, in a sample of the files where there are many.
 
     Args:
         data: What is converted.

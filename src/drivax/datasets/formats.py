@@ -18,8 +18,8 @@ from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError, did_you_mean
 
-#: Every reader; a new format is one module and one entry here. They are asked in this order: those that look at a
-#: name or a few bytes come first.
+#: Every reader; a new format is one module and one entry here. A file goes to the readers whose patterns it matches,
+#: then to the others, both in this order: those that look at a name or a few bytes come first.
 READERS: tuple[Reader, ...] = (
     ArgoverseMotion(),
     ArgoverseSensor(),
@@ -32,7 +32,7 @@ READERS: tuple[Reader, ...] = (
     ScenarioMax(),
 )
 AUTO = "auto"
-#: Endings of sensor data and texts, which data sets hold by the hundred thousand: such files are never opened.
+#: Endings of sensor data and texts, which data sets hold by the hundred thousand: in folders they are never opened.
 _NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
 
@@ -47,14 +47,14 @@ def find_reader(name: str) -> Reader:
 
 
 def recognise(path: Path) -> Reader | None:
-    """Return the reader whose format a file's content is, if there is one."""
+    """Return the reader that recognises a file, None if none does."""
     # Readers whose patterns match come first: most files of a large folder are opened once.
     readers = sorted(READERS, key=lambda reader: not _matches(path, reader.patterns))
     return next((reader for reader in readers if reader.recognise(path)), None)
 
 
 def detect(path: str | Path) -> Reader:
-    """Return the reader whose format a file's content is.
+    """Return the reader that recognises a file.
 
     Raises:
         DataError: The file is missing, damaged at its beginning, or of no format that drivax reads.
@@ -66,7 +66,7 @@ def detect(path: str | Path) -> Reader:
 
 @dataclass(frozen=True)
 class Input:
-    """One file to read; its format is None if only its name is that of a format's files."""
+    """One file to read; its format is None if no reader recognises it, but the user or its name says to read it."""
 
     path: Path
     format: str | None
@@ -103,17 +103,17 @@ class Survey:
 
 
 def survey(src: str | Path, name: str = AUTO) -> Survey:
-    """Find the files that can be read, and their formats.
+    """Find the files to read, and their formats.
 
-    A file given by name is always read. In a folder (searched to any depth, without hidden names) files count whose
-    content is of a format, and those with the name of a format's files, so that damaged ones are reported.
+    A file given by name is always read. In a folder (searched to any depth, without hidden names) these are the files
+    that a reader recognises, and those with the name of a format's files, so that damaged ones are reported.
 
     Args:
         src: A file or a folder.
         name: A format, or ``auto`` for all of them.
 
     Raises:
-        DataError: ``src`` does not exist, or the folder holds no file of a known format.
+        DataError: ``src`` does not exist, or the folder holds no such file.
         UsageError: There is no such format.
     """
     src = Path(src)

@@ -1,7 +1,7 @@
-"""Reader and writer of GPUDrive's JSON files: scenes of the Waymo Open Motion Dataset, one file each.
+"""Reader and writer of GPUDrive's JSON files: scenarios of the Waymo Open Motion Dataset, one file each.
 
-They hold tracks and map elements, but no lane graph, no speed limits and no lanes of stop signs; the published files
-also lack every scene with a traffic light.
+They hold tracks and map elements, but no lane graph, no speed limits and no lanes of stop signs; none of the published
+files has a traffic light.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MOST_STEPS = 1000
 _INVALID = -10_000.0
 #: Largest plausible number (metres, m/s, radians).
 _LARGEST = 1e7
-#: Plausible box sizes; others are replaced by those of the class.
+#: Plausible lengths, widths and heights; others are replaced by that of the class.
 _SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
 #: Public tools store ids in 31 bits.
 _ID_END = 2**31
@@ -68,7 +68,8 @@ _ROAD_TYPES = {
     **{kind: name for name, kind in _ROADS.items()},
 }
 _KINDS = {int(kind): kind for kind in RoadKind}
-#: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
+#: Points of the published files are 0.5 m apart: twice that is a jump where the map was clipped, unless the median
+#: spacing is above the second number, because points were thinned.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
 #: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
 _OPTIONAL = ("z", "height")
@@ -85,7 +86,7 @@ class GpuDrive:
     companions: tuple[str, ...] = ("export.json",)
 
     def recognise(self, path: Path) -> bool:
-        """Whether the file begins like a GPUDrive scene."""
+        """Whether the file begins like a GPUDrive scenario."""
         head = read_head(path, _HEAD_BYTES)
         keys = ((b'"objects"', b'"position"'), (b'"roads"', b'"geometry"'))
         return head.lstrip().startswith(b"{") and any(a in head and b in head for a, b in keys)
@@ -98,13 +99,13 @@ class GpuDrive:
             "no lane graph (lanes are chained by geometry) and no speed limits",
         ]
         if not recording.lights:
-            notes.append("no traffic lights; the published files leave out every scene that has one")
+            notes.append("no traffic lights; the published files leave out every scenario that has one")
         if recording.split_gap_m is None:
             notes.append("its points were thinned, so it is none of the published files")
         return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
 
     def count(self, path: Path) -> int:
-        """Return 1 for a scene, else 0."""
+        """Return 1 for a GPUDrive scenario, else 0."""
         return int(self.recognise(path))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
@@ -112,31 +113,31 @@ class GpuDrive:
         yield attempt(lambda: decode(parsing.load_json(path)), file=path)
 
 
-def decode(scene: Any) -> Recording:
-    """Return the recording in a parsed GPUDrive scene.
+def decode(content: Any) -> Recording:
+    """Return the recording in a parsed GPUDrive file.
 
     Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
     apart, because the file has no timestamps. ``goalPosition`` (an agent's last valid position) and ``mark_as_expert``
     (agents that GPUDrive replays) are dropped.
     """
-    if not isinstance(scene, Mapping):
-        raise DataError("is not a GPUDrive scene", cure=_SKIP)
-    metadata, scenario_id = scene.get("metadata"), scene.get("scenario_id")
+    if not isinstance(content, Mapping):
+        raise DataError("is not a GPUDrive scenario", cure=_SKIP)
+    metadata, scenario_id = content.get("metadata"), content.get("scenario_id")
     if not isinstance(metadata, Mapping) or "sdc_track_index" not in metadata:
         raise DataError(
             "has no metadata with sdc_track_index, so the ego is unknown",
-            cure="use files of GPUDrive's present converter; its small hand-made test scenes are not recordings",
+            cure="use files of GPUDrive's present converter; its small hand-made test files are not recordings",
         )
     if not isinstance(scenario_id, str) or not scenario_id.isprintable():
         raise DataError("has no scenario_id", cure=_SKIP)
-    objects, roads = _rows(scene, "objects"), _rows(scene, "roads")
+    objects, roads = _rows(content, "objects"), _rows(content, "roads")
     tracks, unusable_sizes = _tracks(objects)
     count, steps = tracks.valid.shape
     ego = _row_numbers([metadata["sdc_track_index"]], count, "sdc_track_index")[0]
     if tracks.kind[ego] != AgentKind.VEHICLE:
         raise DataError(f"sdc_track_index names object {ego}, which is not a vehicle", cure=_SKIP)
     features, unknown = _features(roads)
-    lights, lost_lights = _lights(scene.get("tl_states"), steps, features)
+    lights, lost_lights = _lights(content.get("tl_states"), steps, features)
     spacing = parsing.spacing_m(features)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
     ids = [_integer(track, "objects_of_interest") for track in _read_list(metadata, "objects_of_interest")]
@@ -170,8 +171,8 @@ def decode(scene: Any) -> Recording:
     )
 
 
-def _rows(scene: Mapping[str, Any], name: str) -> Sequence[Mapping[str, Any]]:
-    rows = scene.get(name)
+def _rows(content: Mapping[str, Any], name: str) -> Sequence[Mapping[str, Any]]:
+    rows = content.get(name)
     if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
         raise DataError(f"has no list of {name}", cure=_SKIP)
     return rows
@@ -210,7 +211,7 @@ def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
 
 
 def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
-    """Return lists of one length in a dictionary."""
+    """Return the lists of these names in a dictionary; refuse missing ones, and lists of different lengths."""
     lists = [row.get(name) for name in names] if isinstance(row, Mapping) else []
     columns = [values for values in lists if isinstance(values, list)]
     if len(columns) < len(names) or len({len(values) for values in columns}) != 1:
@@ -219,7 +220,7 @@ def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
 
 
 def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
-    """Return the ids of objects or roads, their indices if none has an id."""
+    """Return the ids of objects or roads, or their indices if none has an id."""
     numbers = [row.get("id") for row in rows]
     if all(number is None for number in numbers):
         return list(range(len(numbers)))
@@ -230,9 +231,9 @@ def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
 
 
 def _tracks(objects: Sequence[Mapping[str, Any]]) -> tuple[Tracks, int]:
-    """Return the tracks, and the number of those with an implausible size.
+    """Return the tracks, and the number of those with an implausible length, width or height.
 
-    Implausible sizes are 0, which stands for that of the class.
+    Each of these becomes 0, which stands for that of the class. Missing heights are not counted.
     """
     table, valid = _states(objects)
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
@@ -279,12 +280,12 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
             _table(velocity, "xy", f"the velocity of object {row}"),
         )
         tables.append(np.concatenate(columns, axis=1))
-        marks.append([mark is True or mark == 1 for mark in valid])
+        marks.append([mark == 1 for mark in valid])
     return np.stack(tables), np.array(marks, bool)
 
 
 def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...], int]:
-    """Return map features in order of the file, and the number of roads of unknown kind."""
+    """Return map features in order of the file, and the number of roads of unknown kind or without points."""
     ids = _ids(roads, "roads")
     features, unknown = [], 0
     for number, road in zip(ids, roads, strict=True):
@@ -313,7 +314,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
             raise DataError(f"tl_states names lane {lane[:40]!r}, which is not an id", cure=_SKIP)
         what = f"tl_states of lane {lane[:40]}"
         indices, lane_states, *axes = _columns(observations, ("time_index", "state", "x", "y", "z"), what)
-        indices = parsing.rows_within([_integer(step, what) for step in indices], steps, what)
+        indices = parsing.rows_within([_integer(step, what) for step in indices], steps, what, "step")
         rows = [dict(zip("xyz", point, strict=True)) for point in zip(*axes, strict=True)]
         points = _table(rows, "xyz", what)
         if not (np.abs(points) <= _LARGEST).all():
@@ -332,13 +333,13 @@ def _light_state(state: Any) -> int:
     return state if is_number else int(LightState.UNKNOWN)
 
 
-def file_name(row: int) -> str:
-    """Return the file name of a scenario, with the prefix that GPUDrive's loader expects."""
-    return f"tfrecord-00000-of-00001_{row}.json"
+def file_name(number: int) -> str:
+    """Return the file name of an exported scenario by its number, with the prefix that GPUDrive's loader expects."""
+    return f"tfrecord-00000-of-00001_{number}.json"
 
 
-def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
-    """Return the scene of a scenario as plain JSON values.
+def gpudrive_content(scenario: Scenario, name: str) -> dict[str, Any]:
+    """Return the content of a scenario's GPUDrive file as plain JSON values.
 
     Positions are in the source's frame, to a tenth of a millimetre; invalid steps are -10000. Ego is the last object,
     as in the published files; ``mark_as_expert`` is false for all.
@@ -348,6 +349,9 @@ def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
     rows = [*(row for row in range(count) if row != recording.ego), recording.ego]
     index = {row: number for number, row in enumerate(rows)}
     ids = recording.tracks.track_id
+    lights: dict[str, dict[str, list[Any]]] = {}
+    for light in recording.lights:  # of several of one lane the first, which is nearest to the log, counts
+        lights.setdefault(str(light.lane_id), _light(light))
     return {
         "name": name,
         "scenario_id": recording.scenario_id,
@@ -361,7 +365,7 @@ def gpudrive_scene(scenario: Scenario, name: str) -> dict[str, Any]:
             }
             for feature in recording.features
         ],
-        "tl_states": {str(light.lane_id): _light(light) for light in recording.lights},
+        "tl_states": lights,
         "metadata": {
             "sdc_track_index": index[recording.ego],
             "objects_of_interest": [int(ids[row]) for row in recording.of_interest],
@@ -377,7 +381,7 @@ def _points(points: _Array) -> list[dict[str, float]]:
 
 
 def _object(recording: Recording, row: int) -> dict[str, Any]:
-    """Return a track as an object of the scene, with the size of its last valid step."""
+    """Return a track as an object of the file, with the size of its last valid step."""
     tracks = recording.tracks
     valid = tracks.valid[row]
     last = np.flatnonzero(valid)[-1]

@@ -21,8 +21,8 @@ from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, 
 
 Array = np.ndarray[Any, Any]
 
-#: Cities (the tag ``place``) and the names of them or their parts in data sets: of the maps of nuScenes and nuPlan,
-#: of Argoverse 2 and the codes of its sensor maps.
+#: Cities (the tag ``place``), and other names of them in data sets: of nuScenes' and nuPlan's maps, which may cover a
+#: part of a city, and codes of three letters in Argoverse 2's sensor maps.
 PLACES: Mapping[str, tuple[str, ...]] = {
     "austin": ("atx",),
     "boston": ("boston-seaport", "us-ma-boston"),
@@ -35,6 +35,7 @@ PLACES: Mapping[str, tuple[str, ...]] = {
     "washington-dc": ("wdc",),
 }
 _CITY_OF = {name: city for city, names in PLACES.items() for name in (city, *names)}
+#: Characters of a source's name for a place that are kept.
 _LONGEST = 64
 #: Metres per second in a mile per hour.
 MPS_PER_MPH = 0.44704
@@ -65,7 +66,7 @@ def segment_of(scenario_id: str) -> str:
 
 
 class Lights:
-    """Collects light states by lane over some steps; slots and list positions move between steps, lanes do not."""
+    """Collects light states by lane over some steps; a source's slots may hold different lanes at different steps."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
@@ -98,11 +99,11 @@ class Lights:
         return lights, len(entries) - len(lights)
 
 
-def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Return row numbers as ints; refuse those that are not from 0 to less than ``count``."""
+def rows_within(rows: Sequence[int], count: int, what: str, rows_of: str = "track") -> tuple[int, ...]:
+    """Return numbers of rows (``rows_of`` says of what) as ints; refuse those that are not from 0 to ``count - 1``."""
     for row in rows:
         if not 0 <= row < count:
-            raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
+            raise DataError(f"{what} names {rows_of} {row}, there are {count}", cure="skip this record")
     return tuple(int(row) for row in rows)
 
 
@@ -130,12 +131,12 @@ def shift(recording: Recording, offset: Float[np.ndarray, "3"]) -> Recording:
 def box_centre(
     rear_axle: Float[np.ndarray, "step 2"], heading: Float[np.ndarray, " step"], ahead_m: float
 ) -> Float[np.ndarray, "step 2"]:
-    """Return positions of the box centre from those of the rear axle, which it is ``ahead_m`` ahead of."""
+    """Return positions of the box centre, which lies ``ahead_m`` ahead of the rear axle."""
     return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
 
 
 def spacing_m(features: Sequence[MapFeature]) -> float | None:
-    """Return the median distance of neighbouring points of lines without polygons, metres; None without any."""
+    """Return the median distance of neighbouring points of map lines (not of polygons), metres; None without any."""
     gaps = [
         np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
         for feature in features
@@ -150,7 +151,7 @@ def load_json(path: Path) -> Any:
 
 
 def windows_of(steps: int) -> int:
-    """Return the number of windows that a recording of ``steps`` steps becomes."""
+    """Return the number of windows of the usual length and stride that a recording of ``steps`` steps becomes."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
@@ -213,7 +214,7 @@ def _samples(features: Sequence[MapFeature]) -> Float[Array, "sample 3"]:
 def subdivide(
     start: Float[Array, "segment 3"], step: Float[Array, "segment 3"], counts: Int[Array, " segment"]
 ) -> Float[Array, "piece 3"]:
-    """Return the first points of ``counts`` equal pieces of each segment; the last point of a line begins none."""
+    """Cut each segment into ``counts`` equal pieces; return the first point of each piece."""
     segment = np.repeat(np.arange(len(start)), counts)
     piece = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
     return start[segment] + (piece / counts[segment])[:, None] * step[segment]

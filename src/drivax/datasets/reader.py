@@ -99,14 +99,15 @@ class Reader(Protocol):
         ...
 
     def recognise(self, path: Path) -> bool:
-        """Whether a file is of this format, by its beginning; never raises."""
+        """Whether a file is of this format, by its name, first bytes, tables or first record; never raises."""
         ...
 
     def describe(self, path: Path) -> Description:
-        """Describe the file without decoding all of it.
+        """Describe the file; some readers look at its first recording only.
 
         Raises:
             DataError: The file is damaged.
+            UsageError: A package of an extra is missing.
         """
         ...
 

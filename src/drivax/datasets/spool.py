@@ -61,7 +61,7 @@ def convert_ahead(
 def _spool(
     task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
 ) -> list[Scenario | BadRecord]:
-    """Run one task in a worker: write its records to ``path``, return the other fields."""
+    """Run one task in a worker: write the records of its scenarios to ``path``, return all else."""
     items: list[Scenario | BadRecord] = []
     with path.open("wb") as file:
         for item in convert(*task):

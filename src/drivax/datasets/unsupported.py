@@ -47,8 +47,8 @@ _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
 #: Kinds of JSON files by words at their beginning, and cures.
 _JSON = {
     rb'"(objects|roads)"': (
-        "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
-        "convert the scenes again with a GPUDrive that writes metadata",
+        "JSON with objects or roads, but without GPUDrive's positions or geometries at its beginning",
+        "give files of GPUDrive's present converter",
     ),
     rb'"(lane_segments|drivable_areas)"': (
         "a map of Argoverse 2 without its recording",
@@ -138,7 +138,7 @@ def explain_folder(folder: Path) -> DataError | None:
 
 
 def explain_own(folder: Path) -> DataError | None:
-    """Return the error for a folder that drivax wrote, whatever files are in it; None for others."""
+    """Return the error for a scenario set or run folder of drivax, whatever files are in it; None for others."""
     return _first_match(folder, _OWN_FOLDERS)
 
 

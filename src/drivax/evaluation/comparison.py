@@ -21,6 +21,7 @@ from drivax.evaluation import pairing
 from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
 from drivax.evaluation.pairing import Pairs, Split
 from drivax.evaluation.plan import ComparisonPlan, Decision, MetricComparison, Sensitivity, decide
+from drivax.files import path_end
 from drivax.seal import MARK, mark_edited
 from drivax.stats import effects, significance
 from drivax.stats.clusters import design_effect, drop_undefined
@@ -302,10 +303,10 @@ def _names(a: _Side, b: _Side) -> tuple[str, str]:
     """Return the names of A and B; equal ones with the shortest different ends of their folders."""
     if a.name != b.name:
         return a.name, b.name
-    parts_a, parts_b = (side.folder.parts if side.folder else (arm,) for side, arm in ((a, "A"), (b, "B")))
-    lengths = range(1, max(len(parts_a), len(parts_b)) + 1)
-    n = next((n for n in lengths if parts_a[-n:] != parts_b[-n:]), 1)
-    return f"{a.name} ({Path(*parts_a[-n:])})", f"{b.name} ({Path(*parts_b[-n:])})"
+    if a.folder is None or b.folder is None:
+        return f"{a.name} (A)", f"{b.name} (B)"
+    first, second = a.folder.resolve(), b.folder.resolve()
+    return f"{a.name} ({path_end(first, [second])})", f"{b.name} ({path_end(second, [first])})"
 
 
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:

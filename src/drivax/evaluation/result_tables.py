@@ -12,6 +12,7 @@ import numpy as np
 
 from drivax.evaluation.episode_table import COLUMNS, NOT_SUMMARISED, RATES, EpisodeTable, Tags, interval_of
 from drivax.evaluation.pairing import Pairs, mismatch
+from drivax.files import path_end
 from drivax.metrics.catalogue import METRICS, headline
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
@@ -284,11 +285,8 @@ def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     own_names = {_planner_key(run): run.planner for run in runs}
     names = {}
     for key, name in own_names.items():
-        namesakes = [Path(other).parts for other in own_names if other != key and own_names[other] == name]
-        parts = Path(key).parts
-        lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in namesakes))
-        length = next(lengths, len(parts))
-        names[key] = "/".join(parts[-length:]) if namesakes else name
+        namesakes = [Path(other) for other in own_names if other != key and own_names[other] == name]
+        names[key] = path_end(Path(key), namesakes) if namesakes else name
     return names
 
 

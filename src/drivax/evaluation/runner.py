@@ -224,7 +224,8 @@ def evaluate(
         options: See :class:`Options`.
 
     Raises:
-        UsageError: Planner, task, start and scenarios are incompatible, or an option is invalid.
+        UsageError: Planner, task, start and scenarios are incompatible, or an option is invalid (``batch`` below 1,
+            ``sizes`` too small).
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """

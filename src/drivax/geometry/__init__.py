@@ -1,4 +1,4 @@
-"""Angles, oriented boxes and polylines, for NumPy and JAX arrays."""
+"""Angles and oriented boxes, for NumPy and JAX arrays, and polylines, for NumPy arrays."""
 
 import lazy_loader
 

@@ -32,7 +32,7 @@ class Polylines:
 
     @classmethod
     def of(cls, lines: Sequence[Float[Array, "_ dim"]], dim: int = 3) -> Polylines:
-        """Concatenate polylines; ``dim`` is the number of coordinates if there are none."""
+        """Concatenate polylines; ``dim`` is the number of coordinates if there are no polylines."""
         counts = np.array([len(line) for line in lines], dtype=np.int64)
         points = np.concatenate(list(lines)) if len(lines) else np.zeros((0, dim))
         start = np.concatenate(([0], np.cumsum(counts)))
@@ -225,7 +225,7 @@ def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
 def project(
     points: Float[Array, "point dim"], xy: Float[Array, "query 2"]
 ) -> tuple[Float[Array, " query"], Float[Array, " query"]]:
-    """Arc length of the nearest point of a polyline, and the distance from it, metres."""
+    """Arc length of the nearest point of a polyline of at least two points, and the distance from it, metres."""
     line = points[:, :2]
     arc = arc_lengths(points)
     distance, fraction = point_to_segment(xy[:, None], line[None, :-1], line[None, 1:])

@@ -1,8 +1,11 @@
 """Training of policies: algorithms, their environment, the training loop, and trained policies.
 
-``replay`` stores the transitions of a run; ``experience`` samples minibatches of logged steps for offline learning; PPO
-shuffles its own rollouts (``algorithms.ppo``). ``training_log.rank`` decides which checkpoint is the best, and
-``drivax.tracking.Checkpoints`` keeps it.
+- ``loop`` runs the iterations: it logs, validates, writes checkpoints, resumes. ``program`` compiles them.
+- ``algorithms`` has a module per algorithm; the terms of their losses are functions of :mod:`drivax.rl`.
+- ``environment`` collects rollouts; ``driving``, ``self_play`` and ``mixture`` are the environments.
+- ``replay`` stores the transitions of SAC, ``experience`` samples logged steps; PPO shuffles its own rollouts.
+- ``training_log.rank`` decides which checkpoint is the best, and ``drivax.tracking.Checkpoints`` keeps it.
+- ``policies`` loads and exports trained policies, as planners and as traffic.
 """
 
 import lazy_loader

@@ -37,13 +37,13 @@ Algorithm = (
 
 #: Name of the traffic in which the policy in training drives several vehicles.
 SELF = "self"
-#: Largest difference to 1 of a sum of shares.
+#: Largest difference of a sum of shares from 1.
 _ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of ``drivax train``; every preset in ``configs/`` is one of these.
+    """Settings of ``drivax train``; every preset in ``configs/`` is one of these, except ``studies/``.
 
     Attributes:
         total_steps: Decisions in all environments (``task.hold`` steps each), or logged steps that offline algorithms
@@ -57,15 +57,16 @@ class TrainConfig:
         start: How training episodes begin; those of self-play and of validation begin as logged, the latter at step 10.
         egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
             of a set made with ``--egos``). Validation episodes are those of the recorded ego.
-        earliest_start, latest_start: Training episodes begin at a random step of the log between the two.
+        earliest_start, latest_start: Training episodes begin at a random step of the log between the two; the first
+            ones of a run also later, so that they end at different times.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.
-        checkpoint_every: Iterations between checkpoints; the last iteration always has one.
+        checkpoint_every: Iterations between checkpoints; validations and the last iteration always have one.
         keep: Number of newest checkpoints to keep in addition to the best.
         checkpoint_rule: How validation ranks checkpoints; see :data:`~drivax.learning.training_log.Rule`.
         patience: Validations without improvement after which training stops; 0: never.
-        devices: Number of this machine's devices; None: all that seeds or environments can be divided among.
+        devices: Number of this machine's devices; None: all if seeds, environments or batch divide among them, else 1.
     """
 
     total_steps: int = 2_000_000
@@ -90,6 +91,8 @@ class TrainConfig:
         if isinstance(self.task.actions, DirectState | Trajectory):
             kind = kind_of(type(self.task.actions))
             raise UsageError(f"policies cannot learn in {kind}", cure="choose a space in [-1, 1]")
+        if self.total_steps < 1:
+            raise UsageError(f"total_steps is {self.total_steps}", cure="use 1 or more")
         if self.evaluate_every < 0 or min(self.checkpoint_every, self.keep) < 1 or self.patience < 0:
             problem = "evaluate_every and patience are at least 0, checkpoint_every and keep at least 1"
             raise UsageError(problem, cure="use patience 0 to train to the end")

@@ -39,8 +39,8 @@ class Driving:
 
     Attributes:
         simulator: Task, traffic and kind of start.
-        latest_start, earliest_start: Episodes begin at a random step of the log between the two, at most the third
-            last, or at step 10 where the ego is not valid yet.
+        latest_start, earliest_start: Episodes begin at a random step of the log between the two, those of
+            :meth:`start` up to the third last; at step 10 if the ego is not valid then, or its log ends earlier.
         egos: Who drives: the recorded ego, or one of the egos of the scenario, with equal odds. Rows of logged steps
             (:data:`~drivax.learning.experience.StepIndex`) are scenarios, or the rows of all egos in the bank.
     """
@@ -86,7 +86,7 @@ class Driving:
 
     @property
     def penalties(self) -> dict[str, float]:
-        """Minus the weights of the reward's terms that are never positive, and equal in all episodes."""
+        """Minus the weights below 0 of the reward, by term, without weights that a condition changes."""
         conditions = {condition.name for condition in self.task.conditions}
         return {name: x for name, x in self.task.rewards.penalties.items() if name not in conditions}
 
@@ -104,7 +104,7 @@ class Driving:
         return {name: tuple(value.shape) for name, value in observation.items()}
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
-        """Reset environments to random steps of their logs.
+        """Reset environments to random steps of their logs, from ``earliest_start`` to the third last.
 
         Raises:
             UsageError: ``latest_start`` is too late.
@@ -195,6 +195,7 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
+        At a step where the ego is not valid, step 10 is taken instead.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
@@ -237,7 +238,7 @@ class Driving:
         return Simulator(replace(self.task, metrics="none"))
 
     def _ego_of(self, bank: ScenarioBank, row: Array) -> tuple[Array, Any]:
-        """Return scenario and slot of a row of logged steps; rows without an ego have that of the recorded one."""
+        """Return scenario and slot of a row of logged steps; rows without an ego have the slot of the recorded one."""
         if self.egos == "recorded":
             return row, 0
         return bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
@@ -278,7 +279,7 @@ class Driving:
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """Return the expert's action within bounds and actuator rates, and whether it was clipped."""
+        """Return the expert's action within bounds and actuator rates, and whether it exceeded the bounds."""
         space = self.task.actions
         action = expert_action(bank, context, space)
         # In the space ``route`` the executed action is another one than that which a policy requests.
@@ -315,9 +316,9 @@ def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[...,
 
 
 def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
-    """Mask of steps with an expert action of the first egos of each scenario.
+    """Mask of steps with an expert action, for the first ``egos`` egos of each scenario.
 
-    These are the steps from the current one on that are valid, as are the next two of the ego's log.
+    From the current step on, the ego must be valid at the step and at the two after it.
     """
     steps, slot = jnp.arange(bank.steps), bank.egos[:, :egos, None]
     valid = bank.agents[jnp.arange(len(bank))[:, None, None], steps, slot, AgentColumn.VALID] > 0

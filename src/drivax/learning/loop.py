@@ -52,7 +52,7 @@ def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] 
     :func:`~drivax.learning.policies.load_policy`, for policies in the traffic.
 
     Raises:
-        UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
+        UsageError: The algorithm has no parts: bc, cql, iql, td3_bc, and the warm starts bc_ppo and bc_sac.
     """
     environment = training_environment(config, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
@@ -69,8 +69,8 @@ class TrainOptions:
     Attributes:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
-        seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-0``, ...
-        log: Called with lines about held-out scenarios, memory, pretrained networks, and early stopping.
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
+        log: Called with lines about held-out scenarios, memory, pretrained networks and early stopping, and warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
             in the traffic may name.
     """
@@ -203,7 +203,7 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     """Return the means to log, given the values of an iteration.
 
     A name with a count ``<name>/n`` is a sum: its mean is logged, or nothing if the count is 0. Sums of
-    ``rollout/reward/*`` are divided by the number of steps. All other values are logged unchanged.
+    ``rollout/reward/*`` are divided by ``rollout/steps``, and logged as ``reward/*``. All others are logged unchanged.
     """
     values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
     steps = values.pop("rollout/steps", 0.0)
@@ -344,7 +344,10 @@ class _Training:
         return iteration * self.config.algorithm.steps_per_iteration
 
     def _start(self) -> tuple[int, Any]:
-        """Return the number of finished iterations and the state: of the newest common checkpoint, or initial."""
+        """Return the number of finished iterations and the state: of the newest common checkpoint, or initial.
+
+        If every seed has stopped, all iterations count as finished, and the state is None.
+        """
         unfinished = [log for log in self.logs if not log.out_of_patience]
         if all(log.divergence is not None for log in unfinished):
             # The user may have corrected a reward term.
@@ -505,7 +508,8 @@ class PretrainedRun:
     def networks(self, state: Any) -> dict[str, Any]:
         """Return the stored networks by their paths in the initial state of one seed (or its shapes).
 
-        Networks that the checkpoint lacks are omitted. Raises DataError for the first array that does not fit.
+        Networks that the checkpoint lacks are omitted, except ``parameters``. Raises DataError for the first array that
+        is missing or does not fit.
         """
         checkpoints = Checkpoints(RunFolder.open(self.run).checkpoints)
         leaves = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]

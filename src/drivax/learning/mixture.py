@@ -111,9 +111,10 @@ class Mixture:
         keys, sizes = jax.random.split(key, len(self.blocks)), self.sizes(len(action))
         after, outcomes = [], []
         for number, (start, end) in enumerate(pairwise(accumulate(sizes, initial=0))):
-            batch = (now.over, now.observation, action)
-            *rows, actions = jax.tree.map(lambda leaf, start=start, end=end: leaf[start:end], batch)
-            environments, block = Environments(now.state[number], *rows), self.blocks[number][1]
+            over, observation, actions = jax.tree.map(
+                lambda leaf, start=start, end=end: leaf[start:end], (now.over, now.observation, action)
+            )
+            environments, block = Environments(now.state[number], over, observation), self.blocks[number][1]
             stepped, outcome = block.step(data, environments, cache[number], actions, keys[number])
             after.append(stepped)
             outcomes.append(outcome)

@@ -26,7 +26,7 @@ from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, t
 
 #: What an exported policy has instead of checkpoints.
 POLICY_FILE = "policy.npz"
-#: What ``run.json`` of an exported policy keeps of the training: no path of the machine.
+#: What ``run.json`` of an exported policy keeps of the training; paths are in the command alone.
 _PROVENANCE = ("command", "started", "versions", "git", "validation", "step")
 #: Parameters do not depend on traffic and starts, and the traffic of the training may no longer exist.
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
@@ -90,8 +90,8 @@ def export_policy(
 ) -> RunFolder:  # fmt: skip
     """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
 
-    The folder holds the planner's parameters, the configuration, and the provenance (command, versions, commit and
-    hashes of data sets, but no path of the machine).
+    The folder holds the planner's parameters, the configuration, and the provenance: command as typed, versions,
+    commit and hashes of data sets. Only the command, and a run named as ``traffic``, may contain paths of the machine.
 
     Args:
         run: As for :func:`load_policy`, with its errors.

@@ -1,7 +1,8 @@
 """Replay buffer: a ring of transitions, stored as states that are observed when they are sampled.
 
-A state in log traffic takes a tenth of the memory of its observation, but every sampled step is observed twice, before
-and after; ``store: observation`` stores observations in bfloat16 instead.
+A state takes 0.4 kB in log traffic, an observation in bfloat16 1.2 kB (preset ``sac``) to 44 kB (``published/sac``);
+but states are observed when they are sampled, twice per step, and those of reactive traffic grow with the vehicles
+(2.3 kB in the built-in world).
 
 A row holds one step of all environments. What row t led to is in the next row, the final state of an episode in the
 row that resets it. The newest row has no next row yet and is not sampled.
@@ -28,7 +29,7 @@ class ReplayConfig:
 
     Attributes:
         capacity: Steps over all environments; new steps replace the oldest.
-        store: ``state``, or ``observation`` in bfloat16, which takes more memory and less time.
+        store: ``state``, or ``observation`` in bfloat16, which takes less time and, in log traffic, more memory.
     """
 
     capacity: int = 100_000
@@ -84,7 +85,7 @@ class Transitions:
         reward: Discounted sum of the rewards of up to n steps of one episode.
         terminated: Whether the episode ended by a failure in them.
         next_observation: What they led to, final states included.
-        discount: ``gamma`` to the power of their number.
+        discount: ``gamma`` to the power of the number of these steps (of decisions, where they are held).
     """
 
     observation: dict[str, Array]

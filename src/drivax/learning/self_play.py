@@ -26,7 +26,7 @@ class SelfPlayConfig:
 
     Attributes:
         vehicles: Largest number of vehicles of a scenario that the policy drives, ego included.
-        past: Share of the groups in which an older copy of the policy drives all vehicles but ego (PPO only).
+        past: Share of the groups in which an older copy of the policy drives all vehicles but ego (ppo and bc_ppo).
         refresh: Iterations after which the current policy replaces the older copy.
     """
 
@@ -54,9 +54,16 @@ class SelfPlay(Driving):
     config: SelfPlayConfig = SelfPlayConfig()
 
     def past(self, count: int) -> PastPolicy:
-        """Return the environments that an older copy of the policy drives: in the first groups, all but ego's."""
+        """Return the environments that an older copy of the policy drives: in the first groups, all but ego's.
+
+        Raises:
+            UsageError: The share of ``past`` is less than half a group.
+        """
         size, number = self.config.vehicles, np.arange(count)
         groups = round(self.config.past * (count // size))
+        if self.config.past and not groups:
+            problem = f"self_play.past is {self.config.past:g} of {count // size} groups: none"
+            raise UsageError(problem, cure="raise it, or algorithm.environments")
         is_past = (number // size < groups) & (number % size > 0)
         return PastPolicy(np.flatnonzero(is_past), self.config.refresh)
 

@@ -56,8 +56,8 @@ class Validation:
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
     """Evaluate a planner in closed loop on held-out scenarios.
 
-    Returns ``validation/<metric>``: means over the scenarios that define it. With ``success``, the shares ``late`` (the
-    goal is not reached), ``at_fault`` and ``not_at_fault`` (a failure) sum to 1 over the scenarios that define it.
+    Returns ``validation/<metric>``: means over the scenarios that define it. Where ``success`` is defined, it and the
+    shares ``late`` (only the goal is not reached), ``at_fault`` and ``not_at_fault`` (a failure) sum to 1.
 
     Raises:
         DivergenceError: Actions are not finite.
@@ -119,7 +119,7 @@ class Preempted(DrivaxError):
 class StopSignal:
     """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
 
-    Batch systems send it some seconds before they take a machine away. Threads but the main one have no signals.
+    Batch systems send it some seconds before they take a machine away. Outside of the main thread it is not noted.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Encoders, heads and action distributions (flax nnx)."""
+"""Encoders, action distributions, and the policies, values and critics made of them (flax nnx)."""
 
 import lazy_loader
 

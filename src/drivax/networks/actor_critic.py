@@ -46,15 +46,16 @@ class NetworkConfig:
     """Architecture of policy, value and critics.
 
     Attributes:
-        encoder: The encoder; policy, value and each critic have their own.
+        encoder: The encoder; policy, value and each critic have their own, unless it is shared.
         head: Hidden layers between embedding and output.
         activation: Activation after each hidden layer of a head; outputs are linear.
         first_scale: Standard deviation of an untrained policy, for all actions or for each: before squashing (gaussian,
-            mixture), of the action (beta), or of the Gaussian whose density weights the levels (grid).
-        least_scale: Lower bound of the standard deviation of a Gaussian, as a share of ``first_scale``, so that
-            exploration does not vanish.
+            each component of a mixture), of the action (beta), or of the Gaussian whose density weights the levels
+            (grid).
+        least_scale: Lower bound of the standard deviation, as a share of ``first_scale``, so that exploration does not
+            vanish; of ``gaussian`` only.
         distribution: Action distribution; ``grid`` is for ``discrete`` actions.
-        shared_encoder: Whether policy and value share one encoder.
+        shared_encoder: Whether policy and value of PPO share one encoder; no effect on other algorithms.
         critic_norm: Layer normalisation before each activation of the critics' heads. It bounds the values of unseen
             actions (Ball et al. 2023, arXiv 2302.02948).
     """
@@ -125,7 +126,7 @@ class Policy(nnx.Module):
         )
 
     def __call__(self, groups: Groups) -> Distribution:
-        """Return the action distribution; before training it is centred at zero with ``first_scale``."""
+        """Return the action distribution; before training it is centred near zero with ``first_scale``."""
         return self.from_embedding(self.encoder(groups))
 
     def from_embedding(self, embedding: Float[Array, "*batch width"]) -> Distribution:

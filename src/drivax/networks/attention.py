@@ -23,7 +23,7 @@ from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_name
 
 Dtype = Literal["float32", "bfloat16"]
 
-#: Logit of masked tokens; finite, so that a softmax over masked tokens only stays finite.
+#: Logit of masked tokens; finite, so that the softmax stays finite if all tokens are masked.
 _MASKED = -1e30
 
 
@@ -213,7 +213,7 @@ def time_code(times: int, width: int) -> Float[np.ndarray, "time width"]:
 class Embedding(nnx.Module):
     """Map features to normalised tokens: dense layers per group, plus a time encoding for series.
 
-    Features are embedded in float32: in bfloat16 a point 50 m away would move by 20 cm.
+    Features are embedded in float32: in bfloat16 a point 50 m away would move by up to 20 cm.
     """
 
     def __init__(

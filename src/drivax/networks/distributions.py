@@ -65,7 +65,7 @@ class Distribution(Protocol):
         ...
 
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch raw"]:
-        """Return the raw action that maps to an action, or to the nearest reachable one."""
+        """Return the raw action of an action, of one just inside the bounds, or of the nearest levels of the grid."""
         ...
 
     def mode(self) -> Float[Array, "*batch action"]:
@@ -133,7 +133,7 @@ class SquashedGaussian(_SquashedActions):
 
 @record
 class Beta:
-    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)``, unimodal because both parameters are above 1."""
+    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)``; above 1, both parameters give a single peak."""
 
     alpha: Float[Array, "*batch action"]
     beta: Float[Array, "*batch action"]
@@ -163,7 +163,7 @@ class Beta:
         return jnp.clip((action + 1.0) / 2.0, _EDGE, 1.0 - _EDGE)
 
     def mode(self) -> Float[Array, "*batch action"]:
-        """Return the peak of the density; for the uniform distribution (``alpha = beta = 1``), its centre."""
+        """Return the peak of the density; its centre if both parameters are rounded to 1."""
         return (self.alpha - self.beta) / jnp.maximum(self.alpha + self.beta - 2.0, _EDGE)
 
     def mean_action(self) -> Float[Array, "*batch action"]:
@@ -292,7 +292,8 @@ def initial_parameters(
     and ``scale``.
 
     Raises:
-        UsageError: A Beta with this scale has no peak, or there are scales of another number of actions.
+        UsageError: A Gaussian cannot have this scale, a Beta with it has no peak, or there are scales of another number
+            of actions.
     """
     scales = np.atleast_1d(np.asarray(scale, np.float64))
     if len(scales) not in (1, actions.size):
@@ -301,6 +302,9 @@ def initial_parameters(
     scales = np.broadcast_to(scales, actions.size)
     if kind == "grid":
         return (-0.5 * (combinations(_levels(actions)) / scales) ** 2).sum(axis=-1)
+    if kind != "beta" and (scales.min() < _MIN_SCALE or scales.max() > _MAX_SCALE):
+        problem = f"first_scale of a {kind} is {scales.min():g} to {scales.max():g}"
+        raise UsageError(problem, cure=f"use {_MIN_SCALE:g} to {_MAX_SCALE:g}")
     spread = np.log(np.expm1(scales))  # The inverse of softplus.
     if kind == "gaussian":
         return np.concatenate([np.zeros(actions.size), spread]).astype(np.float32)

@@ -51,7 +51,7 @@ class Encoder(Protocol):
 
 @runtime_checkable
 class EncoderConfig(Protocol):
-    """Settings of an encoder; yours is a frozen dataclass, in YAML ``kind: package.module:Name``."""
+    """Settings of an encoder; your own are frozen dataclasses, named in YAML as ``package.module:Name``."""
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> Encoder:
         """Return an encoder of observations with these groups."""
@@ -204,7 +204,7 @@ def _dense_and_max_forward(
 def _dense_and_max_backward(
     activation: Activation, residuals: Any, gradient: Array
 ) -> tuple[Any, Array, None]:
-    """Differentiate all rows as one matrix: on CPUs, XLA's gathers and scatters are slower than its zeros."""
+    """Differentiate all rows as one matrix: on CPUs, XLA multiplies zeros faster than it gathers and scatters."""
     layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
     (gradient,) = vjp(jnp.where(is_positive, gradient, 0.0))
     is_largest = (products == largest[:, None]) & valid[..., None]

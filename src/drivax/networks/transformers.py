@@ -110,9 +110,14 @@ class LqhConfig(LatentConfig):
     kind: Literal["lqh"] = "lqh"
     local_layers: int = 1
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.local_layers < 1:
+            raise ValueError(f"local_layers must be at least 1, not {self.local_layers}")
+
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
-        fusion = Fusion(max(self.local_layers, 1), self.sizes.layers, every_layer=True)
+        fusion = Fusion(self.local_layers, self.sizes.layers, every_layer=True)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 
 

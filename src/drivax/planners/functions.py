@@ -53,7 +53,7 @@ class FunctionPlanner(Memoryless):
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the function's action; NaN if a Python function raises an error."""
+        """Return the function's action; NaN if a Python function raises an error in :func:`collect_errors`."""
         if not self.in_python:
             return jnp.ravel(jnp.asarray(self.function(situation, observation), jnp.float32))
         context = situation.context
@@ -83,7 +83,9 @@ def python_planner(function: Drive) -> FunctionPlanner:
 def python_actions(
     function: Callable[..., Any], identity: Array, step: Array, arguments: tuple[Any, ...], size: int
 ) -> Array:
-    """Return ``size`` numbers of a Python function called outside the compiled program, or NaN if it raises an error.
+    """Return ``size`` numbers of a Python function that is called outside the compiled program.
+
+    In :func:`collect_errors` they are NaN if it raises an error, which otherwise ends the program.
 
     Args:
         function: Gets ``arguments`` as numpy arrays of one scenario.
@@ -109,6 +111,7 @@ class NetworkPlanner(Memoryless):
     Attributes:
         parameters: Weights of the network.
         graph: Structure of the network.
+        name: Name in tables.
         samples: Whether to act by a sample.
     """
 

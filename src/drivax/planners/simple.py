@@ -116,8 +116,8 @@ class RandomActions(Memoryless):
 class IdmPlanner(RuleBased):
     """Follow the leader along the route by IDM, stop for red lights, slow down in curves, steer by pure pursuit.
 
-    Reads the true situation, not observations. The desired speed is the speed limit, or 13.4 m/s if it is unknown. In a
-    scenario without a route on lanes, ego follows the path of the log.
+    Reads the true situation, not observations. The desired speed is the speed limit (13.4 m/s if unknown), less before
+    curves, and 0 at the end of the route. In a scenario without a route on lanes, ego follows the path of the log.
     """
 
     actions: ActionSpace = static(default=Physical())

@@ -26,12 +26,15 @@ _RIGHT, _TOP, _BOTTOM = 12, 10, 34
 Points = Float[np.ndarray[Any, Any], "point 2"]
 #: Maximum number of points of a line; longer lines are averaged into bins.
 _MAX_POINTS = 150
-#: Groups of quantities with visible curves; the others are collapsed.
+#: Groups of quantities with visible curves, in order.
 _VISIBLE = ("validation", "evaluation", "rollout")
 
 
 def curve_sections(runs: Sequence[Training]) -> str:
-    """Return all learning curves: the policy's results visible, losses and all others collapsed."""
+    """Return a chart of each quantity that was logged more than once.
+
+    The policy's results (:data:`_VISIBLE`), or else the first six quantities, are visible, all others collapsed.
+    """
     names = list(dict.fromkeys(name for run in runs for name in run.curves))
     drawable = [name for name in names if any(len(run.curves.get(name, ())) > 1 for run in runs)]
     if not drawable:
@@ -47,8 +50,8 @@ def chart(
 ) -> str:
     """Return one chart as HTML, with a title above and ``x_label`` below.
 
-    ``lines`` has the stroke and the points (x, y) of each run. With ``share``, the vertical axis spans 0 to 1 if all
-    values fit.
+    ``lines`` has the stroke and the points (x, y) of each line; some line has points. With ``share``, the vertical axis
+    spans 0 to 1 if all values fit.
     """
     series = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
     values = np.concatenate([points for _, points in series.values()])
@@ -132,7 +135,7 @@ class Axes:
 def ticks(low: float, high: float, maximum: int) -> list[float]:
     """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten.
 
-    The interval is at most ``maximum`` steps long. A single value gets an interval around it.
+    They have at most ``maximum + 1`` steps between them. A single value gets an interval around it.
     """
     if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
         pad = max(0.5 * abs(low), 0.5)
@@ -165,8 +168,8 @@ SPREAD = (
     "vmax_score", "progress_ratio", "min_ttc", "average_ttc", "max_jerk", "max_lateral_acceleration", "comfort",
     "speeding_max", "route_deviation_max", "ade", "goal_distance", "distance",
 )  # fmt: skip
-#: Maximum number of steps of a distribution: a chart does not average its corners (2 per step).
-_MAX_STEPS = 75
+#: Maximum number of steps of a distribution. Its corners, two per step, must not be averaged into bins.
+_MAX_STEPS = _MAX_POINTS // 2
 #: Maximum number of bins of a histogram.
 BINS = 24
 
@@ -187,7 +190,7 @@ def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
 def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
     """Return the corners of the empirical distribution function of the defined values: value, cumulative share.
 
-    More than 75 values are thinned evenly; no corner moves by more than 1 / 75.
+    More than 75 values are thinned evenly, which lowers the share at a value by less than 1 / 74.
     """
     sorted_values = np.sort(np.asarray(values, np.float64))
     sorted_values = sorted_values[~np.isnan(sorted_values)]
@@ -201,7 +204,10 @@ def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
 
 
 def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenario") -> str:
-    """Return one histogram as HTML: the share of each series in common bins, labelled with the unit."""
+    """Return one histogram as HTML: the share of each series in common bins, labelled with the unit.
+
+    Some series has values.
+    """
     values = np.concatenate(list(series.values()))
     edges = bins(values)
     shares = {name: _shares(numbers, edges) for name, numbers in series.items()}

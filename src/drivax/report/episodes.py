@@ -31,7 +31,7 @@ FAILURES = (
     ("left the map", "left_map", 1.0),
     ("goal not reached", "reached_goal", 0.0),
 )
-#: Least share of successes among the shown episodes, if there are enough.
+#: Least share of successes among the shown episodes, rounded to whole episodes, if there are enough.
 _MIN_SUCCESS_SHARE = 0.25
 
 
@@ -39,8 +39,8 @@ _MIN_SUCCESS_SHARE = 0.25
 class EpisodeGroup:
     """The episodes of all runs in one scenario.
 
-    ``rows`` has a row of each run's table, or None if the run has no episode. ``outcome`` is that of the policy's
-    episode (:func:`outcome`).
+    ``rows`` has a row of each run's table, or None if the run has no episode or is not comparable with the policy, the
+    last run. ``outcome`` is that of the policy's episode (:func:`outcome`).
     """
 
     dataset: str
@@ -55,7 +55,10 @@ class EpisodeGroup:
 
 
 def outcome(run: EpisodeTable, row: int) -> str:
-    """Return the most severe failure of an episode, ``success``, or ``unjudged`` if no metric is defined."""
+    """Return the most severe failure of an episode, ``success`` without one, or ``unjudged``.
+
+    An episode is unjudged if no metric of :data:`FAILURES` is defined.
+    """
     any_defined = False
     for name, metric, failure_value in FAILURES:
         value = _metric_value(run, metric, row)
@@ -66,9 +69,10 @@ def outcome(run: EpisodeTable, row: int) -> str:
 
 
 def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:
-    """Return the rows of a run, worst episode first, by failure and score.
+    """Return the rows of a run, worst episode first: by failure, unjudged, success; then by ``vmax_score``.
 
-    Ties are broken by the number of other runs that succeed, the largest first, then by scenario id.
+    An undefined score counts as 1. Ties are broken by the number of comparable ``others`` that succeed, the largest
+    first, then by scenario id.
     """
     order = (*(name for name, _, _ in FAILURES), "unjudged", "success")
     rank = {name: index for index, name in enumerate(order)}
@@ -90,8 +94,8 @@ def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
     """Choose ``count`` episodes of the last run: failures of every kind in turn, worst score first, then successes.
 
-    At least a quarter are successes if there are enough. Among equal failures, those where other planners succeed come
-    first; among successes, those where they fail.
+    Unjudged episodes count as a kind of failure. At least a quarter (rounded) are successes if there are enough. Among
+    equal failures, those where other planners succeed come first; among successes, those where they fail.
     """
     kinds: dict[str, list[EpisodeGroup]] = {}
     for group in rank_scenarios(runs):
@@ -111,7 +115,7 @@ def _count_successes(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
 
 
 def rank_scenarios(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
-    """Return the episodes of every scenario of the last run, worst scenario first."""
+    """Return the first episode of every run in each scenario of the last run, worst scenario first."""
     policy = runs[-1]
     others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
     groups = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby
 from operator import getitem
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
+from drivax.files import path_end
 from drivax.report.charts import short
 from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
@@ -27,7 +28,7 @@ Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
 
 _SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights", "lost")
-#: Number of scenarios whose records are read; all others are described by the manifest.
+#: Maximum number of scenarios whose records are read for speeds and rates.
 SAMPLE = 1000
 
 
@@ -101,7 +102,7 @@ class Inspection:
 
     @property
     def hours(self) -> float:
-        """Driving time of all scenarios; overlapping windows of one recording count in full."""
+        """Driving time of the selected scenarios; overlapping windows of one recording count in full."""
         return sum(max(entry["source"]["steps"] - 1, 0) for entry in self.entries) * DT_S / 3600
 
     @property
@@ -145,7 +146,7 @@ class Inspection:
         return {name: (counts[name], scenarios[name]) for name in sorted(counts)}
 
     def findings(self) -> list[str]:
-        """Return the names of the audit's findings, in the order of ``scenario.select.selection.FINDINGS``."""
+        """Return the names of the audit's defined findings: those of ``FINDINGS`` in its order, then others by name."""
         names = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
         return [*(name for name in FINDINGS if name in names), *sorted(names - set(FINDINGS))]
 
@@ -170,7 +171,7 @@ class Quantity:
         return cls(label, unit, lambda entry: reduce(getitem, path, entry).get(name, default))
 
 
-#: Numbers of every scenario: of its source, before cropping and capping, and of its audit.
+#: Numbers of every scenario: of its source, before cropping and capping; its stored segments; and of its audit.
 QUANTITIES = (
     Quantity.of("agents now", "source", "tracks_valid_now"),
     Quantity.of("tracks", "source", "tracks"),
@@ -210,8 +211,10 @@ def read_speeds(inspection: Inspection) -> Speeds:
     return Speeds(ego_mps, vehicles_mps, len(ego))
 
 
-#: Maximum numbers of listed scenarios, listed values of a tag, sets per table, and causes of unreadable records.
-MAX_LISTED, MAX_NAMED, SETS_PER_TABLE, _MAX_CAUSES = 30, 6, 4, 3
+#: Maximum numbers of listed scenarios, sets per table, and causes of unreadable records.
+MAX_LISTED, SETS_PER_TABLE, _MAX_CAUSES = 30, 4, 3
+#: Maximum numbers of listed values of a tag or flag, and of places of a set.
+_MAX_VALUES, _MAX_PLACES = 12, 6
 #: A label and one text per set.
 Row = tuple[str, list[str]]
 
@@ -304,8 +307,17 @@ def _counts(entry: Entry) -> tuple[int, ...]:
     return (*track_counts, *feature_counts, others, source["map_points"], source["lights"], entry["segments"])
 
 
+def with_distinct_names(inspections: Sequence[Inspection]) -> list[Inspection]:
+    """Return the sets, each of a repeated name with the shortest end of its path that distinguishes it."""
+    paths = [inspection.scenarios.path.resolve() for inspection in inspections]
+    others = [[other for other in paths if other.name == path.name and other != path] for path in paths]
+    triples = zip(inspections, paths, others, strict=True)
+    return [replace(inspection, name=path_end(path, namesakes)) for inspection, path, namesakes in triples]
+
+
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Return tables of several sets side by side: sizes, averages per scenario, shares of tags."""
+    """Return tables of four sets each: sizes, averages per scenario, shares of audit findings, tags and flags."""
+    inspections = with_distinct_names(inspections)
     groups = [
         inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)
     ]
@@ -345,14 +357,18 @@ def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **options: A
 
 
 def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
-    """Return the shares of scenarios by audit finding, tag value and flag; tags of many values only have a count."""
+    """Return the shares of scenarios by audit finding, tag value and flag.
+
+    Tags of more than :data:`_MAX_VALUES` values have the number of their values instead; ``place`` is in
+    :data:`_CONTENT`.
+    """
     sizes = [len(inspection) for inspection in inspections]
     rows = _percents("", true_findings(inspections))
     tags_by_set = [inspection.tags() for inspection in inspections]
     for name in dict.fromkeys(name for tags in tags_by_set for name in tags if name != "place"):
         counts = [tags.get(name, {}) for tags in tags_by_set]
         shares = with_sizes(counts, sizes)
-        if len(shares) > 2 * MAX_NAMED:
+        if len(shares) > _MAX_VALUES:
             rows.append((name, [f"{len(values):,} values" if values else MISSING for values in counts]))
         else:
             rows += _percents(f"{name} ", shares)
@@ -410,12 +426,12 @@ def _places_text(inspection: Inspection) -> str:
     places = inspection.value_counts(
         lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else []
     )
-    suffix = f" and {len(places) - MAX_NAMED} more" if len(places) > MAX_NAMED else ""
-    return ", ".join(list(places)[:MAX_NAMED]) + suffix if places else MISSING
+    suffix = f" and {len(places) - _MAX_PLACES} more" if len(places) > _MAX_PLACES else ""
+    return ", ".join(list(places)[:_MAX_PLACES]) + suffix if places else MISSING
 
 
 def _counts_text(counts: Mapping[str, int], total: int) -> str:
-    first = list(counts.items())[: 2 * MAX_NAMED]
+    first = list(counts.items())[:_MAX_VALUES]
     texts = [name if count == total else f"{name} ({count:,} of {total:,})" for name, count in first]
     hidden = len(counts) - len(texts)
     return ", ".join(texts) + (f" and {hidden:,} more" if hidden else "") or "none"

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.files import path_end
 from drivax.seal import edited_files, mark_edited
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
@@ -35,7 +36,8 @@ class Training:
 def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
     """Read evaluation and training runs, with every seed of a run.
 
-    A repeated name gets its folder as suffix.
+    An evaluation has the name of its planner, a training that of its folder (of a seed ``RUN/seed-N``). A repeated name
+    gets as suffix the shortest end of its path that distinguishes it from the runs before it.
 
     Raises:
         DataError: A folder is missing, damaged, or neither an evaluation nor a training run.
@@ -49,19 +51,20 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
         )
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
-    table_names, chart_names = set[str](), set[str]()
-    for folder in folders:
+    tables, charts = dict[str, list[Path]](), dict[str, list[Path]]()
+    for folder, path in zip(folders, paths, strict=True):
         run = RunFolder.open(folder)
         if run.kind == "training":
             curves = _curves(run)
-            name = mark_edited(folder.name, edited_files(folder) or run.info.get("edited"))
-            name = _unique_name(name, folder, chart_names)
+            label = f"{path.parent.name}/{path.name}" if path.name.startswith("seed-") else path.name
+            name = mark_edited(label, edited_files(folder) or run.info.get("edited"))
+            name = _unique_name(name, path, charts)
             trainings.append(Training(folder, name, run.info, curves))
         elif run.kind == "evaluation":
             table = EpisodeTable.read(folder)
             _ = table.trajectories  # reads the file, to report damage before any work
             name = mark_edited(table.name, edited_files(folder))
-            evaluations.append(replace(table, name=_unique_name(name, folder, table_names)))
+            evaluations.append(replace(table, name=_unique_name(name, path, tables)))
         else:
             problem = f"is of kind {run.kind!r}, not evaluation or training"
             cure = "give folders written by drivax evaluate or drivax train"
@@ -82,14 +85,12 @@ def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
     return evaluations
 
 
-def _unique_name(name: str, folder: Path, names: set[str]) -> str:
-    """Return a name that is not yet in ``names``, and add it."""
-    candidate, number = name, 1
-    while candidate in names:
-        candidate = f"{name} ({folder.name})" if number == 1 else f"{name} ({folder.name} {number})"
-        number += 1
-    names.add(candidate)
-    return candidate
+def _unique_name(name: str, path: Path, namesakes: dict[str, list[Path]]) -> str:
+    """Return the name, with a suffix if earlier runs have it; ``namesakes`` has the paths of all runs by name."""
+    earlier = namesakes.setdefault(name, [])
+    suffix = f" ({path_end(path, earlier)})" if earlier else ""
+    earlier.append(path)
+    return name + suffix
 
 
 def _curves(run: RunFolder) -> dict[str, Array]:

@@ -29,7 +29,7 @@ def write_tables(
     """Write every table of a report into a folder as ``.csv``, ``.md`` and ``.tex``, and return the files.
 
     The tables are ``results``, ``differences`` (several runs), ``collisions`` (known kinds of collision), ``by-TAG``
-    (tags of the scenarios) and ``transfer-METRIC`` (runs on several data sets).
+    (:func:`strata_tables`) and ``transfer-METRIC`` (runs on several data sets).
 
     Args:
         runs: Run folders; the last evaluation is the policy.
@@ -56,14 +56,16 @@ def write_tables(
 def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:
     """Return the metrics of the files: headline metrics, progress in metres, user-defined metrics, and ``extra``.
 
+    ``extra`` has names of metrics and of sets of metrics. Runs without any of these metrics have all of theirs.
+
     Raises:
-        UsageError: No run has a metric of ``extra``.
+        UsageError: ``extra`` names no set, and no metric that a run has.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
     selected = {"progress"}
     for entry in extra:
         if entry not in SETS and entry not in names:
-            raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
+            raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, [*SETS, *names]))
         selected.update(SETS.get(entry, (entry,)))
     headline = result_tables.headline_names(names)
     others = [name for name in names if name in selected or name not in (*METRICS, *ADDED)]
@@ -85,7 +87,10 @@ def _tables(runs: Sequence[EpisodeTable], data: Path | None, extra: Sequence[str
 
 
 def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, extra: Sequence[str] = ()) -> list[Table]:
-    """Return a table per tag of the scenarios, with the runs on these scenarios and the ``extra`` metrics."""
+    """Return a table for each tag of ``result_tables.STRATA`` that the scenarios have, of the runs on these scenarios.
+
+    Columns are :data:`KEY_METRICS` and ``extra``.
+    """
     runs = [run for run in runs if any(key in tags for key in run.scenarios)]
     tag_names = {name for scenario_tags in tags.values() for name in scenario_tags}
     names = dict.fromkeys((*KEY_METRICS, *extra))
@@ -95,7 +100,10 @@ def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, extra: Sequence[str]
 
 
 def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
-    """Return a matrix of training and evaluation data for each metric, or no table if all runs share one set."""
+    """Return a matrix of training and evaluation data for each defined metric of :data:`TRANSFER_METRICS`.
+
+    There is no table if all runs share one set.
+    """
     if len({result_tables.set_key(run.data) for run in runs}) < 2:
         return []
     metrics = [name for name in TRANSFER_METRICS if any(result_tables.summarise(run, name).n for run in runs)]

@@ -1,4 +1,8 @@
-"""Equations of reinforcement learning: returns, targets and losses. Arrays in, arrays out."""
+"""Equations of reinforcement learning: arrays in, arrays out.
+
+``equations`` has advantages and returns, TD targets, and the terms of losses, among them PPO's clipped surrogate. The
+modules of :mod:`drivax.learning.algorithms` add these terms up to the loss of an algorithm.
+"""
 
 import lazy_loader
 

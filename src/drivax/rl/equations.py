@@ -1,7 +1,7 @@
-"""Equations of reinforcement learning: advantages, temporal-difference targets, and the losses of all algorithms.
+"""Equations of reinforcement learning: advantages, temporal-difference targets, and the terms of losses.
 
 Arrays in, arrays out. Time is the leading axis; ``_t`` and ``_tp1`` mark steps t and t + 1. Losses are per sample;
-callers average them.
+callers add and average them (``drivax.learning.algorithms``).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def clipped_surrogate_loss(
 
 
 class NStepReturns(NamedTuple):
-    """Discounted sums of rewards, whether a failure ended the episode, numbers of steps, and ``gamma^n``."""
+    """Discounted sums of rewards, whether a failure ended the episode, numbers of steps, and ``gamma^(decisions)``."""
 
     reward: Float[Array, "*batch"]
     terminated: Bool[Array, "*batch"]
@@ -68,8 +68,9 @@ def n_step_returns(
 ) -> NStepReturns:  # fmt: skip
     """Return ``sum_k gamma^k r_{t+k}`` over the steps before the first false ``follows_t`` (Sutton 1988).
 
-    ``hold`` steps of time make one decision; their rewards share a discount. Nothing corrects for the later actions,
-    which another policy may have chosen.
+    ``follows_t`` holds where step t belongs to the episode and its next state is stored. ``hold`` steps of time make
+    one decision; their rewards share a discount. Nothing corrects for the later actions, which another policy may have
+    chosen.
     """
     taken_t = jnp.cumprod(follows_t, axis=0, dtype=jnp.int32)
     decision = np.arange(len(reward_t)) // hold
@@ -151,8 +152,8 @@ def conservative_penalty(
 ) -> Float[Array, "*batch"]:  # fmt: skip
     """``log_mass(Q(s, .)) - Q(s, a)`` with the logged action ``a``: the regulariser CQL(H) (arXiv 2006.04779, eq. 4).
 
-    A tabular critic that also minimises half the squared error of ``r + gamma V`` ends at
-    ``r + gamma V - alpha (softmax(Q) / pi_beta - 1)``, with ``pi_beta`` the policy of the data.
+    A tabular critic that minimises half its squared error from ``r + gamma V`` plus ``alpha`` times this penalty ends
+    at ``r + gamma V - alpha (softmax(Q / tau) / pi_beta - 1)``, with ``pi_beta`` the policy of the data.
     """
     return log_mass(q, log_density, temperature) - q_data
 

@@ -11,7 +11,7 @@ from jaxtyping import Int8
 
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.build.tracks import DEFAULT_SIZES
+from drivax.scenario.build.tracks import DEFAULT_EGO_SIZE, DEFAULT_SIZES
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, interpolate
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
 
@@ -37,7 +37,7 @@ def recording_from_arrays(
     Args:
         scenario_id: Name of the recording; windows that are cut from it share it as their segment.
         agents: ``xy`` [agent, time, 2], ``heading`` [agent, time], ``valid`` [agent, time]; box ``size`` [agent, 3] or
-            [agent, time, 3] (length, width, height; class defaults where it is missing or 0). Optional: ``kind``, one
+            [agent, time, 3] (length, width, height; defaults where it is missing or 0). Optional: ``kind``, one
             per agent ("vehicle", "pedestrian", "cyclist", "other", "static"; vehicles if missing); ``velocity``
             [agent, time, 2] (differentiated positions if missing); ``z`` [agent, time] of the box centre (required if
             the roads have heights); ``id``, integers. Invalid entries may hold anything.
@@ -88,7 +88,7 @@ def scenario_from_arrays(
     lights: Sequence[Mapping[str, Any]] = (), route: Sequence[int] = (), ego: int = 0,
     dt_s: float = DT_S, dataset: str = "own",
 ) -> Scenario:  # fmt: skip
-    """Return a scenario from plain arrays of at most 91 steps; step 10 is the current one.
+    """Return a scenario from plain arrays of at most 91 steps; step 10, or the last of fewer, is the current one.
 
     Arguments and errors are those of :func:`recording_from_arrays` and :func:`~drivax.scenario.build.assemble`; cut
     longer recordings with :func:`drivax.scenario.recording.windows`.
@@ -173,9 +173,10 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_z: bool) -> Tracks:
     elif needs_z:
         raise UsageError('the roads have heights, agents["z"] is missing', cure="give z of the box centres")
     else:
-        default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])[:, None]
+        default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])
+        default[ego] = DEFAULT_EGO_SIZE[2]
         # The roads are at z = 0, so the centre of a box is at half its height.
-        z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default) / 2, valid)
+        z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default[:, None]) / 2, valid)
     heading = _zero_invalid(_array(agents, "heading", float, (count, steps)), valid)
     track_id = _array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count)
     return Tracks(xy, z, heading, velocity, size, valid, kind, track_id)
@@ -190,7 +191,7 @@ def _kinds(agents: Mapping[str, Any], count: int) -> Int8[np.ndarray, " agent"]:
 
 
 def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
-    """Box sizes of every step; zeros stand for the size of the class."""
+    """Box sizes of every step; zeros stand for default sizes."""
     if "size" not in agents:
         return np.zeros((count, steps, 3))
     if np.ndim(agents["size"]) == 3:
@@ -254,7 +255,7 @@ def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
 
 
 def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
-    """Check an index of a lane, or several, and return a tuple."""
+    """Check one or several indices of lanes, and return a tuple."""
     rows = [indices] if isinstance(indices, int | np.integer) else list(indices)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
@@ -264,11 +265,13 @@ def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
 
 def _light(light: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
     _check_keys(light, _LIGHT_KEYS, what)
-    (lane,) = _lane_indices(light.get("lane", -1), len(lanes), f'{what}["lane"]')
+    indices = _lane_indices(light.get("lane", -1), len(lanes), f'{what}["lane"]')
+    if len(indices) != 1:
+        raise UsageError(f'{what}["lane"] names {len(indices)} lanes', cure="give one light per lane")
     states = list(light.get("states", ()))
     if len(states) != steps:
         raise UsageError(f'{what}["states"] has {len(states)} entries, not {steps}', cure="give one per step")
     codes = [_member(state, _COLOURS, LightState, f'{what}["states"]') for state in states]
     stop = light.get("stop_point")
-    point = lanes[lane].points[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
-    return Light(lane, point, np.array(codes, np.int8))
+    point = lanes[indices[0]].points[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
+    return Light(indices[0], point, np.array(codes, np.int8))

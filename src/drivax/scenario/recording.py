@@ -22,7 +22,7 @@ LATE_S, GAP_STEPS = 0.02, 2.5
 DATASET_BYTES = 16
 #: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
 EXTENT_M, SPEED_MPS = 100_000.0, 100.0
-#: Steps between the starts of two windows.
+#: Default number of steps between the starts of two windows.
 STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
 #: Fields of tracks with a value per step, and the shape of that value.
@@ -92,14 +92,14 @@ class Recording:
     Attributes:
         ego: Row of ``tracks`` that is the ego vehicle.
         timestamps_s: Seconds, one per step.
-        current_step: Last step of the past (10 in WOMD).
+        current_step: Step after which the future begins (10 in WOMD).
         to_predict, of_interest: Rows of ``tracks``.
         route_lanes: Feature ids of the lanes of the intended route in order, if known.
         route_corridor: Feature ids of all lanes that the intended route may use, if only these are known (nuPlan's
             roadblocks).
         seen: Mask of the valid steps that the sensors of the ego would see; None for all of them.
         tags: Words of the source: ``place`` (city), ``source_format``, ``family`` of the built-in world, ...
-        lost: Numbers of items that the reader dropped, by name.
+        lost: Numbers of items that were dropped or interpolated, by name.
         flags: Facts that only the reader knows (default sizes, truncated map, ...).
         split_gap_m: Polylines are split where neighbouring points are further apart (clipped maps).
     """
@@ -126,7 +126,7 @@ class Recording:
 
 
 def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
-    """Cut a recording into windows of ``length`` steps that share its segment; step 10 of each is the current one.
+    """Cut a recording into windows of ``length`` steps that share its segment; step 10 (or the last) becomes current.
 
     Window ``k`` starts at step ``k * stride``; a rest that fills no window is dropped (110 steps make one window, 199
     make three). Windows without a valid ego at the current step are dropped, and counted in ``lost`` of the others as
@@ -251,13 +251,14 @@ def differentiate(
     No difference spans a gap; invalid steps and those without a valid neighbour get zero.
     """
     step = np.arange(len(timestamps_s))
-    behind = np.pad(valid[:, 1:] & valid[:, :-1], ((0, 0), (1, 0)))
-    ahead = np.pad(behind[:, 1:], ((0, 0), (0, 1)))
-    first, last = np.maximum(step - behind, 0), np.minimum(step + ahead, len(step) - 1)
+    has_previous = np.pad(valid[:, 1:] & valid[:, :-1], ((0, 0), (1, 0)))
+    has_next = np.pad(has_previous[:, 1:], ((0, 0), (0, 1)))
+    first, last = np.maximum(step - has_previous, 0), np.minimum(step + has_next, len(step) - 1)
     rows = np.arange(len(xy))[:, None]
     seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
     moved = xy[rows, last] - xy[rows, first]
-    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
+    is_known = (has_previous | has_next)[..., None]
+    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=is_known)
 
 
 def _window(
@@ -293,7 +294,7 @@ def _cut(recording: Recording, part: slice) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another vehicle as the ego: without route and ``seen``, its id with the track's.
+    """Return the recording with another vehicle as the ego, without route and ``seen``; its id ends with the track's.
 
     Raises:
         UsageError: The track is not a vehicle that is valid at the current step.

@@ -10,7 +10,7 @@ from drivax.scenario.schema import Scenario
 
 def lane_count(scenario: Scenario) -> int:
     """Number of lanes of the lane graph."""
-    return int((scenario.lane_id >= 0).sum())
+    return int((scenario.lane_length > 0).sum())
 
 
 def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:

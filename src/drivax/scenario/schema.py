@@ -105,7 +105,7 @@ class LightState(enum.IntEnum):
 
 
 class Flag(enum.IntFlag):
-    """Facts about a scenario that decide which metrics are defined and which uses are refused."""
+    """Facts about a scenario; some decide which metrics are defined and which uses are refused."""
 
     NONE = 0
     LIGHTS = 1
@@ -127,9 +127,9 @@ class Flag(enum.IntFlag):
 
 @dataclass(frozen=True)
 class Capacity:
-    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``.
+    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``, but not routes and egos.
 
-    ``egos`` counts the vehicles with a route and a goal, the recorded ego included.
+    ``egos`` is the largest number of vehicles with a route and a goal, the recorded ego included.
     """
 
     name: str = "default"
@@ -178,7 +178,7 @@ class Capacity:
         """
         if not 1 <= egos <= MOST_EGOS:
             raise UsageError(f"egos is {egos}", cure=f"use 1 to {MOST_EGOS}")
-        return replace(self, name=f"{self.name}-{egos}egos", egos=egos) if egos > 1 else self
+        return self if egos == self.egos else replace(self, name=f"{self.name}-{egos}egos", egos=egos)
 
 
 CAPACITIES = {
@@ -207,7 +207,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "agent_size": ("f4", (a, 3)), "agent_kind": ("i1", (a,)), "agent_id": ("i4", (a,)),
         "agent_flags": ("u1", (a,)),  # 1 ego, 2 to predict, 4 of interest
         "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart, beyond the last logged pose, along lanes
-        # Agents that stay where they are: one pose, and when they were seen.
+        # Agents that stay where they are: one pose, and the steps at which they are observed.
         "parked_xy": ("f4", (p, 2)), "parked_z": ("f4", (p,)), "parked_heading": ("f4", (p,)),
         "parked_size": ("f4", (p, 3)), "parked_kind": ("i1", (p,)), "parked_id": ("i4", (p,)),
         "parked_valid": ("?", (t, p)), "parked_seen": ("?", (t, p)),
@@ -247,7 +247,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
 
 
 def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return the fields of the egos after the recorded one: slot, last step, and route to the goal as for ego."""
+    """Return the fields of further egos: slot, last step, and route to the goal (as of the recorded ego)."""
     return {
         "ego_slot": ("i2", (egos,)), "ego_last_step": ("i2", (egos,)),
         "ego_on_lanes": ("?", (egos,)),  # otherwise the route is the logged path (privileged)
@@ -301,7 +301,7 @@ class SourceCounts:
     map_features: dict[str, int]
     map_points: int
     lights: int
-    #: Nonzero numbers of items that the reader or the assembly dropped, by name (``dangling_links``, ...).
+    #: Nonzero numbers of items that were dropped or interpolated, by name (``dangling_links``, ...).
     lost: dict[str, int] = field(default_factory=dict)
 
 

@@ -6,8 +6,8 @@ A set is a folder::
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     seal.json            SHA-256 of the manifest (``drivax.seal``)
-    splits/              lists for training, validation and test (``scenario.select.splits``)
-    scores.npz           criticality scores by which the scenarios were selected (``curation.subset``)
+    splits/              optional: lists for training, validation and test (``scenario.select.splits``)
+    scores.npz           optional: criticality scores by which they were selected (``curation.subset``)
 
 ``numpy.load(path, mmap_mode="r")`` reads a shard; a record lies at a fixed offset, so a scenario is one range read. A
 set appears under its name only when it is complete. This module needs no JAX.
@@ -96,7 +96,8 @@ class ScenarioWriter:
         further: Writes additional files into the complete folder before it is published.
 
     Raises:
-        UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
+        UsageError: ``path`` exists, another process writes it, a scenario has another capacity, or ``shard_size`` is
+            below 1.
         DataError: A scenario's id is in the set already, no scenario was added, or the disk is full.
     """
 
@@ -139,7 +140,7 @@ class ScenarioWriter:
         return self
 
     def _is_finished(self, part: Mapping[str, Any]) -> bool:
-        """Whether a closed shard is as it was written, and full: a last shard that is not is written again."""
+        """Whether a closed shard is as it was written, and full; a last one of fewer records is written again."""
         if not part["shard"]["count"] == len(part["scenarios"]) == self._shard_size:
             return False
         with contextlib.suppress(DataError):

@@ -1,11 +1,12 @@
 """Configuration records: frozen dataclasses to and from YAML, with command-line overrides.
 
-A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
-carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
-presets (a class method ``preset(name)``), the key ``preset`` names the preset to start from. A file may extend a preset
-(``extends: ppo``) or a file relative to it (``extends: base.yaml``): its settings are merged over those of the other.
-An unknown key or a value of the wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest
-valid name. A class variable ``renamed`` maps former keys to present ones.
+A configuration record holds scalars, strings, literals, paths, tuples, mappings, other records, unions of records,
+which carry a ``kind`` key in YAML (:func:`kind_of`), and objects of the user by ``package.module:name``. Missing keys
+keep the defaults of the enclosing record. In a record with presets (a class method ``preset(name)``), the key
+``preset`` names the preset to start from. A file may extend a preset (``extends: ppo``) or a file relative to it
+(``extends: base.yaml``): its settings are merged over those of the other. An unknown key or a value of the wrong type
+is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable ``renamed``
+maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, TypeVar
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
-from drivax.settings.structure import Flag, kind_of, parse_yaml, plain, structure, write_yaml
+from drivax.settings.structure import Flag, NameAlone, kind_of, parse_yaml, plain, structure, write_yaml
 
 __all__ = ["check_names", "dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
 
@@ -136,11 +137,20 @@ def _find_base(file: Path, name: Any) -> Path:
 
 def _merge(base: Any, values: Any) -> Any:
     """Return settings merged over others by key; a section that names another kind or preset replaces the other."""
-    if not isinstance(base, dict) or not isinstance(values, dict):
+    if not isinstance(values, dict):
         return values
+    base = _section(base)
     if any(name in values and values[name] != base.get(name) for name in ("kind", "preset")):
         return values
     return base | {name: _merge(base.get(name), value) for name, value in values.items()}
+
+
+def _section(value: Any) -> dict[str, Any]:
+    """Return a setting as a section: a mapping as it is, a name as that of its kind, others as an empty section."""
+    content = parse_yaml(value) if isinstance(value, Flag) else value
+    if isinstance(content, str):
+        return {NameAlone("kind"): type(value)(content)}
+    return content if isinstance(content, dict) else {}
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -149,9 +159,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
         *parents, key = path
         section = values
         for name in parents:
-            # A record that is missing, null or set by a flag starts from its defaults.
-            if not isinstance(section.get(name), dict):
-                section[name] = {}
+            section[name] = _section(section.get(name))
             section = section[name]
         if key == "kind" and str(section.get("kind")) != text:
             section.clear()  # Settings of the former kind do not apply.
@@ -179,7 +187,7 @@ def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_names(values: Any, trust: Collection[str], file: Path | None = None) -> None:
-    """Check the names in plain values of a file before one of them is used; those of flags are the user's.
+    """Check the dotted names in plain values of a file before one of them is imported; those in flags are trusted.
 
     Raises:
         UsageError: A name leads to a module that is not trusted, or to something that is no component.

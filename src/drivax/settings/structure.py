@@ -1,7 +1,7 @@
 """Conversion of YAML to plain values, of plain values to configuration records, and back.
 
 Errors name the line, or the dotted path of the wrong value. YAML follows the 1.2 core rules: ``3e-4`` is a number,
-``no`` a string, ``010`` ten; duplicate keys are errors.
+``no`` a string, ``010`` ten. Unlike there, ``0x10`` is a string and ``1_000`` a number; duplicate keys are errors.
 """
 
 from __future__ import annotations
@@ -47,6 +47,12 @@ class _Problem(ValueError):
 
 class Flag(str):
     """The text of a command-line value, parsed by the type of its setting."""
+
+    __slots__ = ()
+
+
+class NameAlone(str):
+    """The key ``kind`` of a section that was a name alone; plain mappings, which have no kind, ignore it."""
 
     __slots__ = ()
 
@@ -144,7 +150,8 @@ def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
     if not isinstance(items, Mapping):
         raise _refusal(value, "a mapping")
     item_type = get_args(cls)[1]
-    return {name: _to_item(item, item_type, str(name)) for name, item in items.items()}
+    own_items = {name: item for name, item in items.items() if not isinstance(name, NameAlone)}
+    return {name: _to_item(item, item_type, str(name)) for name, item in own_items.items()}
 
 
 def _to_item(value: Any, cls: Any, place: str) -> Any:
@@ -393,7 +400,7 @@ def parse_yaml(text: str, file: Path | None = None) -> Any:
     """Return the plain values of a YAML text.
 
     Raises:
-        UsageError: Invalid YAML, a duplicate key, or too large a value, with its line.
+        UsageError: Invalid YAML, a duplicate key, or too large a value or text, with its line if known.
     """
     try:
         if len(text) > _MOST_CHARACTERS:

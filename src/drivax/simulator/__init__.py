@@ -1,7 +1,8 @@
 """Reset and step as pure functions of a bank, a state and an action.
 
 ``dynamics`` contains the kinematic bicycle, ``controller`` nuPlan's LQR tracker, ``contact`` collisions, their fault
-and time to collision, ``ahead`` the leader, stop lines and speed ahead on a route, and pure pursuit.
+and time to collision, ``ahead`` the leader, stop lines and speed ahead on a route, and pure pursuit; ``idm`` the
+Intelligent Driver Model (IDM), ``traffic.reactive`` IDM traffic.
 """
 
 import lazy_loader

@@ -41,7 +41,7 @@ class Ahead:
     # Gap to the nearest obstacle, bumper to bumper, m; 10 km if free. A stop line counts as a standing car at the
     # distance that makes the driver stop 1 m before the line
     gap: Scalar
-    leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light
+    leader: Scalar  # Speed of the obstacle along the route, m/s; 0 for a light, arbitrary if free
     desired: Scalar  # Speed limit (13.4 if unknown), less before curves; 0 at the route's end, m/s
 
     def acceleration(self, speed: Scalar, parameters: IdmParameters) -> Scalar:
@@ -50,7 +50,7 @@ class Ahead:
 
 
 def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
-    """Look 90 m ahead of the driven agent along its route.
+    """Look 90 m ahead of the driven agent along its route, for stop lines 92 m ahead of its front bumper.
 
     ``min_gap_m`` is the gap that the driver keeps behind a standing leader.
     """
@@ -102,7 +102,10 @@ def _leader(
 
 
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
-    """Return the distance from the front bumper to the nearest stop line that requires a stop, m; infinite for none."""
+    """Return the distance from the front bumper to the nearest stop line that requires a stop, m.
+
+    Infinite for none within 92 m.
+    """
     line, state = bank.light_line[context.index], frame.lights
     arc = line[LightRow.ARC + bank.ego_number(context.row)]
     distance = arc - context.route_m - frame.box[context.slot, LENGTH] / 2
@@ -162,9 +165,10 @@ def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) ->
 
 
 def offset_to_steer(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
-    """Return the offset for which :func:`follow_route` returns a curvature, m; the closest offset if none does.
+    """Return the offset for which :func:`follow_route` returns a curvature, m.
 
-    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``.
+    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``. If it does
+    not, or if the car heads across the route, the result is finite but no such offset.
     """
     point, left = _pursuit_point(bank, context)
     linear = 2.0 * (curvature * jnp.sum(point * left) - left[1])

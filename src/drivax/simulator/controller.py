@@ -28,7 +28,7 @@ Actuators = Float[Array, " 3"]
 ACCELERATION, STEERING, RATE = range(3)
 #: Regularisation of the first curvature, which a plan without motion does not determine.
 _FIRST_CURVATURE = 1e-10
-#: Steps over which initial acceleration and steering are measured; shorter distances over them are standstill, m.
+#: Steps over which initial acceleration and steering are measured; distance below which they are a standstill, m.
 _RECENT, _STILL_M = 5, 0.5
 
 
@@ -41,8 +41,8 @@ class TrackingConfig:
         speed_weight, acceleration_weight: Costs of squared speed error and acceleration.
         lateral_weight, heading_weight, steering_weight, rate_weight: Costs of squared lateral error (m),
             heading error (rad), steering angle (rad) and steering rate (rad/s).
-        stopping_mps, stopping_gain: Where actual and desired speed are below this speed, the acceleration is the speed
-            error times this gain, 1/s.
+        stopping_mps, stopping_gain: Where neither actual nor desired speed exceeds this speed, the acceleration is the
+            speed error times this gain, 1/s.
         acceleration_lag_s, steering_lag_s: Time constants of the actuators.
         most_steering: Largest steering angle, rad.
         wheelbase: Relative to the length (nuPlan's vehicle: 3.089 m of 5.176 m).
@@ -121,8 +121,8 @@ def fit_curvatures(poses: Poses, speeds: Float[Array, " m"], config: TrackingCon
     """Curvatures k of the steps between poses: the least squares of ``dt v k - turn`` plus a penalty on their rate.
 
     The solution is ``k = c (1 - g) + u``: u are the later curvatures for a first curvature of 0, ``1 - g`` their
-    derivative by the first one (two tridiagonal systems), and c is the first one. This elimination is exact at any
-    speed in single precision.
+    derivative by the first one (two tridiagonal systems), and c is the first one. This elimination is accurate in
+    single precision at any speed.
     """
     turn, distance = wrap(jnp.diff(poses[:, 2])), speeds * DT_S
     weight = config.curvature_rate_penalty / DT_S**2

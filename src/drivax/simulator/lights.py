@@ -57,8 +57,8 @@ def check_lights(
 ) -> tuple[Bool[Array, ""], LightMemory]:  # fmt: skip
     """Return whether a red-light violation is established at this step, and the new memory.
 
-    On the route only its own lights count, immediately. Off the route only one of the lines that are crossed together
-    counts: that whose lane ends closest to the agent's heading two seconds later, or at the end of the log.
+    On the route only lights of the route count, immediately. Off the route a crossing is decided two seconds later, or
+    at the end of the log; of lines decided together only that whose lane ends closest to the agent's heading counts.
     """
     front_before, front = _fronts(context, ego[LENGTH])[-2:]
     crossed, distance_m = light_crossing(bank, context.index, front_before, front, ground)

@@ -32,7 +32,7 @@ from drivax.simulator.types import (
     Transition,
 )
 
-#: Elements that :func:`map_where` computes at a time: few steps start more episodes, and 8 floats fill a vector.
+#: Elements that :func:`map_where` computes at a time: more episodes rarely start in a step; 8 floats fill a vector.
 AT_ONCE = 8
 #: The next state, and the transition to it.
 Step = tuple[SimState, Transition]
@@ -106,7 +106,7 @@ class Simulator:
         return frame_of(bank, context.index, context.step, agents, driven, back, slots)
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
-        """Return the present frame of a single driven agent."""
+        """Return the present frame with a single driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
     def step(self, bank: ScenarioBank, state: SimState, action: Action) -> Step:
@@ -135,8 +135,9 @@ class Simulator:
         """Drive K agents of one scenario; they see each other, and traffic sees them.
 
         Slots beyond the moving agents are padding: never rewarded or terminated, with undefined facts. ``done`` is the
-        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. Once all are done, all
-        begin the episodes ``starts`` (stacked :meth:`new_episode` of K agents); see :meth:`step_or_reset`.
+        ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. Once it is true for
+        all, padding included, all begin the episodes ``starts``, if given (stacked :meth:`new_episode` of K agents);
+        see :meth:`step_or_reset`.
         """
         done = jnp.zeros(actions.shape[0], bool) if done is None else done
         first = _first(states.context)

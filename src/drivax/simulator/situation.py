@@ -125,7 +125,7 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     ego, ground = frame.box[context.slot], _ground(bank, context, frame)
     is_ego, pose = context.slot == bank.ego_slot(context.row), (ego[:2], ego[2:4], corners(ego))
     lanes = queries.around_lanes(bank, context.index, *pose, ground, is_ego, context.row)
-    # A step may be longer along the route, on the outside of a bend.
+    # On the inside of a bend a step is longer along the route.
     ahead_m = 1.5 * _step_length(context) + 2.0
     route = queries.project_on_route(bank, context.row, ego[:2], context.route_m, ahead_m)
     return Surroundings(frame, lanes, route)

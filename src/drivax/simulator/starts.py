@@ -72,7 +72,7 @@ class NoisyStart:
     start.
 
     Attributes:
-        steps: Perturbed steps; fewer where the log starts later.
+        steps: Perturbed steps; fewer where the log has the agent for fewer steps before the start.
         strong: Share of strong draws.
         scale: Factor on accelerations and curvatures.
         tries: Draws per start.

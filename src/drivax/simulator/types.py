@@ -1,4 +1,4 @@
-"""Records of the simulator (decision 0002). Unbatched; ``vmap`` adds the batch."""
+"""Records and protocols of the simulator (decision 0002), unbatched; ``vmap`` adds the batch."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class AgentContext:
         slot: Slot of the driven agent (0: ego).
         history: x, y, heading, speed of the driven agent over the last 23 steps; the last row is the present step.
         action: Last executed action, within bounds and actuator rates; D components (2 by default).
-        route_m: Arc length along the route to the goal, m; never decreases.
+        route_m: Arc length of the agent along its route, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple for log replay.
         route: Row of the agent's route in the bank (:meth:`ScenarioBank.row_of`); None in banks with one ego per
@@ -88,14 +88,15 @@ class Frame:
 class Facts:
     """Scalar measurements of an agent at one step, kept in the state. Names carry units; the semantics define them.
 
-    Facts outside ``Task.reads`` are None and not computed. ``ttc_defined`` is false at standstill; ``limit_mps`` is -1
-    if unknown; ``routed``: the agent has a route on lanes, without which progress and ``off_route`` are undefined;
-    ``logged``: the log has the agent at this step; ``ignored`` counts ignored overlaps.
+    Facts outside ``Task.reads`` are None and not computed, except that ``lane_changed`` and ``merged`` need ``strand``.
+    ``ttc_defined`` is false at standstill; ``limit_mps`` is -1 if unknown; ``routed``: the agent has a route on lanes,
+    without which progress and ``off_route`` are undefined; ``logged``: the log has the agent at this step; ``ignored``
+    counts ignored overlaps.
 
     Measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m`` behind the log
     along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and ``early_m`` ahead
-    of where the log is a second later (both negative in between); ``completed``: share of the log's path from the
-    current step to its end, in [0, 1], 1 if that path is shorter than 0.5 m; ``time_gap_s`` to the nearest obstacle
+    of where the log is a second later (both negative in between); ``completed``: share of the log's path from
+    ``CURRENT_STEP`` to its end, in [0, 1], 1 if that path is shorter than 0.5 m; ``time_gap_s`` to the nearest obstacle
     ahead on the route (bumper to bumper, over the agent's speed), at most 10 s; ``strand`` of the agent's lane
     (``scenario.bank.queries.lane_passage``); ``lane_changed`` and ``merged``, at this step.
     """
@@ -302,5 +303,8 @@ class Task(Protocol):
     def episode_add(
         self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Any:
-        """Return the accumulators after a step to ``situation``, in an episode that started at step ``start``."""
+        """Return the accumulators after a step to ``situation``; the episode started at step ``start``.
+
+        ``final`` marks the last step of the episode.
+        """
         ...

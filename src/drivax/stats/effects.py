@@ -101,7 +101,7 @@ def scenarios_needed(
     It counts pairs, or the scenarios of both arms, up to about 1e12. Clustered scenarios need ``deff`` times as many.
     Arguments are those of :func:`power`.
     """
-    if effect == 0 or not 0 < target < 1:
+    if not abs(effect) > 0 or not 0 < target < 1:
         problem = f"no number of scenarios detects an effect of {effect} with power {target}"
         raise UsageError(problem, cure="give an effect, and a power between 0 and 1")
     low, high = 1, 2

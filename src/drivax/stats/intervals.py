@@ -66,7 +66,7 @@ def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> 
     """Return the score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
 
     ``centre = (p + z^2 / 2n) / (1 + z^2 / n)``, ``margin = z / (1 + z^2 / n) * sqrt(p (1 - p) / n + z^2 / 4n^2)``;
-    always within [0, 1]. The number of trials ``n`` may be fractional (an effective sample size).
+    always within [0, 1]. The number of trials ``n`` may be fractional (an effective sample size); the result rounds it.
     """
     z = normal_quantile(confidence)
     if not 0 <= successes <= n:

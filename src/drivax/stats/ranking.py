@@ -42,7 +42,7 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Return the precision among the ``k`` highest scores, where ``k`` is the number of positives.
+    """Return the precision among the ``k`` highest scores, where ``k`` is the number (or weight) of positives.
 
     Ties at the threshold count in proportion. A perfect ranking has 1, a random one the base rate.
     """
@@ -55,8 +55,8 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
     """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Clusters with and without positives are drawn separately, which keeps the base rate (Davison and Hinkley, Bootstrap
-    Methods, 1997, section 3.8).
+    Clusters with and without positives are drawn separately, so each resample has as many of either (Davison and
+    Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)

@@ -102,11 +102,11 @@ class CrossedEffect:
         return self._probability(abs(difference) / self.error - self._quantile((1.0 + confidence) / 2.0))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of seeds per policy, above the present one, that detects this difference."""
+        """Return the smallest number of seeds per policy above the present one that detects this difference, if any."""
         return self._smallest_number(self._with_seeds, max(self.seed_counts), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of clusters, above the present one, that detects this difference."""
+        """Return the smallest number of clusters above the present one that detects this difference, if any."""
         return self._smallest_number(self._with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
@@ -256,7 +256,7 @@ def difference_interval(
 def log_ratio(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
-    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means are positive."""
+    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means exist and are positive."""
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None

@@ -38,8 +38,8 @@ class SignificanceResult:
         name: Name of the test.
         p: Two-sided p-value; None if no value is defined, an arm is empty, or the bootstrap has only one cluster.
         units: Number of units: discordant pairs (McNemar), clusters with a difference (permutation of pairs), or
-            clusters (others).
-        exact: Whether the p-value is exact (closed form, or all permutations) rather than sampled.
+            clusters (others; 0 if all their differences are 0); 0 without a p-value.
+        exact: Whether the p-value is exact (binomial, or all permutations), not sampled or by a t distribution.
     """
 
     name: str
@@ -59,11 +59,11 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
     for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
             raise UsageError("McNemar's test takes only 0 and 1", cure="use paired_permutation")
-    pairs = paired_differences(a, b)
+    difference = paired_differences(a, b)
     name = "McNemar mid-p" if mid else "McNemar exact"
-    if np.isnan(pairs).all():
+    if np.isnan(difference).all():
         return SignificanceResult(name, None, 0, exact=True)
-    positive, negative = int((pairs > 0).sum()), int((pairs < 0).sum())
+    positive, negative = int((difference > 0).sum()), int((difference < 0).sum())
     n, k = positive + negative, min(positive, negative)
     cdf = float(special.bdtr(k, n, 0.5)) if n else 1.0
     pmf = cdf - float(special.bdtr(k - 1, n, 0.5)) if k else cdf

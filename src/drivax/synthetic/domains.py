@@ -18,9 +18,9 @@ class Domain:
     Attributes:
         name: Tag of every scenario.
         shares: Relative frequency of each road family; families without one do not occur.
-        pedestrians: Pedestrians per 100 m of sidewalk, low and high, drawn per scenario.
+        pedestrians: Pedestrians per 100 m of sidewalk and per two crossings, low and high, drawn per scenario.
         parked_share: Share of occupied bays, low and high, drawn per scenario.
-        double_share: Probability of a double-parked car where a bay has room for one next to it.
+        double_share: Share of scenarios with a double-parked car, of those with a bay that has room for one next to it.
     """
 
     name: str

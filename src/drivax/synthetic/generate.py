@@ -3,8 +3,8 @@
 With workers, the bytes of a set depend only on its options, seed and number of scenarios: not on the number of workers
 or the processor. This module does not import JAX, so that workers start quickly; an audit that needs it is an argument.
 
-A map is drawn from (seed, number of the map), so sets of different seeds share no map. The seeds of the benchmark's
-splits are refused to users: training on its maps by accident is impossible.
+A map is drawn from (seed, number of the map), so sets of different seeds share no map. :func:`generate` refuses the
+seeds of the benchmark's splits, so no other set has their maps.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from drivax.scenario.store import ScenarioWriter, check_set_space
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_many
 from drivax.tracking.workers import worker_pool
 
-#: CPU features beyond the baseline that NumPy can use, and the variable that disables them.
+#: NumPy's module with the table of CPU features, and the environment variable that disables features.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
-#: Scenarios per audited batch, and of the first one.
+#: Scenarios per audited batch; in the first one, in the first task of a worker and at least in each other task.
 _BATCH, _FIRST = 64, 4
-#: Most scenarios per task of a worker, and least tasks per worker.
+#: Largest number of scenarios per task, and number of tasks per worker that smaller sets are divided into.
 _CHUNK, _TASKS = 16, 4
-#: Finished tasks per worker, and audited batches, that may wait.
+#: Submitted tasks per worker, and batches in the audit, whose results may be outstanding.
 _AHEAD, _AHEAD_BATCHES = 3, 2
 _EVENT = "event"
 #: First seed of the benchmark's splits.
@@ -46,7 +46,7 @@ RESERVED_SEED = 1_000_000_000
 #: Raised when a split changes while the world's version stays.
 BENCHMARK_VERSION = 3
 
-#: Called with (scenarios done, scenarios).
+#: Called with (finished scenarios, all scenarios).
 Progress = Callable[[int, int], None]
 #: Returns the audit of scenarios: one dictionary each.
 Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
@@ -55,7 +55,7 @@ Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 @contextmanager
 def portable_workers() -> Iterator[None]:
     """Context in which started worker processes compute the same bits on any x86-64 processor."""
-    # Features disabled in this process are missing from the table, but workers would use them.
+    # The table shows features that this process disables as missing, but the variable is replaced, so add them.
     disabled = os.environ.get(_FEATURES, "").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
     settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
@@ -104,9 +104,9 @@ class Generation:
             raise UsageError(
                 f"unknown capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
-        if self.future_s < 8.0:
+        if not 8.0 <= self.future_s <= 60.0:
             raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
-        _ = self.sizes  # refuses other lengths and numbers of egos
+        _ = self.sizes  # refuses wrong numbers of egos
         self.world.check()
 
     @property
@@ -133,7 +133,7 @@ class FamilyCount:
 
     @property
     def rejection_rate(self) -> float:
-        """Share of rejected draws among those with no event or a suitable one."""
+        """Share of rejected draws among all but the unsuited ones; 0 without draws."""
         rejected = sum(self.rejected.values())
         return rejected / max(rejected + self.kept, 1)
 
@@ -200,7 +200,8 @@ def generate(
         audit: Called in a thread of this process with batches of scenarios; its results are stored with them.
 
     Raises:
-        UsageError: Wrong options, or ``out`` exists.
+        UsageError: Wrong options, ``out`` exists and is not to be overwritten, or a scenario has no clean expert.
+        DataError: The disk has too little space.
     """
     options = options or Generation()
     options.check()
@@ -274,22 +275,22 @@ def _pairs(
     return zip(batch, findings.result(), strict=True)
 
 
-def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> Iterator[_Draw]:
-    """Draw scenarios ``first`` to ``last - 1``."""
+def _draw_chunk(first: int, end: int, seed: int, options: Generation) -> Iterator[_Draw]:
+    """Draw scenarios ``first`` to ``end - 1``."""
     capacity = options.sizes
-    for draw in generate_many(seed, range(first, last), options.world, capacity.steps):
+    for draw in generate_many(seed, range(first, end), options.world, capacity.steps):
         yield _Draw(assemble(draw.recording, capacity), draw.family, draw.rejected)
 
 
-def _draw_in_worker(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
-    """:func:`_draw_chunk`; the garbage collector ignores what was imported, which saves time."""
+def _draw_in_worker(first: int, end: int, seed: int, options: Generation) -> list[_Draw]:
+    """:func:`_draw_chunk`; the garbage collector ignores imported objects, which saves time."""
     if not gc.get_freeze_count():
         gc.freeze()
-    return list(_draw_chunk(first, last, seed, options))
+    return list(_draw_chunk(first, end, seed, options))
 
 
 def _spans(scenarios: int, workers: int) -> list[tuple[int, int]]:
-    """First and last scenario of each task; the first task is short, so that the audit begins early."""
+    """First scenario of each task and of the next one; the first task is short, so that the audit begins early."""
     size = min(max(scenarios // (_TASKS * workers), _FIRST), _CHUNK)
     return list(pairwise([0, *range(_FIRST, scenarios, size), scenarios]))
 
@@ -302,9 +303,9 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
     spans = _spans(scenarios, options.workers)
     waiting: deque[Future[list[_Draw]]] = deque()
     with worker_pool(min(options.workers, len(spans))) as pool:
-        for first, last in spans:
-            with portable_workers():  # processes are started as they are needed
-                waiting.append(pool.submit(_draw_in_worker, first, last, seed, options))
+        for first, end in spans:
+            with portable_workers():  # the pool starts processes when a task is submitted
+                waiting.append(pool.submit(_draw_in_worker, first, end, seed, options))
             if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:
@@ -358,7 +359,8 @@ def generate_benchmark(
         audit: See :func:`generate`.
 
     Raises:
-        UsageError: Wrong options, or one of the sets exists.
+        UsageError: Wrong options, or one of the sets exists and is not to be overwritten.
+        DataError: The disk has too little space.
     """
     options = options or Generation()
     options.check()
@@ -369,6 +371,9 @@ def generate_benchmark(
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))
+    for name in SPLITS:
+        # Refuses an existing set.
+        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:

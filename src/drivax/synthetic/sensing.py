@@ -18,7 +18,7 @@ from drivax.scenario.schema import AgentKind
 
 #: Speed below which noise decreases, m/s, and its share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
-#: Clip of errors in standard deviations: noise must not make users overlap.
+#: Clip of errors in standard deviations: noise must not make a user overlap ego.
 _MAX_SIGMA = 3.0
 #: Lines of sight per batch.
 _BATCH_SIZE = 512
@@ -51,9 +51,9 @@ class SensorConfig:
 class NoiseConfig:
     """Errors of recorded poses and speeds of the others: standard deviations, and correlations over one step.
 
-    The defaults are the level of vehicle tracks in WOMD recordings, measured by
-    ``experiments/world/perception_noise.py``; Argoverse 2 is smoother. Speeds are noisier than positions, because
-    trackers differentiate.
+    Deviations hold from 2 m/s on; slower users have smaller errors. The defaults are the level of vehicle tracks in
+    WOMD recordings, measured by ``experiments/world/perception_noise.py``. WOMD's speeds are noisy, because trackers
+    differentiate positions.
 
     Attributes:
         level: Factor on all standard deviations; 0 switches noise off.
@@ -131,7 +131,7 @@ def visible(
 
 
 def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> tuple[_Pairs, _Pairs]:
-    """Return pairs of a line of sight and a user whose circumscribed circle it intersects."""
+    """Return pairs of an index into ``target`` and a user whose circumscribed circle may cut a ray to the target."""
     offset = box[..., :2] - box[:1, :, :2]
     x, y = (np.ascontiguousarray(offset[..., k]) for k in (0, 1))
     ray_x, ray_y = x[target, step], y[target, step]
@@ -147,19 +147,19 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
     # Batches keep the tables in the processor's cache.
     for first in range(0, len(target), _BATCH_SIZE):
         batch = slice(first, first + _BATCH_SIZE)
-        position, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
-        to_x, to_y = x[near_rows].take(position, axis=1), y[near_rows].take(position, axis=1)
-        ahead = to_x * ax + to_y * ay
-        to_y *= ax
-        to_x *= ay
-        to_y -= to_x
-        reach = radius[near_rows, None] + radius[to]
-        meets = blocking[near_rows].take(position, axis=1) & (np.abs(to_y, out=to_y) < reach)
-        meets &= ahead > -radius[near_rows, None]
+        steps, targets, cos, sin = step[batch], target[batch], ray_x[batch], ray_y[batch]
+        dx, lateral = x[near_rows].take(steps, axis=1), y[near_rows].take(steps, axis=1)
+        ahead = dx * cos + lateral * sin
+        lateral *= cos
+        dx *= sin
+        lateral -= dx
+        reach = radius[near_rows, None] + radius[targets]
+        may_cut = blocking[near_rows].take(steps, axis=1) & (np.abs(lateral, out=lateral) < reach)
+        may_cut &= ahead > -radius[near_rows, None]
         reach += length[batch]
-        meets &= ahead < reach
-        meets &= near_rows[:, None] != to
-        occluder, ray = np.nonzero(meets)
+        may_cut &= ahead < reach
+        may_cut &= near_rows[:, None] != targets
+        occluder, ray = np.nonzero(may_cut)
         pairs.append((ray + first, near_rows[occluder]))
     ray, occluder = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return ray, occluder
@@ -188,8 +188,8 @@ def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> flo
 def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
     """Add perception noise to tracks, ego's excepted.
 
-    Errors are zero-mean AR(1) processes, clipped at three standard deviations. Standing users keep speed 0 and jitter
-    by a few millimetres. Sizes are exact.
+    Errors are zero-mean AR(1) processes, clipped at three standard deviations. Below 2 m/s they shrink linearly, to a
+    quarter at standstill; standing users keep speed 0. Sizes are exact.
     """
     cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
     speed = tracks.velocity[..., 0] * cos + tracks.velocity[..., 1] * sin

@@ -48,19 +48,19 @@ WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
-#: Candidate first steps of a critical recording: earliest, latest delay, stride.
+#: Candidate first steps of a critical recording: earliest, largest delay after the warm-up, stride.
 _EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
-#: Steps before an event from which ego may react to it.
+#: Steps before an event from which the first plan of ego reacts to it (:func:`expert.driver.drive_ego`).
 _LEAD_STEPS = 8
-#: Distance from ego's log within which lights are recorded, m: slightly less than the range of a scenario's map.
+#: Lights are recorded up to this distance from the bounding rectangle of ego's log, m.
 _LIGHTS_M = 95.0
-#: Largest number of draws of a scenario, on one map, and with one kind of event.
+#: Largest number of draws of a scenario (and of roads for an event), on one map, and with one kind of event.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
-#: Causes of rejection other than violations: the requested event cannot happen, or has no effect.
+#: Causes of rejection other than violations: the event cannot happen, or does not endanger ego.
 UNSUITED = _NO_OCCASION, _NO_THREAT = "no_occasion", "no_threat"
 #: Largest number of stagings with the same roles.
 _STAGINGS = 3
-#: Largest number of recorded users without ego, those nearest to it.
+#: Largest number of recorded users without ego: the actors of its event and those nearest to it.
 _RECORDED = 76
 
 
@@ -71,11 +71,13 @@ class WorldConfig:
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
-        critical_share: Share of the others in which ego must give way, if the roads allow it; the recording begins when
-            another user approaches.
-        lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
-        signal_timing: Shares of what the light does for ego: green on arrival, turning green, turning red.
-        scenarios_per_map: Number of consecutive scenarios on the same roads; they share a segment.
+        critical_share: Share of the others in which ego must give way, if the roads allow it; the recording begins at a
+            critical step (:mod:`events.conflict_start`), if there is one.
+        lane_change_share: Share of random routes with room for it on which ego plans a lane change; routes past a place
+            of an event or a conflict have none.
+        signal_timing: Shares of ego's next light at the end of the warm-up: green, turning green, turning yellow.
+        scenarios_per_map: Number of consecutive scenarios without an event that share roads and a segment; new roads
+            are drawn after 12 rejected draws.
         noise: Perception noise of the others' tracks.
         sensor: Ego's sensor.
     """
@@ -109,8 +111,8 @@ class WorldConfig:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
         if largest_shift_m(self.noise, *LARGEST_VEHICLE_M) > EGO_SKIN_M:
             raise UsageError(
-                f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
-                cure="use a smaller one",
+                f"noise (noise.level {self.noise.level}) could exceed the margin of {EGO_SKIN_M} m around ego",
+                cure="use a smaller level or smaller deviations",
             )
         return DOMAINS[self.domain]
 
@@ -128,7 +130,7 @@ class GeneratedRecording:
 def generate_recording(
     seed: int, index: int, config: WorldConfig | None = None, steps: int = STEPS
 ) -> Recording:
-    """Generate the recording of a seed and an index, neither of them negative."""
+    """Generate the recording of a seed and an index, neither of them negative; see :func:`generate_many`."""
     return generate_one(seed, index, config or WorldConfig(), steps).recording
 
 
@@ -140,11 +142,11 @@ def generate_one(seed: int, index: int, config: WorldConfig, steps: int = STEPS)
 def generate_many(
     seed: int, indices: Iterable[int], config: WorldConfig, steps: int = STEPS
 ) -> Iterator[GeneratedRecording]:
-    """Generate recordings of at least 91 steps with their families and rejected attempts.
+    """Generate recordings of ``steps`` steps, at least 91, with their families and rejected attempts.
 
     Their traffic is simulated together, which is faster and changes no recording. The kind of event is drawn first and
-    replaced only after 60 attempts, so kinds that fail more often are hardly rarer. A rare scenario has its own roads,
-    new ones for each attempt, on which its event can happen.
+    replaced only after 60 attempts, so kinds that fail more often are hardly rarer. A scenario with an event has its
+    own roads, new ones for each attempt, on which the event can happen.
 
     Raises:
         UsageError: A setting is wrong, seed or index are negative, no roads suit the event, or no draw gives a clean
@@ -167,8 +169,9 @@ def _generate(
         map_number = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
         family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *map_number))
         rng = np.random.default_rng([seed, 2, index, attempt])
-        places = destinations_for(event, network, attempt > 0) if event else ()
-        result = yield from _attempt(_Draw(network, places, event, severity, steps), domain, config, rng)
+        destinations = destinations_for(event, network, attempt > 0) if event else ()
+        draw = _Draw(network, destinations, event, severity, steps)
+        result = yield from _attempt(draw, domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
@@ -212,7 +215,7 @@ def _draw_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Roa
 
 @dataclass(frozen=True)
 class _Draw:
-    """Arguments of an attempt: roads, candidate destinations of ego, the event (or none) and its severity."""
+    """Arguments of an attempt: roads, candidate destinations of ego, event (or none), severity, number of steps."""
 
     network: RoadNetwork
     destinations: tuple[Destination, ...]
@@ -227,16 +230,8 @@ def _attempt(
     """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + draw.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
-    roles = assign_roles(
-        draw.network,
-        domain,
-        times,
-        config.lane_change_share,
-        config.signal_timing,
-        rng,
-        draw.destinations,
-        critical,
-    )
+    shares = config.lane_change_share, config.signal_timing
+    roles = assign_roles(draw.network, domain, times, *shares, rng, draw.destinations, critical)
     traffic = Traffic(roles, times)
     if draw.event:
         result = yield from _stage_event(draw, traffic, rng)
@@ -287,7 +282,7 @@ def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Ge
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
-    """Draw the first step of a recording in which ego must give way, if there is one."""
+    """Draw one of the candidate first steps that are critical (:func:`critical_steps`), if there is one."""
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):
         return None
@@ -327,7 +322,7 @@ def _to_recording(
 
 
 def _lights(network: RoadNetwork, motion: Motion, times_s: Float64[np.ndarray, " time"]) -> tuple[Light, ...]:
-    """Return the lights near ego's trajectory."""
+    """Return the lights near the bounding rectangle of ego's trajectory."""
     if network.signals is None:
         return ()
     colour, _ = network.signals.colours(times_s, len(network.lanes))

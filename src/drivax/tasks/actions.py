@@ -39,8 +39,8 @@ class Physical:
     """Acceleration and curvature of the bicycle.
 
     Attributes:
-        braking_mps2, acceleration_mps2: Accelerations at -1 and +1 of the first action.
-        steering: Curvature at 1 of the second action, 1/m.
+        braking_mps2, acceleration_mps2: Braking at -1 and acceleration at +1 of the first component.
+        steering: Curvature at 1 of the second component, 1/m.
         jerk_mps3: Largest change of the acceleration per second; unlimited by default.
         steering_rate: Largest change of the curvature per second, 1/m/s; unlimited by default.
     """
@@ -127,8 +127,8 @@ class Published(Physical):
     """Acceleration and steering angle, as published: k = tan(angle) / (0.6 length).
 
     Attributes:
-        braking_mps2, acceleration_mps2: Accelerations at -1 and +1 of the first action.
-        steering: Steering angle at 1 of the second action, rad.
+        braking_mps2, acceleration_mps2: Braking at -1 and acceleration at +1 of the first component.
+        steering: Steering angle at 1 of the second component, rad.
         jerk_mps3: Largest change of the acceleration per second; unlimited by default.
         steering_rate: Largest change of the steering angle per second, rad/s; unlimited by default.
     """
@@ -150,7 +150,7 @@ class Discrete(Physical):
     Level i of n, counted from the middle, is ``sign(i) (|i| / ((n - 1) / 2)) ** density`` of the bound.
 
     Attributes:
-        accelerations, curvatures: Number of levels of each action; odd, to include zero.
+        accelerations, curvatures: Number of levels of each component; odd, to include zero.
         density: Exponent of the levels: 1 spaces them evenly, more makes them denser near zero.
     """
 
@@ -172,7 +172,7 @@ class Discrete(Physical):
         return self.accelerations * self.curvatures
 
     def levels(self) -> tuple[Float[Array, " A"], Float[Array, " C"]]:
-        """Return the levels of both actions in [-1, 1], ascending."""
+        """Return the levels of both components in [-1, 1], ascending."""
         return _levels(self.accelerations, self.density), _levels(self.curvatures, self.density)
 
     def of_index(self, index: Integer) -> Vector:
@@ -199,7 +199,7 @@ class Route(Physical):
     lanes the offset is from the line straight ahead. The executed action is one of :class:`Physical`.
 
     Attributes:
-        offset_m: Offset at 1 of the second action, to the left, m.
+        offset_m: Offset at 1 of the second component, to the left, m.
     """
 
     offset_m: float = 3.5
@@ -227,7 +227,7 @@ class DeltaLocal:
     """Displacement in the agent's frame: ahead (never backwards), left, turn; without grip limit.
 
     Attributes:
-        ahead_m, left_m: Displacements at 1 of the first two actions.
+        ahead_m, left_m: Displacements at 1 of the first two components.
         turn_rad: Turn at 1 of the third.
     """
 
@@ -267,7 +267,7 @@ class DeltaLocal:
         return displace(motion, shift, action[2] * self.turn_rad)
 
     def sharpest(self, length_m: Any) -> Any:
-        """Return the largest curvature: unlimited, 1/m."""
+        """Return infinity: the curvature is unlimited."""
         return jnp.inf
 
     def first(self, history: History, length_m: Any) -> Float[Array, " 3"]:
@@ -308,7 +308,7 @@ class DirectState:
         return self.actuate(motion, action, action, length_m)
 
     def sharpest(self, length_m: Any) -> Any:
-        """Return the largest curvature: unlimited, 1/m."""
+        """Return infinity: the curvature is unlimited."""
         return jnp.inf
 
     def first(self, history: History, length_m: Any) -> Motion:

@@ -25,7 +25,8 @@ _OPTIONS = {name: bound for name, bound in OPTIONS.items() if name != "collision
 class Condition:
     """A factor of a reward term's weight, or an option of the reward, drawn for each agent and episode of training.
 
-    Draws are uniform. Evaluation, validation, logged steps and the Gymnasium adapter use ``value``.
+    Draws are uniform. Evaluation, validation, logged steps, policy-driven traffic and the Gymnasium adapter use
+    ``value``.
 
     Attributes:
         name: A term of the reward, built-in or the user's; or an option: ``desired_speed``, ``time_gap_s``, ``ttc_s``
@@ -55,10 +56,10 @@ Conditions = tuple[Condition, ...]
 
 
 def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
-    """Check that each condition has an effect on the reward and occurs once.
+    """Check the conditions.
 
     Raises:
-        UsageError: A condition has no effect, is beyond the bound of its option, or occurs twice.
+        UsageError: A condition has no effect on the reward, is beyond the bound of its option, or occurs twice.
     """
     weights, names = rewards.weights(), [condition.name for condition in conditions]
     active = [term.option for name, term in TERMS.items() if name in weights]

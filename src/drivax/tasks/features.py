@@ -147,7 +147,7 @@ class Features:
 def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
     """Return a name per column of each group, such as ``velocity ahead``, without masks.
 
-    ``shapes`` are those of one observation, by group. Columns of the user's groups are numbered.
+    ``shapes`` are those of one observation, by group. Columns of ``conditions`` and the user's groups are numbered.
     """
     names = {}
     for group, shape in shapes.items():
@@ -182,7 +182,7 @@ def columns_of(group: str, selected: Sequence[str]) -> list[int]:
 
 
 def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return a curvature (1/m) in units of 0.1 1/m, clipped to 3."""
+    """Return a curvature (1/m) in units of 0.1 1/m, clipped to [-3, 3]."""
     return jnp.clip(curvature / CURVATURE_PM, -_MAX_CURVATURE, _MAX_CURVATURE)
 
 
@@ -191,8 +191,8 @@ def route_coordinates(
 ) -> list[Float[Array, " K"]]:
     """Return positions of agents along the route (from ego) and left of it, and sine and cosine of the heading to it.
 
-    Positions are in units of 50 m and 5 m; 20 m left for an agent that is not alongside the route. Zeros without a
-    route.
+    Positions are in units of 50 m and 5 m; left is at most 20 m, as for an agent that is not alongside the route. Zeros
+    without a route.
     """
     offsets = _ROUTE_START_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
     path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
@@ -247,7 +247,7 @@ def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """Return the goal (ego frame, m) in units of 50 m, clipped to 5 in each direction."""
+    """Return the goal (ego frame, m) in units of 50 m, both coordinates clipped to [-5, 5]."""
     return jnp.clip(goal_m / POSITION_M, -5.0, 5.0)
 
 

@@ -19,8 +19,8 @@ def name_of(function: Any, name: str = "") -> str:
 
 def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
     """Check that names are distinct and not taken."""
-    seen = set(taken)
+    used = set(taken)
     for name in names:
-        if name in seen:
+        if name in used:
             raise ValueError(f"{section}: name {name!r} is taken; pass another with name=")
-        seen.add(name)
+        used.add(name)

@@ -91,7 +91,7 @@ class Task:
         return action_of(self.actions, bank, context, jnp.zeros(()), jnp.zeros(()))
 
     def first_action(self, history: History, length: Any) -> Action:
-        """Return the last action at the start of an episode."""
+        """Return the action that counts as the last one at the start of an episode."""
         return self.actions.first(history, length)
 
     def draw_conditions(self, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
@@ -121,7 +121,10 @@ class Task:
     def check_end(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Return terminated (by a failure) and truncated (at the end of log or map)."""
+        """Return terminated (by a failure in ``ends``) and truncated (at the end of log or map).
+
+        With ``to_the_end`` only the end of the log counts.
+        """
         log_ends, terminated = context.step >= bank.last_step[context.row], jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends

@@ -42,15 +42,16 @@ _BATCH = 6
 _BFLOAT16_TOLERANCE = 5e-2
 #: A small observation, because compilation takes most of the time of a check.
 _TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3), metrics="training")
+#: Iterations of the training for which a learner is built; the check runs three.
 _ITERATIONS = 4
 
 
 def check_encoder(config: EncoderConfig | str) -> None:
     """Check an encoder by its settings or their dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It builds for any groups, including groups without rows. It embeds an observation or a batch as ``[..., width]``
+    It builds for groups with and without rows and masks. It embeds an observation or a batch as ``[..., width]``
     float32, compiled or not. Its parameters depend only on the key, and are its only state. Values and gradients are
-    finite, also if all rows are masked. Valid rows have an effect, masked rows have none.
+    finite, also if all rows are masked. Valid rows of every group have an effect, masked rows have none.
     """
     settings = instance(config)
     what = f"encoder {type(settings).__name__}"
@@ -70,6 +71,7 @@ def check_encoder(config: EncoderConfig | str) -> None:
         _check_batches(what, (encoder if number == 0 else run, run), batch, embedding, tolerance)
         _check_masks(what, run, batch, embedding, tolerance)
         _check_gradients(what, encoder, batch)
+        _check_effects(what, run, batch, embedding, _observations(spec, len(_SPECS) + number))
 
 
 def _observations(spec: Any, seed: int) -> dict[str, Any]:
@@ -135,6 +137,15 @@ def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
         gradient = run(parameters, groups)
         finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
         expect(finite, f"{what} has non-finite gradients", "guard roots and divisions on their input")
+
+
+def _check_effects(what: str, run: Any, batch: Any, embedding: Any, others: Any) -> None:
+    """Check that the embedding changes if the valid rows of any group are those of other observations."""
+    for name, rows in batch.items():
+        if rows.size and not name.endswith("_mask"):
+            mask = batch.get(f"{name}_mask", jnp.ones(rows.shape[:-1], bool))
+            changed = run(batch | {name: jnp.where(mask[..., None], others[name], rows)})
+            expect(not same(embedding, changed, 0.0), f"{what} ignores the group {name!r}", "read all groups")
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:

@@ -57,8 +57,8 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     """Check a planner; raise :class:`BrokenContract` if it violates a rule.
 
     Its actions are finite and have the task's shape; its carry keeps its shape. Actions do not depend on batching,
-    repetition, rotation and shift of the world, the order of agents, padding, rows of absent agents, or the log's
-    future.
+    repetition, rotation and shift of the world, the order of agents, padding, rows of absent agents, or (unless
+    privileged) the log's future.
 
     Args:
         planner: The planner, its name, or its dotted name.
@@ -234,7 +234,7 @@ def _check_rows(what: str, rollout: _Rollout) -> None:
 
 
 def _in_ego_frame(rollout: _Rollout) -> Any:
-    """Return valid rows in the ego frame; the first axis is the moment."""
+    """Return the rows of the others in the ego frame, zero where invalid; the first axis is the moment."""
     rows = np.asarray(rollout.rows)[:, :, 1:]
     cos, sin = np.asarray(rollout.view.cos)[..., None], np.asarray(rollout.view.sin)[..., None]
 

@@ -57,9 +57,9 @@ def check_reward(term: Term | str) -> None:
 def check_metric(metric: Metric | str) -> None:
     """Check a metric or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    Its step value is a number and whether it is defined; a defined number follows the rules of :func:`check_reward`.
-    The metric declares all facts that it reads, and has a unit, direction and definition. At the end of an episode it
-    computes a ``Value``, which is finite if defined.
+    It has a unit and a definition. Its step value, if any, is a number and whether it is defined; a defined number
+    follows the rules of :func:`check_reward`, and the metric declares all facts that it reads. ``compute``, if any,
+    returns a ``Value`` at the end of an episode, which is finite if defined.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
@@ -84,8 +84,8 @@ def check_metric(metric: Metric | str) -> None:
 def check_feature(feature: Feature | str) -> None:
     """Check an observation feature or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It is a pure function of bank, context and frames that returns finite float32 values up to 100, with features on
-    the last axis, optionally with a mask of rows. Results do not depend on compilation, batching, the log's future,
+    It is a pure function of bank, context and frames that returns finite float32 values in [-100, 100], with features
+    on the last axis, optionally with a mask of rows. Results do not depend on compilation, batching, the log's future,
     rotation and shift of the world, the order of agents, padding, or rows of absent agents.
     """
     function: Any = find_named(feature) if isinstance(feature, str) else feature

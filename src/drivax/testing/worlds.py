@@ -135,7 +135,7 @@ def pad_frame(frame: Frame) -> Frame:
 
 
 def scatter_frame(frame: Frame) -> Frame:
-    """Fill empty slots with garbage."""
+    """Fill empty slots with garbage, except for booleans."""
 
     def fill(leaf: Array) -> Array:
         valid = frame.valid.reshape(*frame.valid.shape, *(1,) * (leaf.ndim - 2))
@@ -201,7 +201,7 @@ def permute_agents(bank: ScenarioBank) -> ScenarioBank:
 
 
 def pad_agents(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
-    """Append empty slots for agents."""
+    """Append empty slots for moving and for parked agents."""
     n, steps = bank.agents.shape[:2]
     return replace(
         bank,

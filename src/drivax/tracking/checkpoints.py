@@ -45,7 +45,7 @@ State = TypeVar("State")
 
 
 class Checkpoints:
-    """Checkpoints of one run in sub-folders ``step-000001000``: the newest ``keep``, and the best by score."""
+    """Checkpoints of a run in sub-folders ``step-000001000``: the newest ``keep``, and with ``keep_best`` the best."""
 
     def __init__(self, folder: str | Path, keep: int = 2, keep_best: bool = True) -> None:
         if keep < 1:
@@ -104,7 +104,7 @@ class Checkpoints:
     def write(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
         """Store a pytree of numbers and JAX or NumPy arrays, and return the folder, which is on disk.
 
-        Higher scores are better; sequences are compared lexicographically. A NaN score counts as no score.
+        Higher scores are better; sequences are compared lexicographically. A score with a NaN counts as none.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
@@ -119,7 +119,7 @@ class Checkpoints:
         return final
 
     def delete_superseded(self) -> None:
-        """Delete all but the newest ``keep`` checkpoints and the best one; damaged ones have no score."""
+        """Delete all but the checkpoints to keep; damaged ones have no score."""
         steps, scores = self.steps(), dict[int, Any]()
         for step in steps:
             with contextlib.suppress(DataError):
@@ -130,7 +130,7 @@ class Checkpoints:
                 self._delete(step)
 
     def drop_after(self, step: int) -> None:
-        """Delete what an interrupted run left: checkpoints of later steps, and hidden folders."""
+        """Delete what an interrupted run left: checkpoints of later steps and hidden folders; delete links, too."""
         for other in self.steps():
             if other > step:
                 self._delete(other)

@@ -29,7 +29,7 @@ Result = TypeVar("Result")
 
 
 class WorkerPool(ProcessPoolExecutor):
-    """A pool whose workers end at once if the ``with`` block does not reach its end.
+    """A pool whose workers are terminated, after 10 s killed, if the ``with`` block does not reach its end.
 
     Raises:
         DataError: At the end of the block, if a worker died in it.

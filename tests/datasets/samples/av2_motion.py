@@ -13,13 +13,14 @@ SCENARIO = "0a1e6f0a-0000-4a98-b02e-00000000d151"
 ORIGIN = (-440.0, 1310.0)
 STEPS = 110
 SPEED_MPS = 8.0
-#: Lanes by name: id, y of the right and the left boundary, type; the west half ends in 1, the east half in 2.
+#: Lanes by name, seen eastwards: y of the right and the left boundary, type, marks of the right and the left one.
 LANES = {
     "bike": (-1.5, 0.0, "BIKE", "NONE", "SOLID_WHITE"),
     "slow": (0.0, 3.5, "VEHICLE", "SOLID_WHITE", "DASHED_WHITE"),
     "fast": (3.5, 7.0, "VEHICLE", "DASHED_WHITE", "DOUBLE_SOLID_YELLOW"),
     "oncoming": (7.0, 10.5, "VEHICLE", "DOUBLE_SOLID_YELLOW", "NONE"),
 }
+#: Ids of the west (1) and the east (2) half of each lane.
 IDS = {
     name + half: 205_119_000 + 10 * row + int(half) for row, name in enumerate(LANES) for half in ("1", "2")
 }

@@ -30,7 +30,7 @@ BOXES = (
 
 
 def stamps() -> np.ndarray:
-    """Time stamps of the frames: 10 Hz with half a millisecond of jitter."""
+    """Time stamps of the frames: 10 Hz with up to 0.4 ms of jitter."""
     jitter = np.random.default_rng(4).integers(-400_000, 400_000, FRAMES)
     return START_NS + 100_000_000 * np.arange(FRAMES) + jitter
 

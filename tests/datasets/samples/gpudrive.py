@@ -1,4 +1,4 @@
-"""A tiny GPUDrive scene, written with the standard library from the published description of the format."""
+"""A tiny GPUDrive file, written with the standard library from the published description of the format."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ def objects() -> list[dict]:
     ]
 
 
-def scene(**changes) -> dict:
-    """The scene as the JSON file holds it; ``changes`` replace top-level entries."""
+def content(**changes) -> dict:
+    """The content of the JSON file; ``changes`` replace top-level entries."""
     return {
         "name": "tfrecord-00000-of-01000_1.json",
         "scenario_id": "ef3a8f65142f41ac",
@@ -100,12 +100,12 @@ def scene(**changes) -> dict:
 
 def write(folder: Path, **changes) -> Path:
     path = folder / "tfrecord-00000-of-01000_1.json"
-    path.write_text(json.dumps(scene(**changes)))
+    path.write_text(json.dumps(content(**changes)))
     return path
 
 
 def _write_flat(folder: Path) -> Path:
-    """A scene without heights, with a light whose stop point is missing."""
+    """A file without heights, with a light whose stop point is missing."""
     agents, elements = objects(), roads()
     for row in agents:
         del row["height"]

@@ -337,7 +337,7 @@ INDEX = "CREATE INDEX box_of_sweep ON lidar_box (lidar_pc_token)"
 
 @dataclass(frozen=True)
 class Drive:
-    """What the log tells; change parts of it for a test.
+    """Content of the log; change parts of it for a test.
 
     Attributes:
         sweeps: Number of lidar sweeps, 50 ms apart.
@@ -366,7 +366,9 @@ def route() -> str:
 
 
 def status(sweep: int, pair: tuple[str, str]) -> str | None:
-    """Lights: from the west red, yellow from sweep 40, green from 60; from the north red, unseen from sweep 100."""
+    """Lights: from the west red, yellow from sweep 40, green from 60; from the north red, at every 50th sweep unknown,
+    unobserved from sweep 100; from the others never observed.
+    """
     if pair[0] == "w":
         return "red" if sweep < 40 else "yellow" if sweep < 60 else "green"
     if pair[0] == "n" and sweep < 100:
@@ -486,7 +488,7 @@ def write_full(folder: Path, **changes: Any) -> Path:
     return write_all(folder, replace(Drive(), **changes))
 
 
-#: The small log without single sweeps, and one of 4 s with a gap.
+#: The small log without single sweeps, and one of 6 s with a gap.
 FORMS = (
     lambda folder: write_all(folder, replace(SMALL, missing=frozenset({40, 81, 122}))),
     lambda folder: write_all(folder, replace(SMALL, sweeps=120, missing=frozenset(range(90, 96)))),

@@ -89,7 +89,7 @@ def lights(span: str, start: int, stop: int) -> dict[str, bytes]:
 
 
 def road_graph() -> dict[str, bytes]:
-    """Points, and padding up to the fixed number (30,000 in real files); the last direction repeats."""
+    """Points, and padding up to the fixed number (30,000 in real files); all directions are (1, 0, 0)."""
     points = map_points()
     padding = POINTS - len(points)
     directions = [(1.0, 0.0, 0.0)] * len(points)

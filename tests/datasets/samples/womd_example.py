@@ -1,4 +1,4 @@
-"""The scene of ``womd_scenario`` as a tf.Example, encoded byte by byte: no protobuf, no code of drivax."""
+"""A tf.Example with agents like those of ``womd_scenario``, encoded byte by byte: no protobuf, no code of drivax."""
 
 from __future__ import annotations
 

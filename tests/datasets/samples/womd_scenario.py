@@ -75,7 +75,7 @@ def frame(payload: bytes) -> bytes:
     return length + masked_crc(length) + payload + masked_crc(payload)
 
 
-# --- A small scene: ego drives east at 10 m/s on lane 1, a pedestrian waits, a cyclist comes and goes.
+# --- A small scenario: ego drives east at 10 m/s on lane 1, a pedestrian waits, a cyclist comes and goes.
 
 STEPS, CURRENT = 91, 10
 X0, Y0 = 5000.25, -3000.5
@@ -178,7 +178,7 @@ def scenario(scenario_id: str = "0123456789abcdef", steps: int = STEPS, **change
         "map": b"".join(blob(8, f) for f in features()),
         "now": whole(10, CURRENT),
         "predict": blob(11, whole(1, 1) + whole(2, 2)),
-        "laser": blob(12, b"\x0a\x03abc"),  # not declared in drivax, must be skipped
+        "laser": blob(12, b"\x0a\x03abc"),  # compressed lidar, which is not needed
     }
     return b"".join({**parts, **changes}.values())
 

@@ -24,12 +24,13 @@ MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
 #: A local map spans some hundred metres; a point this far from the others is damage.
 _SPREAD_M = 20_000.0
-#: Spacing of points on centre lines, at most, and the length below which a line has none.
+#: Largest spacing of points on a centre line between boundaries, and length of the shortest line that is used.
 _SPACING_M, _SHORTEST_M = 2.0, 1e-3
 #: Ids are below this, so that those of edges and lines, which follow the largest, fit into 64 bits.
 _ID_END = 2**62
 _LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
-#: WOMD has no white lines that are dashed on one side and solid on the other: they become double solid.
+#: WOMD has no white lines that are dashed on one side and solid on the other, which become double solid, and no double
+#: dashed ones, which become single.
 _MARKS = {
     "DASHED_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
     "DOUBLE_DASH_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,

@@ -24,7 +24,7 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
 Array = np.ndarray[Any, Any]
 
 EGO = "AV"
-#: Value of ``object_category`` of tracks that the data set's benchmark scores.
+#: Value of ``object_category`` of the tracks that the data set's benchmark scores besides the focal one.
 _SCORED = 2
 _STATE = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 _COLUMNS: dict[str, Kind] = {
@@ -61,11 +61,11 @@ class ArgoverseMotion:
     companions: tuple[str, ...] = (MAP_PATTERN,)
 
     def recognise(self, path: Path) -> bool:
-        """Whether a parquet file has the name of a scenario."""
+        """Whether it is a parquet file with the name of a scenario."""
         return path.match(self.patterns[0]) and bool(self.count(path))
 
     def describe(self, path: Path) -> Description:
-        """Describe tracks, steps and city of the scenario."""
+        """Describe tracks, steps and city of the scenario, and whether its map is present."""
         table = read_table(path, _COLUMNS, optional=("slice_id",))
         steps = 1 + int(table.numbers["timestep"].max())
         map_path = _map_path(path)
@@ -97,8 +97,8 @@ def _map_path(path: Path) -> Path:
 def decode(path: Path) -> Recording:
     """Return the recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
-    In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
-    those of the map, sizes those of the class, velocities as the source smoothed them.
+    In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; agents stand
+    on the map, sizes are those of the class (of the ego the car's), velocities as the source smoothed them.
     """
     table = read_table(path, _COLUMNS, optional=("slice_id",))
     local_map = read_map(_map_path(path))
@@ -188,7 +188,7 @@ def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
 
 
 def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
-    """Return seconds of every step from the first, the last and their number in the file."""
+    """Return the time of every step, seconds: evenly spaced, by the file's first and last time and number of steps."""
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
     step_s = (end - start) / intervals if intervals > 0 else DT_S

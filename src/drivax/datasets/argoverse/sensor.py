@@ -56,7 +56,7 @@ _SKIP = "skip this log, or download it again"
 
 @dataclass(frozen=True)
 class ArgoverseSensor:
-    """Reader of sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
+    """Reader of sensor logs: about 157 frames at 10 Hz with measured boxes, heights, and the local map."""
 
     name: str = "av2-sensor"
     patterns: tuple[str, ...] = ("annotations.feather", "annotations_with_ego.feather")
@@ -65,11 +65,11 @@ class ArgoverseSensor:
     )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
-        """Whether a feather file has the name of a log's annotations."""
+        """Whether it is a feather file with the name of a log's annotations."""
         return path.name in self.patterns and read_head(path, 6) == b"ARROW1"
 
     def describe(self, path: Path) -> Description:
-        """Describe frames, tracks and city of the log."""
+        """Describe frames, tracks and city of the log, and whether its poses and map are present."""
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
@@ -83,7 +83,7 @@ class ArgoverseSensor:
         )
 
     def count(self, path: Path) -> int:
-        """Return the number of windows of a log."""
+        """Return the number of windows of a log; 0 if its annotations cannot be read."""
         try:
             times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
         except DataError:

@@ -34,7 +34,7 @@ Kind = Literal["number", "whole", "text"]
 
 @dataclass(frozen=True)
 class Words:
-    """A column of text: its words in order of appearance, and the word of every row."""
+    """A column of text: its words in order of appearance, and the index of the word of every row."""
 
     words: tuple[str, ...]
     of_row: Int[Array, " row"]
@@ -62,6 +62,10 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
 
     ``optional`` columns, which not every version of the format has, may be missing.
+
+    Raises:
+        DataError: The file is missing or damaged, has no rows, or lacks a column.
+        UsageError: pyarrow is missing.
     """
     pa = import_extra("pyarrow")
     check_regular(path, _AGAIN)
@@ -113,7 +117,8 @@ def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
     """Refuse a table that lacks a column, has it twice, or has an implausible number of rows."""
     for name in columns:
         if names.count(name) != 1:
-            raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
+            problem = f"has {'several columns' if name in names else 'no column'} {name}"
+            raise DataError(problem, cure="this is another kind of table, or a damaged one")
     if not 0 <= rows <= MOST_ROWS:
         raise DataError(f"invalid row count {rows}", cure=_AGAIN)
 

@@ -28,8 +28,8 @@ def restore(scenario: Scenario) -> Recording:
     """Return the recording that a stored scenario describes, in the source's map frame (float64).
 
     Agents are in stored order: ego, then moving, then parked agents. Every piece of a cropped polyline is a feature:
-    the first keeps the id, the lane graph's links and the stop signs; other pieces, stop signs and unnumbered features
-    get ids above all others.
+    the first keeps the id, and with it the links of the lane graph. Other pieces, stop signs, features without an id,
+    and the lanes of lights that are not on the map get ids above all others.
     """
     largest = max(int(scenario.feature_id.max(initial=0)), int(scenario.lane_id.max(initial=0)))
     new_ids = itertools.count(largest + 1)

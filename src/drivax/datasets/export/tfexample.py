@@ -35,7 +35,8 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: Most tracks to predict that come before all others; rank of tracks without a current position, less their steps.
+#: Most tracks to predict that come before all others; sort key of tracks that are not valid now, from which their
+#: number of valid steps is subtracted.
 _FIRST, _ABSENT_RANK = 8, 1e9
 #: Spacing of map points just under 1 m, so that rounding makes no longer gap, where readers cut polylines; and the
 #: factor by which it grows until the points fit.
@@ -99,7 +100,7 @@ def _origin(recording: Recording, local: _Array) -> _Array:
 
 
 def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
-    """Return tracks over 91 steps around the current one, missing ones not valid, and the number of other steps."""
+    """Return tracks over 91 steps around the current one, missing steps not valid, and the number of steps left out."""
     tracks = recording.tracks
     steps, exists = _steps(recording)
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
@@ -118,7 +119,7 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     """Return the rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
     That is: up to 8 tracks to predict by id, then those that are valid now by their distance from ego, then all
-    others, those with most valid steps first.
+    others, those with most valid steps first. Tracks that are not valid at any of the 91 steps are left out.
     """
     now = tracks.valid[:, CURRENT_STEP]
     to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
@@ -195,7 +196,7 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
 
 
 def _numbers(recording: Recording) -> dict[int, int]:
-    """Return written ids of map features by their ids."""
+    """Return the written id of each map feature and lane of a light by its id: the same if all fit, else its number."""
     ids = [feature.feature_id for feature in recording.features]
     numbers = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in numbers)
@@ -205,7 +206,10 @@ def _numbers(recording: Recording) -> dict[int, int]:
 def _lights(
     recording: Recording, numbers: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
 ) -> dict[str, _Array]:
-    """Return lights in slots, time-major; up to 16 keep their slot, of more the first that are observed at a step."""
+    """Return lights in 16 slots, time-major; count what does not fit under ``lost["light_states"]``.
+
+    Up to 16 lights keep their slots; of more, each step holds the first 16 that are observed at it.
+    """
     lights = recording.lights
     steps, exists = _steps(recording)
     states = np.full((STEPS, max(len(lights), LIGHTS)), -1, np.int64)
@@ -232,7 +236,7 @@ def _lights(
 
 
 def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
-    """Return points along every feature, at most 1 m apart; further where 30,000 would not be enough."""
+    """Return points along every feature, at most 1 m apart; further apart if these are more than 30,000."""
     features = tuple(sorted(features, key=lambda feature: _ORDER.index(feature.kind)))
     spacing = _SPACING_M
     lines = [_sample(feature, spacing) for feature in features]

@@ -1,4 +1,4 @@
-"""Export of scenario sets: a part of a set as a set, tf.Examples or GPUDrive JSON."""
+"""Export of a scenario set, or a part of it, as a set, tf.Examples or GPUDrive JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivax.datasets.export.tfexample import PATHS, tf_example
-from drivax.datasets.gpudrive import file_name, gpudrive_scene
+from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError
 from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
@@ -34,10 +34,10 @@ class Export:
         format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
         filters: Conditions that all must hold (``scenario.select.selection``).
         ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None: all.
-        limit: Write only the first of the selected scenarios; None: all.
+        limit: Write only the first N of the selected scenarios; None: all.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.
-        overwrite: Replace an earlier export of the same kind; other folders are never replaced.
+        overwrite: Replace an existing set (by a set) or export (by another format); other folders are never replaced.
     """
 
     format: Literal["set", "tfexample", "gpudrive"] = "set"
@@ -73,7 +73,7 @@ def export(
 
     Raises:
         DataError: The set is damaged, an id is not in it, or no scenario is selected.
-        UsageError: An option is invalid, or ``out`` exists.
+        UsageError: An option is invalid, or ``out`` exists and may not be replaced.
     """
     options, out = options or Export(), Path(out)
     options.check()
@@ -82,7 +82,7 @@ def export(
     rows = select_scenarios(scenarios, options.filters, names, options.limit)
     if options.format == "set":
         return write_part(scenarios, rows, out, options.overwrite, progress)
-    write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]
+    write = {"tfexample": _write_examples, "gpudrive": _write_gpudrive}[options.format]
     _refuse_existing(out, options)
     partial = PartialFolder(out)
     partial.open()
@@ -119,7 +119,7 @@ def write_part(
         further: Called with the folder of the complete set before it gets its name, to add files.
 
     Raises:
-        UsageError: ``out`` exists, or is the set that is read.
+        UsageError: ``out`` exists and may not be replaced, or is the set that is read.
     """
     refuse_part(scenarios, out)
     part = {"set": scenarios.path.name, "hash": scenarios.hash, **(selection or {})}
@@ -172,13 +172,13 @@ def _write_examples(work: _Work) -> _Written:
     return files, lost
 
 
-def _write_scenes(work: _Work) -> _Written:
+def _write_gpudrive(work: _Work) -> _Written:
     """Write one JSON file per scenario."""
     files = [file_name(number) for number in range(len(work.rows))]
     for number, (row, name) in enumerate(zip(work.rows, files, strict=True), start=1):
-        scene = gpudrive_scene(work.scenarios[row], name)
+        content = gpudrive_content(work.scenarios[row], name)
         with (work.folder / name).open("wb") as file:
-            file.write(json.dumps(scene, allow_nan=False).encode())
+            file.write(json.dumps(content, allow_nan=False).encode())
             sync_and_close(file)
         work.report(number)
     return files, Counter()

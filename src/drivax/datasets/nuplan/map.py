@@ -225,7 +225,7 @@ def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
 
 
 def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
-    """Return lanes with their neighbours: the next and the last index of the same group, counted from the left."""
+    """Return lanes; their left and right neighbours have the index before and after in the same group."""
     lanes: dict[int, Lane] = {}
     lane_at: dict[tuple[int, int], int] = {}
     slots: dict[int, tuple[int, int]] = {}
@@ -250,7 +250,7 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
 
 
 def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> Iterator[tuple[int, Lane]]:
-    """Yield connectors by packed id; the lane before one is its ``exit_lane_fid``, where one leaves that lane."""
+    """Yield connectors by packed id: from the lane ``exit_lane_fid``, which one leaves, to ``entry_lane_fid``."""
     name = "gen_lane_connectors_scaled_width_polygons"
     sides = {
         as_integer(connector): (as_integer(left), as_integer(right))
@@ -442,7 +442,10 @@ def _lane_features(around: _Around) -> Iterator[MapFeature]:
 
 
 def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
-    """Return the width of each lane: the median sum of the distances to both boundaries at five points along it."""
+    """Return the width of each lane: the median sum of the distances to both boundaries at five points along it.
+
+    None for a lane without both boundaries, in parts, or with an implausible width.
+    """
     shapely = import_extra("shapely")
     row_of = around.city.boundary_rows
     pairs = [[row_of.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
@@ -468,7 +471,7 @@ def _line_features(around: _Around) -> Iterator[MapFeature]:
 
 
 def _polygon_features(around: _Around) -> Iterator[MapFeature]:
-    """Yield crosswalks, and stop signs with the lanes whose baselines cross their stop polygons."""
+    """Yield crosswalks, and stop signs with the lanes (else connectors) whose baselines cross their stop polygons."""
     shapely = import_extra("shapely")
     for _, number, points in around.outlines("crosswalks", around.near("crosswalks"), _ring):
         yield MapFeature(number, RoadKind.CROSSWALK, points)

@@ -40,7 +40,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "scenario_tag": ("lidar_pc_token", "type"),
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
-#: Tables, and columns of those that are read, that are not needed; their names hardly repeat with another meaning.
+#: Tables that are not needed, and columns of ``TABLES`` that are not; one set, because their names hardly coincide.
 _OTHERS = frozenset((
     "lidar", "camera", "image", "token", "vehicle_name", "date", "timestamp", "location", "log_token", "lidar_token",
     "next_token", "prev_token", "filename", "z", "vz", "acceleration_x", "acceleration_y", "acceleration_z",
@@ -73,7 +73,7 @@ _LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": Li
 
 @dataclass(frozen=True)
 class NuPlan:
-    """Reader of nuPlan logs: one recording per scene at 10 Hz, all of a log in one segment."""
+    """Reader of nuPlan logs: a recording per scene (several of a long one) at 10 Hz, all of a log in one segment."""
 
     name: str = _NAME
     patterns: tuple[str, ...] = ("*_veh-*.db",)
@@ -118,7 +118,7 @@ class NuPlan:
             return 0
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """Yield one recording per scene in order of time, or a bad record in its place."""
+        """Yield the recording of each :class:`Piece` in order of time, or a bad record in its place."""
         try:
             with open_database(path) as database:
                 log = _open_log(database, path)
@@ -141,15 +141,15 @@ class TimeLine:
 
 @dataclass(frozen=True)
 class Piece:
-    """The steps of one recording: those of a scene, up to 10 before and the future of a scenario (80 steps) after it.
+    """The steps of one recording: a scene or a part of it, with up to 10 steps before and a scenario's future after it.
 
-    So the current steps of its windows are the steps of the scene, and windows cross the borders of scenes.
+    So the current steps of its windows are steps of the scene, and windows cross the borders of scenes.
 
     Attributes:
-        name: Token of the scene in hexadecimal digits, and a number where the scene has several pieces.
+        name: Token of the scene in hexadecimal digits, and a number where a name occurs again.
         scene: Token of the scene.
         sweeps: Rows of the time line, one per step of 0.1 s.
-        scene_sweeps: Sweeps of the scene itself, first and one past the last.
+        scene_sweeps: Rows of the scene or its part alone, first and one past the last.
     """
 
     name: str
@@ -205,23 +205,23 @@ def time_line(database: Database) -> TimeLine:
 def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
-    Of sweeps at 20 Hz every second one is taken, counted from the last gap. A remainder that is too short for a
-    window is dropped: it is the future of the windows before.
+    Of sweeps at 20 Hz every second one is taken, counted from the last gap. A piece that is too short for a window is
+    dropped: its steps are in the future of the piece before, or in the past of the one after.
     """
     recordings: list[Piece] = []
-    counts: dict[Any, int] = {}
+    counts: dict[str, int] = {}
     step = _sweeps_per_step(line.time_us)
     ends = np.flatnonzero(np.diff(line.time_us) > _GAP_US) + 1
     for first, last in zip((0, *ends), (*ends, len(line.tokens)), strict=True):
         sweeps = np.arange(first, last, step)
         for begin, end in _scenes(line, sweeps):
             span = slice(max(begin - CURRENT_STEP, 0), min(end + steps - CURRENT_STEP - 1, len(sweeps)))
-            # Drop a remainder, unless the whole stretch between two gaps is too short for a window.
+            # Keep the first piece if the whole stretch between two gaps is too short for a window.
             if span.stop - span.start < steps and (begin > 0 or len(sweeps) >= steps):
                 continue
             scene = line.scenes[sweeps[begin]]
-            number = counts[scene] = counts.get(scene, 0) + 1
             name = scene.hex() if isinstance(scene, bytes) and 0 < len(scene) <= 16 else "no-scene"
+            number = counts[name] = counts.get(name, 0) + 1
             name += f".{number}" if number > 1 else ""
             scene_sweeps = int(sweeps[begin]), int(sweeps[end - 1]) + step
             recordings.append(Piece(name, scene, sweeps[span], scene_sweeps))
@@ -349,7 +349,7 @@ def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list
 def _boxes(
     log: Log, piece: Piece, agents_by_token: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
-    """Read boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track), and the number of others."""
+    """Read boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track); count boxes without track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _read_observations(log, piece, "lidar_box", columns)
     with_track = [row for row in rows if row[1] in agents_by_token]
@@ -365,7 +365,7 @@ def _boxes(
 
 
 def _scenario_types(log: Log, piece: Piece) -> list[str]:
-    """Read the types of the scenario tags on any sweep of the scene itself, sorted."""
+    """Read the types of the scenario tags on any of the ``scene_sweeps``, sorted."""
     tokens = log.line.tokens[slice(*piece.scene_sweeps)]
     rows = log.database.rows_in("SELECT DISTINCT type FROM scenario_tag WHERE lidar_pc_token IN", tokens)
     return sorted({kind for (kind,) in rows if isinstance(kind, str) and kind})
@@ -417,7 +417,7 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
 def _lights(
     log: Log, piece: Piece, city: City, features: tuple[MapFeature, ...]
 ) -> tuple[tuple[Light, ...], int]:
-    """Read lights of the connectors around the drive, which stop where these begin; count unknown connectors."""
+    """Read lights of the connectors around the drive, with stop points where these begin; count unknown connectors."""
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
     lights = parsing.Lights(len(piece.sweeps))
     unknown = set()

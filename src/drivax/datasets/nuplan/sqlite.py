@@ -34,6 +34,7 @@ _VALUES_AT_ONCE = 500
 _GEOGRAPHIC = 4326
 #: Bytes of the envelope by its code: none, xy, xyz, xym, xyzm.
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)
+#: Bytes of a geometry's header with an envelope in the plane.
 _HEAD_BYTES = 40
 
 

@@ -82,7 +82,7 @@ class City:
     lost: Mapping[str, int]
 
     def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
-        """Return the features in the box around some points; lines are cut there, lanes and polygons stay whole."""
+        """Return the features in the box around some points; edges and lines are cut, lanes and polygons stay whole."""
         box = Box.around(xy, margin_m)
         number = len(self.features)
         result: list[MapFeature] = []
@@ -283,7 +283,10 @@ def marking(name: str) -> RoadKind | None:
 
 
 def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
-    """Add neighbours to lanes, parallel lanes at 2.2 to 5.5 m from their middles; lane connectors have none."""
+    """Add neighbours to lanes: up to one parallel lane on each side, 2.2 to 5.5 m from the middle of the lane.
+
+    It need not be the nearest. Lane connectors, and lanes of two points, have none.
+    """
     from scipy.spatial import KDTree
 
     rows = [i for i, lane in enumerate(lanes) if not lane.interpolating and len(lane.points) > 2]

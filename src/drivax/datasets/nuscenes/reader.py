@@ -76,7 +76,7 @@ class NuScenes:
     )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is ``scene.json`` with the other tables next to it."""
+        """Whether it is ``scene.json`` with the table of samples next to it."""
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
@@ -125,7 +125,8 @@ def _recording(tables: Tables, row: int, maps: Path) -> Recording:
     """Return the recording of the scene in a row of ``scenes``: at 10 Hz, in the city's frame.
 
     Raises:
-        DataError: The scene has no log, fewer than two keyframes or poses, or an implausible duration.
+        DataError: The scene has no log, fewer than two keyframes or poses, no pose between its first and last keyframe,
+            or an implausible duration.
     """
     scene, samples = tables.scenes[row], np.flatnonzero(tables.sample_scene == row)
     location, logfile = tables.logs.get(scene["log_token"], ("", ""))
@@ -164,7 +165,7 @@ def _tracks(
     kinds: Sequence[AgentKind],
     times: Float64[Array, " time"],
 ) -> Tracks:
-    """Return the tracks of the ego (row 0) and every instance at some times; the size of each is its median."""
+    """Return the tracks of the ego (row 0) and every instance at some times; the size of an instance is its median."""
     centres = poses[:, 1:].copy()
     centres[:, :2] = box_centre(centres[:, :2], centres[:, 2], CENTRE_AHEAD_M)
     check_finite(centres, *observations)
@@ -185,16 +186,17 @@ def _tracks(
 
 
 def interpolate(
-    seen_s: Float64[Array, " row"], pose: Float64[Array, "row 3"], times: Float64[Array, " time"]
+    knots_s: Float64[Array, " row"], pose: Float64[Array, "row 3"], times: Float64[Array, " time"]
 ) -> tuple[Float64[Array, "time 5"], Bool[Array, " time"]]:
     """Interpolate position, heading and velocity between observations.
 
     Positions follow a cubic Hermite spline whose tangents are central differences (one-sided at the ends), velocities
-    are its derivative, headings are linear after unwrapping. Steps before the first and after the last observation and
-    in gaps of more than 0.75 s are not valid; an observation without neighbours counts at the nearest step alone.
+    are its derivative, headings are linear after unwrapping. Steps that are more than half a step before the first or
+    after the last observation, or inside a gap of more than 0.75 s, are not valid; an observation between two gaps
+    counts, with velocity 0, at the steps within half a step.
 
     Args:
-        seen_s: Times of the observations, increasing, seconds.
+        knots_s: Times of the observations, increasing, seconds.
         pose: x, y [m] and heading [rad] at each.
         times: Where to interpolate, evenly spaced, seconds.
 
@@ -204,9 +206,9 @@ def interpolate(
     from scipy.interpolate import CubicHermiteSpline
 
     state, valid = np.zeros((len(times), 5)), np.zeros(len(times), bool)
-    runs = np.split(np.arange(len(seen_s)), np.flatnonzero(np.diff(seen_s) > LONGEST_GAP_S) + 1)
+    runs = np.split(np.arange(len(knots_s)), np.flatnonzero(np.diff(knots_s) > LONGEST_GAP_S) + 1)
     for run in (run for run in runs if len(run)):
-        knots, xy = seen_s[run], pose[run, :2]
+        knots, xy = knots_s[run], pose[run, :2]
         # Half a step of tolerance: the ends of a run fall between steps.
         steps = (times >= knots[0] - DT_S / 2) & (times <= knots[-1] + DT_S / 2)
         time = np.clip(times[steps], knots[0], knots[-1])
@@ -428,4 +430,4 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
     except (ValueError, RecursionError) as error:
         problem = f"is damaged after {number} rows ({error})"
-        raise DataError(problem, file=path, cure="unpack the metadata archive again") from error
+        raise DataError(problem, file=path, cure=_AGAIN) from error

@@ -33,8 +33,9 @@ Array = np.ndarray[Any, Any]
 NEIGHBOUR_M = 8.0
 #: Points along a ring that are tested against the other rings; rings may touch at some.
 _PROBES = 5
+#: Most comparisons of points with points of rings or edges; maps that need more are refused.
 _MOST_COMPARISONS = 100_000_000
-#: Comparisons of points and segments at once.
+#: Comparisons of points and segments at a time.
 _BLOCK = 500_000
 _MPS_PER_KMH = 1 / 3.6
 #: A higher limit is a placeholder (MetaDrive's is 1000 km/h).
@@ -116,7 +117,7 @@ def in_ring(points: Array, ring: Array) -> Array:
 
 
 def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
-    """Orient road edges so that most of the lane points next to them are on their left; keep those without lanes."""
+    """Orient road edges so that most of the lane points next to them are on their left; keep those without majority."""
     centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
     if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
         raise DataError("road edges and lanes of too many points", cure=SKIP)
@@ -125,6 +126,8 @@ def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
 
 def _votes_left(edge: Array, centres: Array) -> int:
     """Return the number of lane points next to an edge on its left minus those on its right."""
+    if len(edge) < 2:  # has no sides
+        return 0
     low, high = edge.min(axis=0) - NEIGHBOUR_M, edge.max(axis=0) + NEIGHBOUR_M
     near = centres[np.all((centres >= low) & (centres <= high), axis=1)]
     block = max(_BLOCK // len(edge), 1)
@@ -132,7 +135,7 @@ def _votes_left(edge: Array, centres: Array) -> int:
 
 
 def _votes(edge: Array, points: Array) -> int:
-    """Return the same for a block of points."""
+    """Return :func:`_votes_left` for a block of points."""
     a, b = edge[:-1], edge[1:]
     distance, fraction = point_to_segment(points[:, None], a[None], b[None])
     rows = np.arange(len(points))
@@ -267,6 +270,7 @@ def _width(body: Mapping[Any, Any]) -> float | None:
     """Return the median width of a lane over its points; None for a missing or implausible one.
 
     The file pairs lane and boundary points by index, so distances reach 25 m; a missing side is a copy of the other.
+    Points whose two distances are equal, or of which one is not positive, do not count.
     """
     if body.get("width") is None:
         return None

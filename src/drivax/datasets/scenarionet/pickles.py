@@ -22,14 +22,14 @@ from drivax.errors import DataError
 Array = np.ndarray[Any, Any]
 
 SKIP = "skip this file, or generate it again"
-#: Numbers in one value, and in all values of one kind of one file.
+#: Most rows of a value, and most numbers of a map.
 MOST_NUMBERS = 4_000_000
 _NUMBER = (int, float)
 #: Recorded scenarios have 0.6 to 10 MB.
 MOST_BYTES = 64 << 20
 MOST_OPERATIONS = 4_000_000
 MOST_AXES = 4
-#: Types of keys; integers below this bound differ in their hashes (but -1 and -2), tuples of few parts in most.
+#: Types of keys; integers from this bound on and tuples of more parts are refused: many could have the same hash.
 _PLAIN = (str, int, float, bytes, type(None))
 _LARGEST_KEY, _MOST_PARTS = 1 << 60, 4
 _DAMAGED = "copy or generate the file again"
@@ -350,7 +350,7 @@ def as_int(value: Any) -> int | None:
 
 
 def as_float(value: Any) -> float | None:
-    """Return a number of at most 1e15; None for anything else."""
+    """Return a number from -1e15 to 1e15; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, _NUMBER) or abs(value) > 1e15 or value != value:
         return None
     return float(value)
@@ -376,12 +376,14 @@ def extent(value: Any) -> int:
 
 def floats(value: Any, what: str) -> Array:
     """Return numbers, or rows of up to three numbers, as float64 from an array, list or tuple."""
+    if count_rows(value) > MOST_NUMBERS:
+        raise DataError(f"{what}: {count_rows(value)} rows, more than {MOST_NUMBERS}", cure=SKIP)
     if isinstance(value, np.ndarray):
         narrow = value.ndim == 1 or (value.ndim == 2 and value.shape[1] <= 3)
-        if value.dtype.kind in "biuf" and narrow and len(value) <= MOST_NUMBERS:
+        if value.dtype.kind in "biuf" and narrow:
             with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaNs
                 return value.astype(np.float64)
-    elif isinstance(value, list | tuple) and len(value) <= MOST_NUMBERS:
+    elif isinstance(value, list | tuple):
         try:
             return np.array([_row(row) for row in value], dtype=np.float64)
         except (ValueError, OverflowError, TypeError) as error:
@@ -401,11 +403,11 @@ def _row(row: Any) -> Any:
 
 
 class Names:
-    """Distinct integers for the names of one file: their own where all are integers, else their order.
+    """Distinct integers for the names of one file: the names where all are distinct integers, else their order.
 
     Args:
         names: All names, as texts.
-        bits: Own numbers must be below two to the power of this.
+        bits: Names that are 2 to the power of this or more are no integers.
     """
 
     def __init__(self, names: Sequence[str], bits: int) -> None:

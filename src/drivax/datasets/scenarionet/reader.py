@@ -1,4 +1,4 @@
-"""Reader of ScenarioNet pickles: one recording per file, made from WOMD, nuScenes, nuPlan, Argoverse or MetaDrive.
+"""Reader of ScenarioNet pickles: one recording per file, from WOMD, nuScenes, nuPlan, Argoverse, Lyft or MetaDrive.
 
 The dictionaries are those of MetaDrive's ``ScenarioDescription``. The reader undoes what their converters do to each
 data set as far as the file allows (docs/data/scenarionet.md).
@@ -79,9 +79,9 @@ _COLUMNS = {
     "radius": ((1,), 1e3),  # of round objects of MetaDrive, without length and width
     "valid": ((1,), np.inf),
 }
-#: States of tracks and lights that are not needed: what MetaDrive's own vehicles add.
+#: States of tracks that are not needed: what MetaDrive's own vehicles add.
 _OTHERS = ("angular_velocity", "steering", "throttle_brake", "action")
-#: A longer last step is motion.
+#: A track moves at its end if its last step is longer.
 _MOVED_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
 _HEAD_BYTES = 4096
@@ -194,8 +194,8 @@ def decode(tree: Any) -> Recording:
 def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
     """Return the position (x, y, 0) of the file's origin in the original map frame; zeros if the file does not tell it.
 
-    ScenarioNet notes the centre that it takes from all positions, MetaDrive the old origin in its new frame. Older
-    nuScenes files tell the centre by steps without an observation: their zeros were moved as well.
+    ScenarioNet notes the centre that it subtracts from all positions, MetaDrive the old origin in its new frame. In
+    older nuScenes files the steps without an observation show the centre: their zeros were moved as well.
     """
     centre = _position(metadata, "map_center") - _position(metadata, "old_origin_in_current_coordinate")
     if not centre.any() and dataset == "nuscenes":
@@ -216,7 +216,7 @@ def _position(metadata: Mapping[Any, Any], name: str) -> Array:
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
-    """Return the id of the scenario, which forms of the files hold in three places."""
+    """Return the id of the scenario, from the first of the three places where forms of the files keep it."""
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
         if identity := as_text(value):
             return identity
@@ -246,7 +246,9 @@ def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
 def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Tracks, Counter[str]]:
     """Read ``tracks``, and count states of unknown names.
 
-    Invalid states become zeros; a velocity that the file lacks is zero.
+    Invalid states become zeros. Velocities, heights and sizes that the file lacks are zero; a track without ``valid``
+    is valid at every step. Round objects get twice their radius as length and width; an ego that is wider than long
+    gets the two exchanged.
     """
     titles = [f"track {name[:40]!r}" for name in table]
     bodies = [mapping({"": body}, "", f"tracks[{name[:40]!r}]") for name, body in table.items()]
@@ -306,7 +308,10 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
 
 
 def lacks_velocity(tracks: Tracks) -> bool:
-    """Whether most tracks that move at their end have velocity 0 there: it is missing, or a difference (nuScenes)."""
+    """Whether most tracks that move at their end have velocity 0 there.
+
+    Then velocities are missing, or differences to the next position, of which the last step has none (nuScenes).
+    """
     rows = np.arange(len(tracks.valid))
     end = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
     previous = np.maximum(end - 1, 0)

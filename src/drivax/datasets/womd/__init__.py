@@ -1,1 +1,1 @@
-"""Readers of the Waymo Open Motion Dataset."""
+"""Readers of the Waymo Open Motion Dataset and of ScenarioMax."""

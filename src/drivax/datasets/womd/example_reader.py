@@ -62,8 +62,9 @@ class WomdExample(womd.TfRecordReader):
             )
         if "paths" in recording.lost:
             notes.append("path_samples are not used: routes are computed again")
-        version = "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1"
-        version = version if recording.features else None
+        version = (
+            "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1" if recording.features else None
+        )
         return Description(womd.FULL_NAME, _FLAVOUR, version, count_records(path), tuple(notes))
 
 
@@ -183,7 +184,11 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
 
 
 def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
-    """Return seconds of every step; where no valid state has a time, 10 Hz from the nearest step before, else after."""
+    """Return the time of every step, seconds.
+
+    A step at which no valid state has a time is placed at 10 Hz from the nearest one before it that has a time, else
+    from the first after it; without any time the steps begin at 0.
+    """
     micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
     steps, known = np.arange(len(micros)), np.flatnonzero((micros >= 0) & np.isfinite(micros))
     if known.size == 0:

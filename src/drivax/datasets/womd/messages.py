@@ -1,9 +1,9 @@
 """Protocol-buffer messages of the Waymo Open Motion Dataset and of tf.Example, built when first used.
 
-Declared are the fields of ``waymo_open_dataset/protos/{scenario,map}.proto`` and ``tensorflow/core/example``; those
-that drivax does not need, camera tokens and compressed lidar among them, as bytes. Others are dropped and counted
-(:func:`unknown_fields`). Enums are declared as int32, which is the same on the wire, so that values of later versions
-are kept. The messages live in a descriptor pool of their own and so never clash with an installed
+The declarations have the fields of ``waymo_open_dataset/protos/{scenario,map}.proto`` and ``tensorflow/core/example``;
+inner messages that drivax does not need, such as camera tokens and compressed lidar, are bytes. Undeclared fields are
+dropped and counted (:func:`unknown_fields`). Enums are declared as int32, which is the same on the wire, so that values
+of later versions are kept. The messages live in a descriptor pool of their own and so never clash with an installed
 ``waymo-open-dataset`` package.
 """
 
@@ -199,8 +199,7 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
         rows = np.flatnonzero(unread & (sizes == layout.itemsize))
         if not rows.size:
             continue
-        is_complete = rows.size == len(blobs)
-        content = blobs if is_complete else [blobs[row] for row in rows.tolist()]
+        content = blobs if rows.size == len(blobs) else [blobs[row] for row in rows.tolist()]
         records = np.frombuffer(b"".join(content), layout)
         fields = [(i, *field) for i, field in enumerate(numbers.fields) if field[0] in (layout.names or ())]
         fits = np.ones(len(rows), dtype=bool)
@@ -278,14 +277,14 @@ class ExampleFeatures:
         return values
 
     def find_marks(self, name: str, rows: _Array) -> tuple[int, ...]:
-        """Return the indices in ``rows`` with the value 1; none if the file lacks the feature."""
+        """Return the positions in ``rows`` of the rows with the value 1; none if the file lacks the feature."""
         if not self.has(name):
             return ()
         values = self.numbers(name, (self.numbers("state/id").size,))[rows]
         return tuple(np.flatnonzero(values == 1).tolist())
 
     def scenario_id(self, payload: bytes) -> str:
-        """Return the scenario's id, or the first 16 digits of the payload's SHA-256 if the file has none."""
+        """Return the scenario's id, or the first 16 digits of the payload's SHA-256 if it has none."""
         value = self._values.get("scenario/id")
         text = "" if value is None else b"".join(value.bytes_list.value[:1]).decode("ascii", "replace")
         return text or hashlib.sha256(payload).hexdigest()[:16]
@@ -308,7 +307,7 @@ class ExampleFeatures:
 
     @cached_property
     def spans(self) -> dict[str, int]:
-        """Steps of past, current and future; the future of the test split is missing or invalid throughout."""
+        """Steps of past, current and future; 0 for a future without a valid state, as in the test split."""
         tracks = max(self.numbers("state/id").size, 1)
         steps = {}
         for span in ("past", "current", "future"):

@@ -1,4 +1,4 @@
-"""Common parts of the formats of motion data in TFRecord files: detection, base of the readers, object types."""
+"""Common parts of the formats of motion data in TFRecord files: detection, base of the readers, object types, notes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _CONTENTS = {
 _SIGNS = 2
 
 
-def flavour(payload: bytes) -> str | None:
-    """Detect the format of a payload by its content; None for anything but motion data."""
+def format_of(payload: bytes) -> str | None:
+    """Return the name of a payload's format by its content; None for anything but motion data."""
     example = parse("Example", payload)
     if example is not None and any(entry.key == "state/current/x" for entry in example.features.feature):
         return SCENARIOMAX_FORMAT if scenariomax_signs(ExampleFeatures(example)) >= _SIGNS else EXAMPLE_FORMAT
@@ -45,7 +45,8 @@ def flavour(payload: bytes) -> str | None:
 def scenariomax_signs(features: ExampleFeatures) -> int:
     """Count how many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
-    The prediction difficulty is missing; tracks are numbered 0, 1, 2, ... with the ego first; all times are -1.
+    The prediction difficulty is missing; of the tracks that are valid at the current step the ids are the rows, the ego
+    is row 0; all times of that step are negative.
     """
     ids_are_rows = has_no_times = False
     with suppress(DataError):
@@ -82,7 +83,7 @@ class TfRecordReader:
     def recognise(self, path: Path) -> bool:
         """Whether the first readable record is of this format; never raises."""
         try:
-            return looks_framed(path) and flavour(_first(path)) == self.name
+            return looks_framed(path) and format_of(_first(path)) == self.name
         except UsageError:
             # protobuf is not installed: claim the file as Scenario protos; reading it then reports the missing package.
             return self.name == SCENARIO_FORMAT
@@ -97,7 +98,7 @@ class TfRecordReader:
         return recording
 
     def count(self, path: Path) -> int:
-        """Return the number of records times the windows of the first."""
+        """Return the number of records times the windows of the first readable one; 0 if it cannot be decoded."""
         try:
             return count_records(path) * parsing.windows_of(len(self.decode(_first(path)).timestamps_s))
         except DrivaxError:
@@ -116,7 +117,7 @@ class TfRecordReader:
         try:
             return self.decode(payload)
         except DataError as error:
-            content = flavour(payload)
+            content = format_of(payload)
             if content in (None, self.name):
                 raise
             problem = f"contains {_CONTENTS[content]}, not {_CONTENTS[self.name]}"
@@ -124,12 +125,12 @@ class TfRecordReader:
 
 
 def agent_kind(code: int) -> AgentKind:
-    """Return the class of a WOMD object type; 0 (unset) and codes of later versions are OTHER."""
+    """Return the class of a WOMD object type from 1 to 4 (other); 0 (unset) and codes of later versions are OTHER."""
     return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """Return notes for users about recordings like this one: length, future, lights."""
+    """Return notes for users about a file with this first recording: length, windows or future, lights, frames."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

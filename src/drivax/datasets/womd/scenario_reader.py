@@ -84,7 +84,7 @@ class WomdScenario(womd.TfRecordReader):
 
 
 def _unknown_fields(message: Any, payload: bytes) -> int:
-    """Count fields of unknown numbers; states, which are kept as bytes, are examined once per length."""
+    """Count fields of unknown numbers; of the states, which are kept as bytes, one of each length is examined."""
     states = {len(state): state for track in message.tracks for state in track.states}
     pairs = ((parse(STATES.name, blob), blob) for blob in states.values())
     in_states = (unknown_fields(state, blob) for state, blob in pairs if state is not None)
@@ -140,7 +140,7 @@ def _lights(states: Any, steps: int, features: Sequence[MapFeature]) -> tuple[tu
 
 
 def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """Return the map features, and the number of skipped ones by reason."""
+    """Return the map features, and the numbers of skipped ones and of those with one point by name."""
     bodies: dict[int, tuple[str, Any, Sequence[bytes]]] = {}
     unknown = duplicate = empty = 0
     for message in messages:

@@ -22,11 +22,11 @@ _Array = np.ndarray[Any, Any]
 
 #: Wire type of everything that has a length, and the fields of ``Feature`` by kind of list.
 _LENGTH, _BYTES, _FLOATS, _INTEGERS = 2, 1, 2, 3
-#: Values that encode in seven bits a byte: at most ten bytes for 64 bits.
+#: Numbers of the bytes of a variable-length integer: seven bits each, so at most ten for 64 bits.
 _GROUPS = np.arange(10, dtype=np.uint64)
 _HEADER_BYTES, _FOOTER_BYTES = 12, 4
 _MASK = 0xA282EAD8
-#: Protocol buffers end here; a longer record is damage, whatever its checksum says.
+#: Size of the largest protocol buffer; a longer record is damage, whatever its checksum says.
 _LONGEST_BYTES = 2**31 - 1
 _FETCH = "copy or download the file again"
 
@@ -93,6 +93,10 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
 
     Records after a damaged payload are read; after a damaged length, or where the file ends early, no further record
     can be located and the error is the last item. An empty file yields one error.
+
+    Raises:
+        DataError: The file cannot be opened.
+        UsageError: A package of the extra ``womd`` is missing.
     """
     crc32c = _crc32c()
     path = Path(path)

@@ -1,4 +1,9 @@
-"""Built-in algorithms: PPO and SAC, behaviour cloning, warm starts, and offline reinforcement learning."""
+"""Built-in algorithms, a module each, with settings, iteration, and whole loss (``Ppo._loss``, ``Sac.loss``, ...).
+
+``ppo`` and ``sac`` learn in an environment, ``behaviour_cloning``, ``cql``, ``iql`` and ``td3_bc`` from logged steps,
+and ``warm_start`` from both. ``off_policy`` and ``offline`` are base classes. The terms of losses are in
+:mod:`drivax.rl.equations`.
+"""
 
 import lazy_loader
 

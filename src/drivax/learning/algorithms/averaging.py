@@ -1,4 +1,4 @@
-"""A moving average of parameters, which drives in place of those that are trained.
+"""A moving average of parameters, which is validated and exported in place of those that are trained.
 
 States of averaging algorithms have fields ``parameters`` (of the planner), ``trained`` (None without an average) and
 ``iteration``.
@@ -21,7 +21,7 @@ def check_average(decay: float) -> None:
 
 
 def unless_first(state: Any, parameters: Any) -> Any:
-    """Return parameters, but before the first iteration those of the planner, which a pretraining may have set."""
+    """Return ``parameters``; before the first iteration those of the planner, which pretraining may have set."""
     return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
 
 
@@ -33,7 +33,7 @@ def trained_parameters(state: Any) -> Any:
 def average(state: Any, trained: Any, decay: float) -> dict[str, Any]:
     """Return ``parameters`` and ``trained`` after an iteration that begins in ``state`` and ends with ``trained``.
 
-    The average is the mean of all iterations until the first ones are forgotten.
+    The average is the mean over all iterations for the first ``1 / (1 - decay)`` of them, then exponential.
     """
     if state.trained is None:
         return {"parameters": trained, "trained": None}

@@ -56,7 +56,7 @@ class Cloning:
         batch: Logged steps per update.
         updates: Updates per iteration.
         learning_rate, last_rate: Initial learning rate of Adam, and the final one relative to it; 1: constant.
-        falling: Share of the run over which the rate decays linearly; it is constant afterwards.
+        falling: Share of the run (of pretraining, in a warm start) over which the rate decays linearly, then constant.
         gradient_norm: Maximum global norm of the gradient; None: no clipping.
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
     """
@@ -222,7 +222,7 @@ def require_expert(environment: Environment) -> ExpertEnvironment:
 
 
 def check_loss(cloning: Cloning, network: NetworkConfig) -> None:
-    """Raise UsageError for the loss ``mse`` of a grid or mixture policy, whose mode has no gradient."""
+    """Raise UsageError for the loss ``mse`` of a grid or mixture policy, whose mode has no gradient in the logits."""
     if cloning.loss == "mse" and network.distribution not in REPARAMETRISED:
         problem = f"the mode of {network.distribution!r} has no gradient for the loss 'mse'"
         raise UsageError(problem, cure="use loss: likelihood")

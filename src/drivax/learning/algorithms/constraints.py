@@ -20,7 +20,7 @@ class Constraints:
 
     Attributes:
         limits: Largest mean sum of a cost per episode.
-        weights: Weights of these penalties in the environment's reward, at which the multipliers start.
+        weights: Minus the weights of these penalties in the reward, above 0, at which the multipliers start.
         rate: Step size of the dual ascent.
     """
 

@@ -36,7 +36,7 @@ class CqlConfig(OfflineConfig):
         next_actions: Also sample the penalty's actions from the policy at the next state.
         backup_actions: Number of actions sampled at the next state; the highest value (of the smaller critic) is backed
             up. A single one has on average less value than the expert's action, an error that accumulates over steps.
-        importance: Weight sampled actions by their inverse density; otherwise add the logged action to them.
+        importance: Weight sampled actions by their inverse density; if false, add the logged action to the samples.
         penalty_temperature: Temperature of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss
             is divided by the mean absolute Q, so that the weight does not depend on the scale of rewards.

@@ -1,4 +1,4 @@
-"""Implicit Q-learning (Kostrikov et al. 2021, arXiv 2110.06169), which evaluates only logged actions."""
+"""Implicit Q-learning (Kostrikov et al. 2021, arXiv 2110.06169), which learns values of logged actions only."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class IqlConfig(OfflineConfig):
     """IQL.
 
     Attributes:
-        expectile: Expectile of Q that the value regresses to: 0.5 is the mean, 1 the best logged action.
+        expectile: Expectile of Q that the value regresses to: 0.5 is the mean; near 1, the best logged action.
         inverse_temperature: ``beta`` of the imitation weights ``exp(beta A)``; 0: uniform weights.
         largest_weight: Upper bound of the weights.
         loss: Imitation loss: ``likelihood``, as published, or ``mse`` of the mode, in action units.

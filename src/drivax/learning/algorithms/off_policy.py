@@ -57,7 +57,7 @@ class SoftActor(NamedTuple):
 
 
 def squared_error(q: Array, target: Array) -> Float[Array, ""]:
-    """Return half the mean squared error of Q values from targets."""
+    """Return half the mean squared error of Q values from targets, over the batch and all critics."""
     return 0.5 * jnp.mean((q - target) ** 2)
 
 
@@ -148,7 +148,7 @@ class OffPolicy(Generic[Config]):
     ) -> SoftActor:
         """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy.
 
-        ``key`` is one of all samples, or an array with one of each.
+        ``key`` is a single key for the batch, or an array with a key per sample.
         """
         temperature = jnp.exp(trained["log_temperature"])
         policy = self.distribution(trained["policy"], observation)

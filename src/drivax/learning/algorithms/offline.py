@@ -79,7 +79,7 @@ class FittedQ:
         """Return the estimated discounted return of a policy from the start of episodes.
 
         The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the
-        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Every call draws the same steps.
+        mean of ``Q(s, pi(s))`` over the first usable steps of all logs. Every call draws the same steps.
         ``statistics`` normalise the features, if the network does.
         """
         network_key, key = jax.random.split(jax.random.key(0))
@@ -113,8 +113,8 @@ class FittedQ:
         observation, weight = self._first_steps(data)
         return jnp.sum(q_values(parameters, observation, act(observation)) * weight) / weight.sum()
 
-    def _first_steps(self, data: Experience) -> tuple[dict[str, Array], Float[Array, " N"]]:
-        """Observe the first usable step of every scenario; weight 0 where a scenario has none."""
+    def _first_steps(self, data: Experience) -> tuple[dict[str, Array], Float[Array, " M"]]:
+        """Observe the first usable step of every log; weight 0 where a log has none."""
         usable = data.expert.usable
         index = jnp.arange(len(usable)), jnp.argmax(usable, axis=1)
         return self.environment.observe_recorded(data.data, index), usable.any(axis=1).astype(jnp.float32)
@@ -175,7 +175,7 @@ class OfflineConfig:
         return replace(self.network, encoder=NormalisedConfig(self.network.encoder))
 
     def check_gradient(self) -> None:
-        """Raise UsageError for a grid or mixture policy, whose actions have no gradient."""
+        """Raise UsageError for a grid or mixture policy, whose actions have no gradient in the logits."""
         if self.network.distribution not in REPARAMETRISED:
             problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
             raise UsageError(problem, cure="use gaussian or beta; iql and bc take any distribution")
@@ -229,7 +229,7 @@ class Offline(OffPolicy[Config]):
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
         """Return Adam for a network that every n-th update changes."""
         config = self.config
-        updates = round(config.falling * self.updates) // every if config.last_rate != 1.0 else 0
+        updates = max(round(config.falling * self.updates) // every, 1) if config.last_rate != 1.0 else 0
         return clipped_adam(rate, config.gradient_norm, updates=updates, last=config.last_rate)
 
     def init(self, data: Any, key: Array) -> OfflineState:
@@ -289,7 +289,7 @@ class Offline(OffPolicy[Config]):
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
         """Return ``mean_q``: the smaller critic's value of the policy's mode over a fixed set of held-out steps.
 
-        Overestimation raises it, too. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates.
+        Overestimation raises ``mean_q``. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates.
         """
         metrics = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
         if self.config.fitted_q.updates:

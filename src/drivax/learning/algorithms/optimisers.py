@@ -14,12 +14,15 @@ from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.program import device_count, sum_over_devices
 
-#: Samples per chunk and CPU: intermediate results of a gradient stay in the second-level cache.
+#: Most samples per chunk and CPU device, so that intermediate results fit the second-level cache.
 _CHUNK = 64
 
 
 def chunk_size(batch: int) -> int:
-    """Return the number of samples whose gradient is computed at a time: on GPUs, and for small batches, all."""
+    """Return the number of samples whose gradient is computed at a time: on GPUs all of the batch.
+
+    On CPUs it is the largest divisor of the batch with 17 to 64 samples per device, or all of the batch without one.
+    """
     devices = device_count()
     sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -devices)
     dividing = (size for size in sizes if batch % size == 0)

@@ -50,14 +50,14 @@ class PpoConfig:
         gamma, lambda_: Discount, and decay of generalised advantages.
         clip: Clipping range of the probability ratio around 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        target_kl: The other updates of an iteration are skipped once the divergence from the policy that sampled the
-            rollout exceeds this in a minibatch; None: never.
+        target_kl: The update on a minibatch whose divergence from the policy that sampled the rollout exceeds this is
+            skipped, with all later ones of the iteration; the learning rate does not decay in them. None: never.
         gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
             share an encoder.
         average: Decay per iteration of an exponential moving average of the parameters, which is validated and
             exported in place of the newest ones; 0: no average.
         constraints: Largest mean sum per episode of reward penalties by name, without their weights: of a failure that
-            ends the episode, the share of episodes. Lagrange multipliers, learned from the weights on, replace these.
+            ends the episode, the share of episodes. Lagrange multipliers replace the weights, at which they start.
         multiplier_rate: Step size of the multipliers per iteration.
     """
 
@@ -84,8 +84,8 @@ class PpoConfig:
         if min((self.multiplier_rate, *self.constraints.values())) < 0.0:
             raise ValueError("limits of constraints and multiplier_rate are at least 0")
         check_average(self.average)
-        if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
-            raise ValueError("environments, unroll and minibatches are at least 1")
+        if min(self.environments, self.unroll, self.epochs, self.minibatches) < 1:
+            raise ValueError("environments, unroll, epochs and minibatches are at least 1")
         steps, minibatches = self.steps_per_iteration, self.minibatches
         if steps % minibatches:
             raise ValueError(
@@ -104,9 +104,9 @@ class PpoConfig:
 
 @record
 class PpoState:
-    """State of a run: networks, optimiser, environments, key, step, and multipliers of constraints.
+    """State of a run: networks, optimiser, environments, key, iteration, and multipliers of constraints.
 
-    ``parameters`` are those of the planner: the average, if there is one, of those that are ``trained`` (else None).
+    ``parameters`` are those of the planner: with ``average``, the moving average of ``trained``, which is None without.
     ``past`` are those of the older copy in environments of ``environment.PastPolicy``, else None.
     """
 
@@ -180,7 +180,8 @@ class Ppo:
         While ``settling`` the policy is fixed, a shared encoder included.
 
         Returns:
-            The next state, and sums (``rollout/*``, see ``environment.collect``) and means (``loss/*``) to log.
+            The next state, and sums (``rollout/*``, see ``environment.collect``) and means (``loss/*``, but sums with
+            counts of ``loss/cost/*``) to log.
         """
         actor, key = partial(self.sample_action, state), self.rollout_key(state)
         environments, rollout, totals = collect(
@@ -196,15 +197,19 @@ class Ppo:
         return jax.random.split(state.key, 3)[0]
 
     def sample_action(self, state: PpoState, observation: Any, key: Array) -> SampledAction:
-        """Sample the policy, with log-probabilities and values as extras."""
+        """Sample the policy, with log-probabilities and values as extras.
+
+        In the environments of ``PastPolicy`` an older copy chooses the action, while raw action and extras are still
+        those of the policy; :meth:`update` masks these steps.
+        """
         policy, value = self.network(trained_parameters(state)).policy_and_value(observation)
         raw_action = policy.sample(key)
         extra = {"log_prob": policy.log_prob(raw_action), "value": value}
         action = policy.action(raw_action)
         if self.past is not None:
             index = self.past.environments
-            seen = {name: rows[index] for name, rows in observation.items()}
-            older = self.distribution(unless_first(state, state.past), seen)
+            past_observation = {name: group[index] for name, group in observation.items()}
+            older = self.distribution(unless_first(state, state.past), past_observation)
             action = action.at[index].set(older.action(older.sample(jax.random.fold_in(key, 1))))
         return SampledAction(raw_action, action, extra)
 

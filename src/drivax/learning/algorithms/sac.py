@@ -61,7 +61,7 @@ class SacConfig:
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
         steps: Steps of the n-step returns; their actions are not corrected for later changes of the policy.
-        demonstrations: Share of each batch with the log's expert (Ball et al. 2023, arXiv 2302.02948).
+        demonstrations: Share of each batch drawn from the log's expert (Ball et al. 2023, arXiv 2302.02948).
         warm_up: Steps before the first update.
         explore: Actions before the first update: ``uniform``, or sampled from the ``policy``.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
@@ -69,7 +69,7 @@ class SacConfig:
         tau: Polyak averaging rate of the target critics.
         temperature: Initial temperature.
         target_entropy: Target entropy of the policy; by default minus the size of an action.
-        gradient_norm: Maximum global norm of the gradients of policy and critics; None: no clipping.
+        gradient_norm: Maximum global norm of the policy's gradient, and of that of both critics; None: no clipping.
         average: Decay per iteration of an exponential moving average of the policy's parameters, which is validated
             and exported in place of the newest ones; 0: no average.
     """
@@ -101,6 +101,9 @@ class SacConfig:
             raise ValueError("environments, unroll, updates_per_step, batch and steps are at least 1")
         if not 0.0 <= self.demonstrations < 1.0:
             raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
+        if self.demonstrations and not 0 < self.logged_batch < self.batch:
+            problem = f"demonstrations are {self.logged_batch} of {self.batch} steps of a batch"
+            raise UsageError(problem, cure="use a share of at least one step, and less than all")
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
@@ -111,6 +114,11 @@ class SacConfig:
         if self.network.distribution not in REPARAMETRISED:
             cure = "set distribution to gaussian or beta"
             raise UsageError("SAC needs a policy with reparameterised samples", cure=cure)
+
+    @property
+    def logged_batch(self) -> int:
+        """Number of logged steps in each batch."""
+        return round(self.demonstrations * self.batch)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -144,8 +152,8 @@ class SacParameters:
 class SacState:
     """State of a run.
 
-    ``parameters`` are those of the planner: the average, if there is one, of the policy's that are ``trained`` (else
-    None).
+    ``parameters`` are those of the planner: with ``average``, the moving average of the policy's, which are
+    ``trained``; without, the policy's, and ``trained`` is None.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
@@ -248,7 +256,7 @@ class Sac(OffPolicy[SacConfig]):
         """
         config = self.config
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
-        before = state.iteration * config.steps_per_iteration
+        steps_before = state.iteration * config.steps_per_iteration
         trained = SacParameters(trained_parameters(state), state.critic, state.log_temperature)
         first: Carry = (trained, {"critic": state.target}, state.optimiser)
 
@@ -265,7 +273,7 @@ class Sac(OffPolicy[SacConfig]):
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
-        warm = any_across_learners(before + config.steps_per_iteration >= config.warm_up)
+        warm = any_across_learners(steps_before + config.steps_per_iteration >= config.warm_up)
         (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
         after = replace(
             state,
@@ -281,7 +289,7 @@ class Sac(OffPolicy[SacConfig]):
 
     def _draw(self, data: Any, replay: Replay, key: Array, updates: int) -> _BatchIndex:
         """Draw steps of the buffer and, with ``demonstrations``, of the log for all updates."""
-        logged = round(self.config.demonstrations * self.config.batch)
+        logged = self.config.logged_batch
         index = self.buffer.draw(replay, key, (updates, self.config.batch - logged))
         if not logged:
             return index, None
@@ -299,7 +307,7 @@ class Sac(OffPolicy[SacConfig]):
     def gradient(
         self, trained: SacParameters, target: dict[str, Any], *batch: Any
     ) -> tuple[dict[str, Array], SacParameters]:
-        """Return values to log, and the gradient of :meth:`loss` in chunks, and of the auxiliary loss.
+        """Return values to log, and the sum of the gradients of :meth:`loss`, in chunks, and of the auxiliary loss.
 
         ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
         """

@@ -66,7 +66,7 @@ class Td3Bc(Offline[Td3BcConfig]):
     def loss(
         self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the sum of the critics' loss, the first critic's value of the policy's action, and imitation."""
+        """Return the critics' loss, minus the first critic's scaled value of the policy's action, plus imitation."""
         config = self.config
         next_action = self.distribution(target["policy"], batch.next_observation).mode()
         noise = config.noise * jax.random.normal(key, next_action.shape)

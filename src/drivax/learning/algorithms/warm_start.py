@@ -126,7 +126,7 @@ class WarmStartState:
 
 
 class WarmStartLearner:
-    """A learner after a phase of behaviour cloning."""
+    """Behaviour cloning, then a learner that continues from its policy."""
 
     def __init__(self, config: WarmStart, online: Ppo | Sac, environment: Environment) -> None:
         self.config, self.online, self.environment = config, online, require_expert(environment)

@@ -253,7 +253,7 @@ class EgoState(DevkitObject):
         return Waypoint(self.time_point, self.car_footprint, self.dynamic_car_state.rear_axle_velocity_2d)
 
     def __iter__(self) -> Iterator[float]:
-        """Time, pose, velocity and acceleration of the rear axle, and steering angle."""
+        """Iterate over time, pose, velocity and acceleration of the rear axle, and steering angle."""
         split = self.to_split_state()
         return iter([*split.linear_states[:3], *split.angular_states, *split.linear_states[3:]])
 

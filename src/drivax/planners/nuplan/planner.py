@@ -140,7 +140,8 @@ class Host:
         ``inputs`` are history, actuators and frame at ``step``; ``start`` is the first step of the episode.
 
         Raises:
-            PlannerError: The planner raises an error, now or at an earlier step, or returns no trajectory from now on.
+            PlannerError: The planner raises an error, now or at an earlier step, returns no trajectory from now on, or
+                did not plan every step of the episode.
         """
         identity, start, step = int(identity), int(start), int(step)
         episode = self._episodes.get(identity)
@@ -333,7 +334,9 @@ class View:
         time, x, y, heading = np.array(states).T
         now = nuplan.TimePoint.of_step(step).time_s
         if time[0] > now + _LATE_S or time[-1] <= now:
-            raise PlannerError(f"the trajectory is from {time[0]:g} to {time[-1]:g} s, and it is {now:g} s")
+            raise PlannerError(
+                f"the trajectory from {time[0]:g} to {time[-1]:g} s does not go on from now, {now:g} s"
+            )
         if (np.diff(time) <= 0).any():
             raise PlannerError("the times of the trajectory do not increase")
         times, heading = now + np.arange(steps + 1) * DT_S, np.unwrap(heading)

@@ -23,11 +23,11 @@ from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical, Trajectory
 
-#: Number of agents to consider, those nearest to the path within this radius, m.
+#: Number of agents to consider, those nearest to the path, and their largest distance from ego, m.
 _OTHERS, _RADIUS_M = 24, 50.0
 #: Stride of the forecast motions that form the path.
 _STRIDE = 5
-#: Factor on the speed of the plan that a controller brakes by.
+#: Factor on the speed of the plan that brakes a car in the action space ``trajectory``, as published.
 _OVERSHOOT = 1.1
 
 
@@ -71,8 +71,8 @@ def stop(
 ) -> Float[Array, " D"]:  # fmt: skip
     """Return the action that brakes straight ahead.
 
-    In the action space ``trajectory``, the plan has the constant speed ``1.1 (v + a)``, or ``a`` up to ``slow_mps``, as
-    published. The plan leads backwards if this is negative; the car, which cannot reverse, then stops.
+    In the action space ``trajectory``, the plan has a constant speed, as published: ``1.1 (v + a)`` m/s if ego drives
+    faster than ``slow_mps``, else ``a``. A negative speed leads backwards; the car, which cannot reverse, then stops.
     """
     if not isinstance(actions, Trajectory):
         return actions.action(motion, acceleration, jnp.zeros(()), length_m)
@@ -86,8 +86,8 @@ def stop(
 class EmergencyBrake:
     """Wrap a planner: brake if its action leads to an at-fault collision.
 
-    The action is held constant; in the space ``trajectory``, ego follows the plan exactly. Other agents keep their
-    velocities; agents that already touch ego are ignored.
+    The forecast holds the action constant; in the space ``trajectory``, it follows the plan exactly. Other agents keep
+    their velocities; agents that already touch ego are ignored.
 
     Attributes:
         planner: The wrapped planner.

@@ -36,7 +36,10 @@ class Forecast:
         cls, frame: Frame, slot: Integer, is_ignored: Bool[Array, " S"], path: Float[Array, "M 2"],
         count: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Select ``count`` agents within ``radius_m`` that come nearest to ego's path in five seconds."""
+        """Select up to ``count`` agents within ``radius_m`` of ego that come nearest to its path in five seconds.
+
+        Of agents as near to the path, those near ego now come first; missing ones are not ``valid``.
+        """
         distance = norm(frame.box[:, :2] - frame.box[slot, :2])
         is_eligible = others_on_level(frame, slot) & ~is_ignored & (distance <= radius_m)
         times = jnp.arange(_SAMPLES)[:, None] * _SAMPLE_S
@@ -99,6 +102,7 @@ class Contacts:
             is_unlawful: bool, boxes: Array, kind: Array, speed: Array, other_speed: Array
         ) -> Array:
             """Return whether ego, the first of two boxes, is at fault in its contact with the other."""
+            # A frame of two; height, velocities, lights and ego's kind do not matter.
             zeros, slot = jnp.zeros(2), jnp.zeros((), jnp.int32)
             kinds, lights = jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
             frame = Frame(boxes, jnp.zeros((2, 2)), zeros, zeros == 0.0, kinds, lights)

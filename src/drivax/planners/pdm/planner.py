@@ -166,7 +166,7 @@ class PdmPlanner:
         rows = lines.at(proposals.arc_m).reshape(*plans.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_ALONG] <= lines.remaining_m
-        # The controller swings out in bends and touches curbs between look-ups.
+        # The controller of ``trajectory`` swings out in bends, and would touch curbs between look-ups.
         every = 1 if self._plan_space else config.scoring.ground_every
         contacts = jax.vmap(Contacts.along, in_axes=(0, None, None))(cars.motion, size, others)
         needs_lanes = jax.vmap(partial(Contacts.needs_lanes, steps=config.steps + 1))(contacts)

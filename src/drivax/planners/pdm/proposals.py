@@ -43,7 +43,7 @@ class Lines:
     points: Float[Array, "P M 7"]
     route: Float[Array, "R 7"]  # Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end
     remaining_m: Scalar  # Length of the route ahead of ego; -1 without a route
-    limit: Scalar  # Speed limit of ego's lane, m/s; not positive where unknown
+    limit: Scalar  # Speed limit of the route abreast of ego, m/s; not positive where unknown
 
     @classmethod
     def along_route(

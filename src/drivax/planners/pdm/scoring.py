@@ -57,7 +57,7 @@ class ScoringConfig:
 class ProposalMetrics:
     """Metrics of a proposal."""
 
-    # Gates: 1 passed, 0 failed
+    # Gates: 1 passed, 0 failed; 1/2 for a collision with a static object, and for a short distance astray
     collision: Float[Array, "*batch"]
     road: Float[Array, "*batch"]
     direction: Float[Array, "*batch"]

@@ -22,7 +22,7 @@ _WIDTH, _HEIGHT = 180, 34
 
 
 def comparison_text(comparison: Comparison) -> str:
-    """Return a comparison as text of at most 100 columns, the recommendation last."""
+    """Return a comparison as text: planners, conditions, tables of at most 100 columns, recommendation and notes."""
     tables = comparison_tables(comparison)
     arms = zip("AB", comparison.names, comparison.folders, strict=True)
     lines = [escape_controls(f"{arm}  {name}  ({folder})") for arm, name, folder in arms]
@@ -95,7 +95,7 @@ def _label(metric: MetricComparison) -> MetricLabel:
 
 
 def _p_text(p: float | None) -> str:
-    """Format a p-value with three digits, or as ``< 0.001``."""
+    """Format a p-value with three decimals, or as ``< 0.001``."""
     if p is None:
         return MISSING
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
@@ -121,7 +121,7 @@ def conditions(comparison: Comparison) -> str:
 
 
 def _test_name(metric: MetricComparison) -> str:
-    """Return the name of the test, with its units or its exactness."""
+    """Return the name of the test with the number of its units, or with ``exact`` or ``by recording``."""
     evidence = metric.evidence
     if evidence.name.startswith("McNemar"):
         return f"{evidence.name}, {evidence.units:,} discordant pairs"
@@ -164,6 +164,8 @@ def _test_sentence(comparison: Comparison) -> str:
     p = _p_text(metric.evidence.p)
     p_sentence = f"p {p}" if p.startswith("<") else f"p = {p}"
     test = f"{bounds(metric.difference, label.unit, signed=True)}, {p_sentence}"
+    if metric.difference.mean == 0.0:
+        return f"{label.text} has the same mean for A and B ({test})."
     size = number(abs(metric.difference.mean), label.unit) + suffix(label.unit, signed=True)
     direction = "higher" if metric.difference.mean > 0 else "lower"
     if metric.winner is None:
@@ -211,7 +213,7 @@ def write_comparison(comparison: Comparison, out: Path, overwrite: bool = False)
     """Write the page of a comparison to the HTML file ``out``.
 
     Raises:
-        UsageError: ``out`` exists.
+        UsageError: ``out`` exists without ``overwrite``, or is a folder.
     """
     check_output(out, overwrite)
     names = f"{comparison.names[0]} against {comparison.names[1]}"
@@ -251,9 +253,9 @@ def _plan(comparison: Comparison) -> str:
     return section(
         "The rule",
         f"<p>With fewer than {plan.minimum_scenarios:,} scenarios there is no verdict. If the p-value is below "
-        f"{1 - plan.confidence:.2g}, the verdict is the better planner. Otherwise it is no difference if the "
-        f"comparison had a power of {100 * plan.power:.0f} % to detect the smallest difference that matters, and "
-        "not enough scenarios if it had less.</p>"
+        f"{1 - plan.confidence:.2g}, the verdict is the better planner. Otherwise it is no difference if all values "
+        f"are equal or the comparison had a power of {100 * plan.power:.0f} % to detect the smallest difference that "
+        "matters, and not enough scenarios if it had less.</p>"
         f"<details><summary>the plan</summary><pre>{escape(settings.dump(plan))}</pre></details>",
     )
 
@@ -266,5 +268,5 @@ def _origin(comparison: Comparison) -> str:
         "How this was made",
         facts_html(["", ""], rows),
         f"<details><summary>all numbers</summary><pre>{numbers}</pre></details>",
-        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of both runs.",
+        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of the runs.",
     )

@@ -15,6 +15,7 @@ from drivax.report.inspection import (
     content_table,
     read_speeds,
     true_findings,
+    with_distinct_names,
     with_sizes,
 )
 from drivax.report.pages.page import asset, definitions, page, section
@@ -29,9 +30,10 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
     """Write a page about scenario sets to the HTML file ``out``.
 
     Raises:
-        UsageError: ``out`` exists.
+        UsageError: ``out`` exists without ``overwrite``, or is a folder.
     """
     check_output(out, overwrite)
+    inspections = with_distinct_names(inspections)
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
     names = ", ".join(inspection.name for inspection in inspections)
     title = f"Scenario set{'s' if len(inspections) > 1 else ''}: {names}"
@@ -50,8 +52,9 @@ def _lead(inspections: Sequence[Inspection]) -> str:
 
 def _overview(inspections: Sequence[Inspection]) -> str:
     note = (
-        "Means over the scenarios that define a number, counted in the source before cropping and capping. Windows of "
-        "one recording may overlap; the duration counts each in full."
+        "Means over the scenarios that define a number. Agents, tracks, steps, map features, map points and lights are "
+        "counted in the source, before cropping and capping. Windows of one recording may overlap; the duration counts "
+        "each in full."
     )
     return section("In numbers", content_table(inspections).html(), note=note)
 

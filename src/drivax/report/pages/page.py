@@ -53,7 +53,7 @@ def _edited_html() -> str:
 
 
 def section(title: str, *parts: str, note: str = "", attributes: str = "") -> str:
-    """Return a section with HTML parts and a note below, or "" if all parts are empty."""
+    """Return a section of HTML: title, parts, and a note below; "" if all parts are empty."""
     if not any(parts):
         return ""
     note_html = f"<p><small>{note}</small></p>" if note else ""
@@ -85,7 +85,7 @@ def asset(name: str) -> str:
 
 
 def _colours() -> str:
-    """Return the palette as CSS variables, light and dark."""
+    """Return the palette as CSS variables, light and dark, without ``ink``, which ``player.css`` defines."""
     light, dark = (
         "".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
         for name in ("light", "dark")

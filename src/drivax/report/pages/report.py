@@ -53,7 +53,8 @@ def write_report(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: ``out`` exists, no run is given or one twice, or ``episodes`` is negative.
+        UsageError: ``out`` exists without ``overwrite`` or is a folder, no run is given or one twice, or ``episodes``
+            is negative.
     """
     check_output(out, overwrite)
     if episodes < 0:
@@ -189,7 +190,7 @@ def _transfer(runs: Sequence[EpisodeTable]) -> str:
 
 
 def _collisions(runs: Sequence[EpisodeTable]) -> str:
-    """Return the kinds of the first collision with their meanings, or "" if no kind is known."""
+    """Return the kinds of the first collision with their meanings, or "" without a collision of a known kind."""
     table = result_tables.collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
         return ""
@@ -281,7 +282,8 @@ def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
         "How this was made",
         facts_html(["run", "command", "data", "versions"], rows),
         f"<details><summary>all settings</summary>{settings}</details>",
-        note=f"drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.",
+        note=f"drivax {escape(metadata.version('drivax'))}. The numbers of an evaluation come from its episodes.csv, "
+        "those of rollouts from trajectories.npz, learning curves from metrics.jsonl.",
     )
 
 

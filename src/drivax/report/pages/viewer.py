@@ -25,8 +25,12 @@ from drivax.scenario.store import ScenarioSet
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_reverses": "drives backwards"}
 
 
-def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ()) -> list[Scenario]:
-    """Return the first ``limit`` scenarios of a set, or those with these ids, in that order.
+def select_rows(
+    data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = (), order: Sequence[int] | None = None
+) -> list[int]:
+    """Return at most ``limit`` rows of a set: those of the ids, else of ``order``, which is that of the set by default.
+
+    Of scenarios of several data sets with the same id, the first counts.
 
     Raises:
         UsageError: An id is not in the set, or ``limit`` leaves nothing.
@@ -41,8 +45,8 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
             hint = did_you_mean(name, row_of)
             cure = hint if hint.startswith("did") else "list them with `drivax inspect SET --json`"
             raise UsageError("is not in the set", file=data.path, record=name, cure=cure)
-    rows = [row_of[name] for name in ids] if ids else range(len(data))
-    return [data[row] for row in rows[:limit]]
+    rows = [row_of[name] for name in ids] if ids else list(range(len(data)) if order is None else order)
+    return rows[:limit]
 
 
 def write_player(
@@ -51,10 +55,10 @@ def write_player(
 ) -> Path:  # fmt: skip
     """Write a page of logs (some tens of kB each) to the HTML file ``out``.
 
-    ``details`` has HTML for each scenario, shown above its facts.
+    ``details`` has HTML for each scenario, or none at all, shown above its facts.
 
     Raises:
-        UsageError: ``out`` exists or is a folder, or there is no scenario.
+        UsageError: ``out`` exists without ``overwrite`` or is a folder, or there is no scenario.
     """
     check_output(out, overwrite)
     if not scenarios:
@@ -98,15 +102,15 @@ def criticality_html(table: ScoreTable, row: int) -> str:
 
 
 def _log(scenario: Scenario) -> Rollout:
-    """Return the log as a rollout; its only known event is the first off-road step."""
-    offroad = scenario.audit.get("first_offroad_step")
-    events = {"offroad": -1 if offroad is None else int(offroad)}
+    """Return the log as a rollout; the audit knows its first collision and off-road step, from the current step on."""
+    steps = {name: scenario.audit.get(f"first_{name}_step") for name in ("collision", "offroad")}
+    events = {name: -1 if step is None else int(step) for name, step in steps.items()}
     return Rollout("log", logged_motion(scenario), 0, events, findings(scenario))
 
 
 def _browser(scenarios: Sequence[Scenario], details: Sequence[str]) -> str:
     buttons = "".join(map(_button, scenarios))
-    facts = "".join(map(_details, scenarios, details))
+    facts = "".join(_details(*pair) for pair in zip(scenarios, details, strict=True))
     return (
         "<section class=browse><div class=choose><input type=search id=filter placeholder='id, tag or flag' "
         "aria-label='show scenarios with these words'><small id=shown></small>"
@@ -127,7 +131,7 @@ def _button(scenario: Scenario) -> str:
 
 
 def _details(scenario: Scenario, extra: str) -> str:
-    """Return the ``extra`` HTML, tags, flags, audit and overflow, visible while the scenario is selected."""
+    """Return the ``extra`` HTML, tags, flags, audit, counts and overflow; visible while the scenario is selected."""
     source = scenario.source
     counts = {
         "steps": int(scenario.steps), "tracks": source.tracks, "tracks now": source.tracks_valid_now,

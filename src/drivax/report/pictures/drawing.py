@@ -88,7 +88,7 @@ def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
 class Shape:
     """Lines or polygons ``[n, 2]`` of one style, metres.
 
-    ``line`` and ``fill`` are the colours of outline and inside; without a colour it is not drawn. ``dash`` has the
+    ``line`` and ``fill`` are the colours of outline and inside; None draws no outline, or no inside. ``dash`` has the
     lengths of dashes and gaps in pixels, empty for a solid line. Shapes of a higher ``level`` are drawn on top.
     """
 
@@ -133,7 +133,7 @@ class Drawing:
         layers, stops: Polylines of the map by layer, and positions of stop signs.
         route, goal: Points of the route, and the goal, if it is near.
         light_line, light_state: Stop line of each light, and its code (:data:`LIGHTS`) at every step, -1 unobserved.
-        agents, parked, log: All agents but ego, and the logged ego.
+        agents, parked, log: Moving agents but ego, parked agents, and the logged ego.
     """
 
     layers: Mapping[str, Lines]
@@ -220,7 +220,7 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
     Segments are stored by grid cell. Those of a feature are sorted by arc length and chained where their ends meet. The
     box is (low x, low y, high x, high y).
     """
-    count = int(scenario.segment_blocks[3])
+    count = int(scenario.segment_blocks[3])  # the end of the last block
     rows = np.lexsort((scenario.segment_start_m[:count], scenario.segment_feature[:count]))
     a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
     if box is not None:

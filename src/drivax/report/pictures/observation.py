@@ -30,11 +30,13 @@ _STATES = {"unknown": "unknown", "green": "green", "yellow": "amber", "red": "re
 _ROADS = {"lane": ("lane", 1.6), "edge": ("edge", 2.2), "crosswalk": ("line", 5.0)}
 #: Maximum distance of drawn points, and margin around them, m.
 _MAX_DISTANCE_M, _MARGIN_M = 130.0, 4.0
+#: Corners (ahead, left) of a rectangle that every picture contains, m.
+_MIN_EXTENT_M = ((20.0, 12.0), (-8.0, -12.0))
 #: Minimum ratio of the shorter to the longer side of the picture.
 _MIN_ASPECT = 0.66
 #: Radius of the dot for an agent of unknown size, m.
 _DOT_M = 0.9
-#: Units of features that are scaled.
+#: Factors that turn scaled features into m and m/s; road pieces have another length.
 _SCALE = {
     "position": POSITION_M, "goal": POSITION_M, "velocity": SPEED_MPS, "length": SIZE_M, "width": SIZE_M
 }  # fmt: skip
@@ -42,7 +44,10 @@ _SCALE = {
 
 @dataclass(frozen=True)
 class ObservationGroups:
-    """An observation by group and feature ``[..., columns]`` in m and m/s, and a mask of each group's valid rows."""
+    """An observation by group and feature ``[..., columns]``, and a mask of each group's valid rows.
+
+    Positions, goals, lengths, widths and velocities are in m and m/s, other features as observed.
+    """
 
     values: Mapping[str, Mapping[str, Values]]
     masks: Mapping[str, Values]
@@ -121,9 +126,8 @@ def _to_paper(points: Values) -> Values:
 
 
 def _extent(groups: ObservationGroups) -> tuple[Values, Values]:
-    """Return the low and high corner of a rectangle around all points, clipped to ``_MAX_DISTANCE_M``."""
-    # The picture is not smaller than this.
-    points = [np.zeros((1, 2)), np.array([[20.0, 12.0], [-8.0, -12.0]])]
+    """Return the low and high corner on paper of a rectangle around all points, clipped to ``_MAX_DISTANCE_M``."""
+    points = [_to_paper(np.array(_MIN_EXTENT_M))]
     for group in ("agents", "road", "lights", "route", "ego"):
         if groups.has(group, "position"):
             points.append(_to_paper(groups[group, "position"][groups.masks[group]]))

@@ -26,7 +26,7 @@ from drivax.scenario.schema import Scenario
 Array = np.ndarray[Any, Any]
 #: Marks an absent pose or value.
 ABSENT = -32768
-#: Packed headings per radian, and largest packed value: int16 holds little more.
+#: Packed units per radian, and largest packed value: int16 holds little more.
 _PER_RADIAN, _MAX_VALUE = 10_000, 32_000
 
 
@@ -72,7 +72,7 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
     - ``agents.pose``: ``[agent, step, 3]``.
     - ``parked.seen``: the first and last step at which a parked agent was seen.
     - ``lights.state``: ``[step, light]``, indices of ``LIGHTS``, -1 where unobserved.
-    - ``rollouts[].pose``: ``[step, 3]``; ``speed`` is in cm/s.
+    - ``rollouts[].pose``: ``[step, 3]``; ``speed`` is in cm/s, 0 where ego is absent.
     - ``rollouts[].signals``: ``charts.SIGNALS`` and ``charts.COMMANDS`` in units of their steps, ABSENT where missing.
     """
     scenario = replace_traffic(scenario, rollouts[-1])

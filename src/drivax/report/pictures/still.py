@@ -78,7 +78,7 @@ def draw_on(
     axes: Axes, scenario: Scenario, step: int, centre: tuple[float, float], reach_m: float, path: Any = None,
     colours: Colours = LIGHT,
 ) -> None:  # fmt: skip
-    """Draw a square of a scenario on axes.
+    """Draw the square around ``centre`` (x, y; local frame, metres) of a scenario on axes.
 
     ``path`` is ``ego`` of :func:`draw_scenario`, and ``colours`` are those of a theme; other arguments are the same.
     """

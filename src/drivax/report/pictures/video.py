@@ -53,7 +53,7 @@ def write_videos(
         runs: Run folders; the last evaluation is the policy, whose episodes are ranked.
         out: Folder for the files.
         which: ``worst:N``, ``all``, or the id of a scenario.
-        side_by_side: Draw every run with an episode of the scenario in one picture, not only the policy.
+        side_by_side: Draw every comparable run with an episode of the scenario in one picture, not only the policy.
         data: Path of the policy's scenario set, if it has moved.
         theme: ``light`` or ``dark``.
         overwrite: Replace existing files.
@@ -164,9 +164,9 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
 Array = np.ndarray[Any, Any]
 #: Red, green, blue and an unused alpha: four bytes are copied faster than three.
 Picture = UInt8[Array, "_ _ 4"]
-#: Metres across the shorter edge of a picture.
+#: Metres across the shorter edge of a picture without its bar.
 VIEW_M = 70.0
-#: Heights of the bar at the top of a picture and of a line of the legend, pixels.
+#: Heights of the bar at the top of a picture, and of a line of the legend, pixels.
 _BAR, _LINE = 30, 22
 
 

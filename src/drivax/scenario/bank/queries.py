@@ -1,8 +1,9 @@
 """Map queries: pure, unbatched functions of a pose.
 
-A query reads the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly inside them. Segments
-beyond the cut-off of a query (edges 3 m from a point, lanes 4 m) never change its result, so no result depends on the
-grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments more than 3 m above or below are ignored.
+A query of edges or lanes reads the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly
+inside them. Segments beyond its cut-off (edges 3 m from a point, lanes 4 m or half their width, 8 m at the border of
+the map) never change its result, so no result depends on the grid; ``tests/scenario/test_queries.py`` compares with
+brute force. Segments more than 3 m above or below are ignored.
 """
 
 from __future__ import annotations
@@ -144,9 +145,10 @@ class LaneHits:
             box is near, too, if it is within the cut-off of the lane nearest to the centre, continued straight, or if
             no lane is within 8 m of the centre.
         on_corridor: Inside a lane of the corridor of the route.
-        wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
-        straddling: Some corner is outside all lanes in the direction of the ego.
-        leaving_lane: No lane in the direction of the ego holds all corners (nuPlan's multiple lanes, for fault).
+        wrong_way: Inside a lane against its direction (more than 135 deg), and no lane within 90 deg is nearer.
+        straddling: Some corner is outside all lanes in the direction of the ego (within 90 deg).
+        leaving_lane: The box drives a lane, but no lane in its direction holds all corners (nuPlan's multiple lanes,
+            for fault).
         limit: Speed limit of the lane that is driven, m/s; -1 unknown.
         z: Height of the nearest lane, or of the query without one.
     """
@@ -328,7 +330,7 @@ def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]
 
 
 def left_the_map(bank: ScenarioBank, index: Integer, xy: Vector) -> Bool[Array, ""]:
-    """Return whether a point lies outside the box of all edges and lanes, widened by the cut-off of lanes."""
+    """Return whether a point lies outside the box of all edges and lanes, if any, widened by the cut-off of lanes."""
     return _outside_box(bank, index, xy, LANE_CUTOFF_M) & is_mapped(bank, index)
 
 
@@ -346,7 +348,7 @@ def is_mapped(bank: ScenarioBank, index: Integer) -> Bool[Array, ""]:
 
 @record
 class RouteHit:
-    """Projection on the route: arc length, signed lateral distance (left positive), m; heading cosine and sine."""
+    """Projection on the route: arc length, signed (left positive) and absolute distance, m; heading cosine and sine."""
 
     along_m: Scalar
     lateral_m: Scalar
@@ -441,8 +443,8 @@ def lane_course(
 class Passage:
     """Strand of a car (-1 without a near lane in its direction), and whether it changed lanes or merged at this step.
 
-    It changed lanes if the previous strand is parallel to this one, and merged if that strand ends, or joins this one,
-    within 100 m.
+    It changed lanes if the previous strand is parallel to this one. It merged if the previous strand ends in a merge
+    (:class:`StrandColumn`) within 100 m, and the car changed lanes or is on the strand that it merges onto.
     """
 
     strand: Integer
@@ -476,7 +478,7 @@ def lane_passage(
     adjacent = (adjacent | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
     passed = (before >= 0) & (now >= 0) & (now != before)
     changed = passed & adjacent & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
-    left = codes[before]
-    ending = norm(xy - left[StrandColumn.END]) <= MERGE_M
-    merged = passed & ending & (changed | (left[StrandColumn.ONTO] == now))
+    previous = codes[before]
+    ending = norm(xy - previous[StrandColumn.END]) <= MERGE_M
+    merged = passed & ending & (changed | (previous[StrandColumn.ONTO] == now))
     return Passage(now.astype(jnp.int16), changed, merged)

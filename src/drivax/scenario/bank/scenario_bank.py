@@ -11,7 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import islice
 from typing import Any
 
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
-from drivax.errors import DataError, DrivaxError
+from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
 from drivax.scenario.bank.route_arrays import interleave, most_egos, of_ego, stack_lights, stack_routes
 from drivax.scenario.bank.strands import corridor_lanes, lane_strands
@@ -40,7 +40,7 @@ from drivax.scenario.schema import (
 Scalar = Float[Array, ""]
 Integer = Int[Array, ""]
 Vector = Float[Array, " 2"]
-#: Sizes are multiples of this, so that banks of similar scenarios share programs.
+#: Most sizes are multiples of this, so that banks of similar scenarios share programs.
 _MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
@@ -126,15 +126,19 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
     moving = max(1, _round_up(int(agents.max()), capacity.agents))
     slots = _round_up(int((agents + parked).max()), capacity.agents + capacity.parked)
     _, edge_end, lane_end, _ = stack_field(records, "segment_blocks").T
-    half_diagonal_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
+    egos = np.zeros((len(records), 1), int)
+    if capacity.egos > 1:
+        egos = np.hstack([egos, np.maximum(stack_field(records, "ego_slot"), 0)])
+    ego_size_m = np.take_along_axis(stack_field(records, "agent_size"), egos[..., None], axis=1)
+    half_diagonal_m = np.hypot(*ego_size_m.T[:2]).astype(np.float64) / 2
     return Sizes(
         agents=moving,
         slots=max(slots, moving),
         lights=max(1, _round_up(int(lights.max()), capacity.lights)),
         edges=int(edge_end.max()),
         lanes=int((lane_end - edge_end).max()),
-        edge_run=_longest_run(stack_field(records, "grid_edge"), capacity.grid),
-        lane_run=_longest_run(stack_field(records, "grid_lane"), capacity.grid),
+        edge_run=_round_up(_longest_run(stack_field(records, "grid_edge"), capacity.grid), capacity.edge_run),
+        lane_run=_round_up(_longest_run(stack_field(records, "grid_lane"), capacity.grid), capacity.lane_run),
         graphs=max(1, _round_up(int(lanes.max()), capacity.lanes)),
         road=max(1, int(stack_field(records, "road_rows").max())),
         # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
@@ -149,9 +153,9 @@ def _round_up(count: int, most: int) -> int:
 
 
 def _longest_run(start: Int[np.ndarray, "n cells1"], grid: int) -> int:
-    """Longest run over three neighbouring cells of a grid row, rounded up to a multiple of 8."""
+    """Longest run over three neighbouring cells of a grid row, at least 1."""
     begin, end = (part.reshape(-1, grid, grid) for part in (start[:, :-1], start[:, 1:]))
-    return -(-max(int((end[..., 2:] - begin[..., :-2]).max()), 1) // _MULTIPLE) * _MULTIPLE
+    return max(int((end[..., 2:] - begin[..., :-2]).max()), 1)
 
 
 @record
@@ -188,7 +192,7 @@ class ScenarioBank:
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
-        trimmed: Whether unused padding was cut.
+        trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.
     """
 
     agents: Float[Array, "N T A 8"]
@@ -272,7 +276,7 @@ class ScenarioBank:
         return 0 if self.most_egos == 1 else self.egos.reshape(-1)[row]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Select scenarios."""
+        """Select scenarios by index."""
         of_egos = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
 
         def select(path: tuple[Any, ...], leaf: Array) -> Array:
@@ -286,12 +290,12 @@ class ScenarioBank:
     ) -> ScenarioBank:
         """Stack scenarios of one capacity.
 
-        ``trim`` cuts unused padding, or cuts to given sizes, which must hold all scenarios (:meth:`Sizes.used`): banks
-        of the same sizes share compiled programs, smaller banks are faster. ``allow_no_future`` accepts logs with fewer
-        than 20 steps after the current one.
+        ``trim`` cuts unused padding, or cuts to sizes that hold all scenarios (:meth:`Sizes.used`): banks of the same
+        sizes share compiled programs, smaller banks are faster. ``allow_no_future`` accepts logs with fewer than 20
+        steps after the current one.
 
         Raises:
-            DrivaxError: There are no scenarios, their capacities differ, or a log is too short.
+            DrivaxError: There are no scenarios, their capacities differ, a log is too short, or sizes are too small.
         """
         logs = list(scenarios)
         for scenario in logs:
@@ -304,11 +308,16 @@ class ScenarioBank:
                 raise DataError(f"has capacity {names[0]}, others {names[1]}", record=scenario.id, cure=cure)
         least = Sizes.used(logs)
         sizes = trim if isinstance(trim, Sizes) else least if trim else Sizes.whole(logs[0].capacity)
+        sizes = replace(sizes, long_ego=sizes.long_ego or least.long_ego)
+        has, needs = asdict(sizes), asdict(least)
+        if small := [f"{name} {has[name]} < {needs[name]}" for name in has if has[name] < needs[name]]:
+            cure = "use Sizes.used of all scenarios"
+            raise UsageError(f"sizes are too small: {', '.join(small)}", cure=cure)
         arrays = _stack(logs, sizes)
         return cls(
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
             cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
-            long_ego=least.long_ego or sizes.long_ego, trimmed=trim is True,
+            long_ego=sizes.long_ego, trimmed=trim is True,
         )  # fmt: skip
 
 
@@ -386,7 +395,7 @@ def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:
 
 
 def _fill_agents(agents: Float[np.ndarray, "time agent 8"], log: _Record) -> None:
-    """Write the moving agents of a record in place: they hold most bytes of a bank, so no copy is made."""
+    """Write the moving agents of a record in place: they are the largest array of a bank, so no copy is made."""
     xy, z, heading, velocity, valid = (
         log[f"agent_{name}"][:, : agents.shape[1]] for name in ("xy", "z", "heading", "velocity", "valid")
     )
@@ -478,7 +487,7 @@ def _fill_segments(
 
 def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
     """Return half width, limit and index of each lane, as in :class:`LaneRow`; the last column is for no lane (-1)."""
-    count = int(last_used(stack_field(records, "lane_id") >= 0).max())
+    count = int(last_used(stack_field(records, "lane_length") > 0).max())
     lanes = np.append(np.arange(count), -1)
     width = stack_field(records, "lane_width", lanes)
     half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
@@ -486,7 +495,9 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
     for ego in range(most_egos(records)):
         route = (of_ego(records, f"route_{name}", ego, 0) for name in ("lane", "points"))
         index = index + 0.5 ** (ego + 1) * corridor_lanes(records, *route)[:, lanes]
-    return np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
+    values = np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
+    values[..., -1] = DEFAULT_LANE_WIDTH_M / 2, -1.0, -1.0  # a full table has no empty last row
+    return values
 
 
 def _lane_limits(records: Sequence[_Record], lanes: Int[np.ndarray, " lane"]) -> Float[np.ndarray, "n lane"]:

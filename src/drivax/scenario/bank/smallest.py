@@ -37,8 +37,8 @@ def number_of(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
 def first_smallest(values: Float[Array, "..."], axis: int = -1, least: float = 0.0) -> Int[Array, "..."]:
     """Return ``argmin`` of values of at least ``least``; of nearly equal values the first.
 
-    N values are nearly equal if they differ by less than 1e-6 or about ``N * 2**-23`` of their distance from ``least``.
-    Values below ``least`` count as equal to it.
+    N values are nearly equal if they differ by less than about ``N * 2**-23`` of their distance from ``least`` plus
+    1e-6. Values below ``least`` count as equal to it.
     """
     count = values.shape[axis]
     bits = (count - 1).bit_length()

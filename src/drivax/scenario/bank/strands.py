@@ -55,16 +55,16 @@ def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 
     lane = np.arange(len(lanes.scenario))
     successor, predecessor = lanes.links(records, "successor"), lanes.links(records, "predecessor")
     courses, lane_of_link = _Courses.of(records, lanes), np.repeat(lane[:, None], 4, axis=1)
-    ahead = _straightest_link(successor, courses.turn(lane_of_link, successor))
-    behind = _straightest_link(predecessor, courses.turn(predecessor, lane_of_link))
+    next_lane = _straightest_link(successor, courses.turn(lane_of_link, successor))
+    previous_lane = _straightest_link(predecessor, courses.turn(predecessor, lane_of_link))
     # Two lanes belong to one strand if each is the straightest link of the other. Index -1 reads the last lane; what it
     # yields is masked.
-    follows = np.where((ahead >= 0) & (behind[ahead] == lane), ahead, -1)
+    follows = np.where((next_lane >= 0) & (previous_lane[next_lane] == lane), next_lane, -1)
     strand, last = _strands(follows)
     # A lane whose successor continues another lane (its rival) merges onto that strand if both come from one direction.
-    rival = np.where((ahead >= 0) & (follows < 0), behind[ahead], -1)
+    rival = np.where((next_lane >= 0) & (follows < 0), previous_lane[next_lane], -1)
     merges = (rival >= 0) & (np.abs(wrap(courses.before - courses.before[rival])) <= _MERGING_RAD)
-    onto = np.where(merges, strand[ahead], -1)
+    onto = np.where(merges, strand[next_lane], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     is_dead_end = (successor < 0).all(axis=1) & _is_map_known(records, lanes.scenario, stop)
     rows = np.empty((len(lane), 6))

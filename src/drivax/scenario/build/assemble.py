@@ -136,11 +136,11 @@ def assemble(
 ) -> Scenario:
     """Assemble a scenario from a recording of at most ``capacity.steps`` steps (cut longer ones with ``windows``).
 
-    Items that do not fit the capacity, the farthest from the ego's log first, are dropped and counted in ``overflow``.
-    ``routes`` is the source of candidate routes (``scenario.build.routes``).
+    Items that do not fit the capacity, mostly the farthest from the ego's log, are dropped and counted in ``overflow``;
+    further routes and egos are not counted. ``routes`` is the source of candidate routes (``scenario.build.routes``).
 
     Raises:
-        DataError: The recording is invalid.
+        DataError: The recording is invalid, or road edges near the ego's log do not fit the capacity.
     """
     check(recording, capacity)
     try:
@@ -155,7 +155,7 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
     tracks = local_tracks(recording.tracks, ego, origin)
     log = ego_log(tracks, now)
-    path = thin_path(log.seen[:, :2])
+    path = thin_path(log.positions[:, :2])
     roads = road_lines(recording.features, origin, recording.split_gap_m)
     _refuse_endless(roads)
     segments = cut(roads)

@@ -33,10 +33,10 @@ def further_egos(
 ) -> list[tuple[int, int]]:
     """Return slot and last step of up to ``most`` vehicles, the nearest to the recorded ego first.
 
-    They are valid at the current step and for 2 s or more after it without a gap, and travel more than 2 m in that
-    time. ``moving`` holds the track of every slot, ``log`` is that of the recorded ego.
+    From the current step on, their log lasts 2 s or more and leads more than 2 m away. It ends at the first gap, or
+    where it leaves the box of :data:`KNOWN_M`. ``moving`` holds the track of every slot, ``log`` is the recorded ego's.
     """
-    now, path = log.current, log.seen[:, :2]
+    now, path = log.current, log.positions[:, :2]
     xy, valid = tracks.xyz[moving, now:, :2], tracks.valid[moving, now:]
     low, high = path.min(axis=0) - KNOWN_M, path.max(axis=0) + KNOWN_M
     unbroken = np.logical_and.accumulate(valid & ((xy >= low) & (xy <= high)).all(axis=2), axis=1)

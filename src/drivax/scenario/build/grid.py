@@ -44,7 +44,7 @@ class Grid:
 
     @classmethod
     def around(cls, xy: Float[Array, "point 2"], path: Float[Array, "step 2"], capacity: Capacity) -> Grid:
-        """Return the grid centred on points, or on ``path``, the log of the ego, if they do not fit."""
+        """Return the grid centred on points; without any, or if they do not fit, on ``path``, the log of the ego."""
         size = capacity.grid * capacity.cell_m
         points = xy if len(xy) and np.all(np.ptp(xy, axis=0) < size) else path
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -178,9 +178,10 @@ def cell_sides(
 ) -> Int32[Array, " cell"]:  # fmt: skip
     """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`pack_sides`.
 
-    The nearest of ``edges`` (all of the source, also those outside the crop) decides: its left is drivable; beyond the
-    end of an open edge the side is unknown. Side cells with a lane centre (``lanes``) are never off the road. Cells out
-    of reach of all edges get a side only if they are ``ringed`` (:func:`ringed_cells`).
+    The nearest of ``edges`` (all of the source, also those outside the crop) within 20 m decides: its left is drivable;
+    beyond the end of an open edge the side is unknown. It is also unknown if a lane centre (``lanes``) lies in a side
+    cell off the road, more than 3 m from the edge. In ``ringed`` cells (:func:`ringed_cells`) far from all edges the
+    rings decide instead.
     """
     side_grid = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):

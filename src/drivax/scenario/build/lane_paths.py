@@ -24,7 +24,8 @@ Line = tuple[Float[Array, "_ 3"], Int[Array, " _"]]
 CHANGE_M = 20.0
 #: Gaps of this size between lanes fade out over ``FADE_M``; wider ones are crossed in a straight line.
 GAP_M, FADE_M = (0.05, 2.0), 10.0
-#: Lateral distance and heading difference within which a lane is under the ego or the goal.
+#: Lateral distance and heading difference within which a lane is under the ego or the goal, and the heading difference
+#: for lanes under the log.
 REACH_M, TURN_RAD, SAME_TURN_RAD = 4.0, np.deg2rad(60.0), np.deg2rad(45.0)
 #: Costs in metres: of a lane change, of a metre between ego and its first lane, of a radian of turning.
 CHANGE_COST_M, LATERAL_COST, TURN_COST_M = 60.0, 30.0, 10.0

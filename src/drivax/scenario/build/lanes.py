@@ -55,7 +55,7 @@ class LaneGraph:
         lines: Centre lines.
         feature, lane_id: Row and id of the source feature.
         width, limit: Metres and m/s, -1 unknown.
-        interpolating: Turn paths inside junctions (WOMD).
+        interpolating: Lanes inside junctions, as marked by the source.
         successor, predecessor: Dense indices, -1 padded, the straightest first.
         left, right: Neighbours in the same direction, -1 none.
         left_shift, right_shift: Arc length on the neighbour at arc length s, minus s, metres.

@@ -1,8 +1,9 @@
 """Routes along the lane graph from the pose of the ego, one point per metre.
 
-Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the route of the log
-depend on the poses up to the current step and on the goal region only; among routes that reach the goal equally well
-the nearest to the log is taken. Candidates come from this project's search (``graph``) or the ``published`` one.
+Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. If no route leads to the
+goal, row 0 is the log, too. All but the route of the log depend on the poses up to the current step and on the goal
+region only; among routes that reach the goal equally well the nearest to the log is taken. Candidates come from this
+project's search (``graph``) or the ``published`` one.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ GOAL_M = 10.0
 CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Shorter steps of the log are jitter of a standing car; a log that stays within the second distance has no path.
 STEP_M, STANDS_M = 0.5, 2.0
-#: The log's route goes on this far beyond the log; its lanes are looked up at every n-th point (0.5 to 3 m apart).
+#: The log's route goes on this far beyond the log; its lanes are looked up at every n-th point (0.5 m apart or more).
 LOG_AHEAD_M, LABEL_EVERY = 100.0, 4
 
 
@@ -100,7 +101,7 @@ class EgoLog:
         return int(np.flatnonzero(self.valid)[-1])
 
     @cached_property
-    def seen(self) -> Float[Array, "step 3"]:
+    def positions(self) -> Float[Array, "step 3"]:
         """Valid positions in order."""
         return self.xyz[self.valid]
 
@@ -229,7 +230,7 @@ def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
     """
     if not routes:
         return None
-    path = thin_path(ego.seen[:, :2])
+    path = thin_path(ego.positions[:, :2])
     distances = [project(route.xyz, path)[1] for route in routes]
     # Rounded, so that routes which are equally good stay in order.
     keys = [(np.floor(away[-1]), round(float(away.mean()), 1), i) for i, away in enumerate(distances)]
@@ -262,16 +263,16 @@ class _Drawer:
         """Route along a lane path and the straightest successors of its last lane; ``place`` as in :func:`trace`."""
         graph, ego = self.graph, self.ego
         history = ego.history[:, :2]
-        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
-        prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, history)
-        begin = lane_path.s + length - behind  # negative: the lanes begin too late
+        behind_m = 0.0 if self.plain else BEHIND_M + float(arc_lengths(history)[-1])
+        prefix, length = precede(graph, lane_path.lanes[0], behind_m - lane_path.s, history)
+        begin = lane_path.s + length - behind_m  # negative: the lanes begin too late
         ahead_m = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
         lanes = (*prefix, *follow(graph, lane_path.lanes, ahead_m, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
         change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.goal_m)
         line = trace(graph, lanes, max(begin, 0.0), -lane_path.s - length, window_m, place, change_m)
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
-        arc, _ = project(line[0], ego.seen[-1:, :2])
+        arc, _ = project(line[0], ego.positions[-1:, :2])
         missing_m = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
         xyz, label = continue_straight(line, 0.0, missing_m)
         points, index = resample(xyz, SPACING_M, self.most)
@@ -327,9 +328,10 @@ def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
 def log_route(lane_segments: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """Path of the logged ego (privileged), continued along its last lane, else straight on.
 
-    Positions within half a metre of the previous one are jitter; a log that stays within 2 m has only its last pose.
+    Positions within half a metre of the previous one are left out as jitter; of a log that stays within 2 m of its
+    first position, only the last remaining one is kept.
     """
-    xyz, heading = ego.seen, ego.heading[ego.valid]
+    xyz, heading = ego.positions, ego.heading[ego.valid]
     keep = space_out(xyz[:, :2], STEP_M)
     if np.hypot(*(xyz - xyz[0])[:, :2].T).max() < STANDS_M:
         keep = keep[-1:]
@@ -362,7 +364,8 @@ def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
     """
     rows = np.flatnonzero(ego.valid)
-    step_m = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
-    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * step_m + 2.0)
+    xy = ego.positions[:, :2]
+    step_m = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
+    s = project_monotone(route.xyz, xy, 1.5 * step_m + 2.0)
     last_valid = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
     return s[np.maximum(last_valid, 0)]

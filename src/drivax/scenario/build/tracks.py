@@ -45,8 +45,8 @@ _UNRELATED_M, _PREFERENCE_M = 1e6, 1e7
 class LocalTracks:
     """Tracks in the local frame, float64: box centres, headings in [-pi, pi), m/s; zeros where not valid.
 
-    ``size`` is the median length, width and height over the valid steps, metres; ``has_default_size`` masks tracks of
-    which a length, width or height is that of the class.
+    ``size`` is the median length, width and height over the valid steps, metres; ``has_default_size`` masks tracks with
+    a default length, width or height.
     """
 
     xyz: Float[Array, "track time 3"]
@@ -63,8 +63,8 @@ class LocalTracks:
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
     """Move tracks into the local frame and give every track one box size.
 
-    The size is the median of valid measurements between 0 and 100 m, since sizes of one object vary by metres in public
-    data; without any it is the default of the class.
+    Length, width and height are each the median of the valid measurements between 0 and 100 m, since sizes of one
+    object vary by metres in public data; without any, that of :data:`DEFAULT_EGO_SIZE` (ego) or :data:`DEFAULT_SIZES`.
     """
     valid, mask = tracks.valid, tracks.valid[..., None]
     xyz = np.where(mask, np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin, 0.0)

@@ -79,14 +79,14 @@ FINDINGS: Mapping[str, Quantity] = {
     "agents_reversing": Quantity("number", "other vehicles and cyclists that reverse as in `log_reverses`"),
     "route_deviation_mean_m": Quantity("number", "mean distance of the log to the route"),
     "route_deviation_max_m": Quantity("number", "largest distance of the log to the route"),
-    "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
+    "route_reaches_goal": Quantity("truth", "the route passes within 3 m of where the log ends"),
     "lights_seen": Quantity("number", "lights with an observed state"),
     "ignored_overlaps": Quantity(
         "number", "most agents at a step that have overlapped ego since they appeared"
     ),
     "clipped_physical": Quantity("number", f"{_EXCEEDS} `physical` and `discrete`"),
     "clipped_published": Quantity("number", f"{_EXCEEDS} `published`"),
-    "default_sizes": Quantity("truth", "some box sizes are those of the class"),
+    "default_sizes": Quantity("truth", "some box has a default length, width or height"),
     "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
     "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),
     "clean": Quantity("truth", "no collision, never off the road, no red light run, not `log_reverses`"),

@@ -1,7 +1,7 @@
 """Training, validation and test splits by recording.
 
-Windows of a recording overlap, so all scenarios of a segment belong to the same split. The split depends on the name of
-the segment only; it does not change when data are added.
+Windows of a recording overlap, so all scenarios of a segment belong to the same split. The split depends on the
+percentages and on the names of data set and segment only; it does not change when data are added.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tags of scenarios, for filters and strata.
 
 Every scenario gets the tags of :data:`TAGS` when it is assembled; readers and the built-in world add tags of their own
-(``place``, ``family``, ...). Tags describe the log of the ego; planners do not observe them.
+(``place``, ``family``, ...). Tags describe log and map; planners do not observe them.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ DIFFICULTY = (2, 3)
 VULNERABLE_M = 15.0
 #: Crossing traffic: largest distance, least speed, and range of angles to the heading of the ego.
 CROSSING_M, CROSSING_MPS, CROSSING_RAD = 20.0, 1.0, (np.deg2rad(45.0), np.deg2rad(135.0))
-#: Braking: least loss of speed within a second.
+#: Braking: least loss of speed from a step to one second later.
 BRAKING_MPS = 2.0
 
 
@@ -107,7 +107,7 @@ def type_of(path: EgoPath, graph: LaneGraph) -> str:
 
     - ``u_turn``, ``turn_left``, ``turn_right``: the heading changes by 135 or 45 degrees within 40 m of driving, and
       the log is somewhere on a lane of a junction or off all lanes (otherwise the road bends).
-    - ``merge``: the log continues on a lane that another lane enters in the same direction, outside junctions.
+    - ``merge``: the log continues on a lane that another lane enters, outside junctions.
     - ``junction``: the log is on a lane of a junction.
     - ``lane_follow``, ``straight``: the headings differ by 10 degrees or more, or by less.
 
@@ -174,8 +174,8 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
     """Return the difficulty by the number of demands on the ego: 2 are medium, 3 or more hard.
 
     The demands: a manoeuvre (any type but ``straight`` and ``lane_follow``); high density; a pedestrian or cyclist
-    within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and the log's
-    ego losing 2 m/s of speed within a second. Distances are between centres at the same step, at any step of the log.
+    within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and braking, by
+    2 m/s from some step to one second later. Distances are between centres at the same step, at any step of the log.
     """
     vulnerable = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
     demands = (
@@ -206,7 +206,7 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
 
 
 def _brakes(tracks: LocalTracks) -> bool:
-    """Whether the logged ego loses 2 m/s within some second."""
+    """Whether the logged ego is slower by 2 m/s one second after some step."""
     speed = np.hypot(*tracks.velocity[tracks.ego].T)
     valid, steps = tracks.valid[tracks.ego], round(1.0 / DT_S)
     both = valid[steps:] & valid[:-steps]

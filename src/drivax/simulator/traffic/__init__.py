@@ -1,4 +1,7 @@
-"""Traffic models: how agents that are not driven move."""
+"""Traffic models: how agents that are not driven move.
+
+``log`` contains log replay, ``reactive`` IDM traffic (:class:`IdmTraffic`), ``override`` given trajectories.
+"""
 
 import lazy_loader
 

@@ -35,7 +35,7 @@ TRAVELS_M = 2.0
 OVERLAPS = 2
 #: Minimum distance between key positions, m. Others do not shape a path: the boxes of a standing car jitter.
 _KEY_M = 1.0
-#: A vehicle whose log moves backwards further than this reverses, m.
+#: A vehicle whose log moves backwards by this much or more reverses, m.
 _BACKWARDS_M = 1.5
 #: The last pose shapes the path, too, if it is further ahead of the last key position than this, m.
 _LAST_POSE_M = 0.2
@@ -158,7 +158,7 @@ def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
 
 
 def _travels_forward(logs: _Logs) -> Bool[np.ndarray, " V"]:
-    """Mask of the agents that move more than 2 m and do not reverse."""
+    """Mask of the agents that move more than 2 m, and neither reverse nor flip their heading."""
     # Moves between key steps: the jitter of a standing car does not count. The first key step has no move before it.
     key = _key_steps(logs.xy, logs.valid)
     last = _last_key(key)

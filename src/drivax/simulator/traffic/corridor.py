@@ -38,7 +38,7 @@ _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 FREE_M = 1e4
 #: Lower bound of the gap of overlapping agents, m.
 LEAST_GAP_M = -50.0
-#: Low bits of a squared distance that store the slot or piece; the rest is exact to 0.03 % (of at least 1 m2).
+#: Low bits of a squared distance that store the slot or piece; the rest is exact to 0.013 % (of at least 1 m2).
 _SLOT_BITS, _PIECE_BITS = 10, 4
 
 
@@ -60,7 +60,7 @@ class Leaders:
 
     # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]
-    speed: Float[Array, " R"]  # Speed of that agent along the path, m/s
+    speed: Float[Array, " R"]  # Speed of that agent along the path, m/s; arbitrary if free
     slots: Int[Array, "R C"]  # Slots of the closest agents around the corridor
     valid: Bool[Array, "R C"]  # Mask of valid ``slots``
 
@@ -93,8 +93,9 @@ def path_poses(
 def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
     """Return the nearest agent in the corridor of each vehicle.
 
-    The corridor is as wide as the vehicle plus 0.1 m on either side. An agent is in it if its box, projected across the
-    path, reaches into it, its centre is ahead of the vehicle's, and it is on the same level.
+    The corridor is as wide as the vehicle plus 0.1 m on either side, and ends at the look-ahead distance or the end of
+    the path. An agent is in it if its box, projected across the path, reaches into it, its centre is ahead of the
+    vehicle's, and it is on the same level.
     """
     look_m = _look_ahead(movers.speed)
     rows, arcs = _path_ahead(paths, index, movers, look_m)
@@ -190,9 +191,9 @@ def _closest(
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
     """Return the closest agents whose boxes reach into the rectangles around the corridor."""
     mover = movers.box[:, None]
-    behind = mover[..., LENGTH] / 2 + BEHIND_M
+    behind_m = mover[..., LENGTH] / 2 + BEHIND_M
     box = columns(frame.box)
-    near = reaching(box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
+    near = reaching(box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind_m, 0.0, RECTANGLES)
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
     near &= frame.valid & (slot != movers.slot[:, None])
     near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M

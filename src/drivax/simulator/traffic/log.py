@@ -37,8 +37,8 @@ class LogTraffic:
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "history 4"]:
     """Return the last logged motions of a slot up to ``step``.
 
-    Before the start of the log, and before the agent appeared, the motion is extended backwards at the velocity of the
-    earliest valid step.
+    Before the start of the log, and before the agent last appeared, the motion is extended backwards at the velocity of
+    the step at which it appeared.
     """
     steps = step - jnp.arange(HISTORY - 1, -1, -1)
     rows = bank.agents[index, jnp.clip(steps, 0, bank.steps - 1), slot]

@@ -44,7 +44,7 @@ class OverrideTraffic:
 
     @property
     def name(self) -> str:
-        """``override``, or ``override+idm``."""
+        """``override``, followed by the name of another base than the log (``override+idm``)."""
         return "override" if self.base.name == "log" else f"override+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
@@ -110,7 +110,7 @@ def motions_of_actions(
     Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
     action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
     the log lacks at ``begin`` starts where it was last valid, or first. At most 22 steps before ``begin`` are as
-    logged; before them the agent stands.
+    logged; before them the earliest motion is repeated.
     """
     steps = bank.steps - 1 - begin
     action_index = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)

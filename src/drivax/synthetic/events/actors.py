@@ -59,7 +59,7 @@ def along_track(
     track: Track, station: Times, left_m: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> ScriptedUser:  # fmt: skip
-    """Build an actor at stations and lateral offsets of ego's path, headed along its motion."""
+    """Build an actor at stations and lateral offsets of ego's path, headed along its motion and valid on the path."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
     return scripted_motion(xy, heading, kind, size_m, valid)
@@ -69,7 +69,11 @@ def scripted_motion(
     xy: Float64[np.ndarray, "time 2"], heading: Times, kind: AgentKind, size_m: Size,
     valid: Bool[np.ndarray, " time"],
 ) -> ScriptedUser:  # fmt: skip
-    """Build an actor headed along its motion; at rest it keeps its last heading, ``heading`` if it never moves."""
+    """Build an actor headed along its motion.
+
+    Below 0.3 m/s it keeps its last heading; before it moves, it has its first one. ``heading`` is that of an actor that
+    never moves.
+    """
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
     is_moving = speed > 0.3

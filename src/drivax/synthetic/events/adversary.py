@@ -30,11 +30,11 @@ from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 _PROPOSED_TTC_S, _SIMULATED_TTC_S, _BOX_MARGIN_M = 1.0, 0.8, 0.3
 #: Relative change of ego's speed below which it counts as constant.
 _STEADY_SHARE = 0.12
-#: Least distance from ego at which an actor may appear, m.
+#: Least distance from ego at which an actor may appear during the recording, m.
 _APPEARANCE_M = 40.0
 #: Longitudinal and lateral distance of a new actor from other agents, m: of a vehicle, and of another actor.
 _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
-#: Largest distance between the centres of vehicles that share a lane, m.
+#: Distance of centres below which parallel vehicles are in the way of a new actor, m.
 _SAME_LANE_M = 6.5
 #: Margins added to the length and width of a crossing vehicle, and largest distance of centres, m.
 _CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
@@ -79,7 +79,7 @@ def actor_boxes(actor: ScriptedUser) -> Float64[np.ndarray, "time 6"]:
 
 
 def first_blocked_station(view: EgoView, adversary: ScriptedUser, step: int) -> Float64[np.ndarray, " time"]:
-    """Return the first station at which ego would touch the actor, at each step from ``step`` on, m (inf: none)."""
+    """Return the first station at which ego would overlap the actor, at each step from ``step`` on, m (inf: none)."""
     track, last = view.track, view.last_step
     box = actor_boxes(adversary)[step : last + 1]
     begin = int(track.at[step] / STEP_M)
@@ -136,7 +136,7 @@ def least_ttc(
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
     """Whether the simulated actor comes close to collision with an ego that keeps its speed from the event's start.
 
-    Rejects events that other agents disturbed, or for which ego became slower before. ``view`` is the scenario without
+    Rejects events that other agents disturbed, or before which ego slowed down. ``view`` is the scenario without
     the event, ``motion`` the simulated motion with it.
     """
     begin = staged.first_step
@@ -161,7 +161,10 @@ def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
 
 
 def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
-    """Return the rows of vehicles in the lane of a new actor, near it and with its heading, up to a step."""
+    """Return the rows of vehicles that are in the way of a new actor at any step up to ``until``.
+
+    Lanes do not count: the vehicles are near it and have about its heading.
+    """
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
     gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
@@ -194,7 +197,8 @@ def enter_when_clear(
     part.
 
     Returns:
-        The actor, or None if it would appear in ego's view, too close to another agent, or after step ``until``.
+        The actor, or None if it would appear close to ego during the recording, too close to another agent, or after
+        step ``until``.
     """
     motion, end = view.motion, until + 1
     along, across = _VEHICLE_MARGIN_M if extra.kind == AgentKind.VEHICLE else _OTHER_MARGIN_M
@@ -211,7 +215,7 @@ def enter_when_clear(
     collisions = step[overlap(box[0, step], other[user, step]) & (is_ahead | is_pedestrian)]
     appears = int(np.argmax(extra.valid))
     if len(collisions):
-        # It appears after its last collision.
+        # It appears half a second after its last collision.
         appears = max(appears, int(collisions.max()) + 5)
     if appears >= end or not extra.valid[appears]:
         return None

@@ -1,6 +1,6 @@
 """Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
-Recorded data sets are mined for interactions, since most driving is on empty roads. This module rolls out a reference
+Recorded data sets are mined for interactions, since most driving is uneventful. This module rolls out a reference
 driver from several steps of the same traffic: it follows its leader and stops at red and yellow lights, but ignores all
 other agents. A collision shows that good driving takes more than car following.
 """
@@ -55,27 +55,29 @@ class _Others:
 def critical_steps(
     network: RoadNetwork, motion: Motion, colour: Int8[np.ndarray, "time lane"], steps: _Steps
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the reference driver collides in the recordings that begin at some steps, which are even.
+    """Whether the reference driver collides in each of the recordings that begin at ``steps``, even numbers.
 
-    The driver takes over from row 0 of the motion ``CURRENT_STEP`` later.
+    The driver takes over from row 0 of the motion ``CURRENT_STEP`` steps later.
     """
     path, motion = motion.paths[0], motion.every_nth(_STRIDE)
     others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]
     step = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
     position, speed = motion.distance_m[0, step], motion.speed[0, step]
     fastest = speed_profile(path, 1.0, _LATERAL_MPS2, _SLOWING_MPS2)
-    hit, behind = np.zeros(len(step), bool), np.zeros((len(others.box), len(step)), bool)
+    hit, from_behind = np.zeros(len(step), bool), np.zeros((len(others.box), len(step)), bool)
     extent = others.extent.take(step, axis=2)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
         gap, leader = _leader(others, extent, step, position, size_m)
-        line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2) + 2.0 - _STOP_SHORT_M
+        # IDM keeps its least gap to the shifted line, and so the driver's distance to the real one.
+        line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2)
+        line = line + _DRIVER.min_gap_m - _STOP_SHORT_M
         target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]
         gaps, leads = np.array((gap, line)), np.array((leader, np.zeros_like(leader)))
         a = idm_acceleration(speed, target_mps, gaps, leads, _DRIVER).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         position, speed, step = position + (speed + after) / 2 * _STRIDE * DT_S, after, step + 1
         extent = others.extent.take(step, axis=2)
-        hit |= _hits(others, extent, step, path, position, size_m, behind)
+        hit |= _hits(others, extent, step, path, position, size_m, from_behind)
     return hit
 
 
@@ -108,7 +110,7 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 def _leader(
     others: _Others, extent: _Extent, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
 ) -> tuple[_Floats, _Floats]:
-    """Return the gap to the next agent ahead on the path, and its speed, from the others' extents at these steps."""
+    """Return gap (inf: none) and speed of the next agent ahead on the path, from the others' extents at these steps."""
     if not len(others.box):
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far, right, left = extent
@@ -122,7 +124,7 @@ def _leader(
 def _stop_line_m(
     network: RoadNetwork, path: Path, colour: Int8[np.ndarray, "start lane"], front: _Floats
 ) -> _Floats:
-    """Return the distance to the next stop line with a red or yellow light."""
+    """Return the distance to the next stop line with a red or yellow light, inf without one."""
     result = np.full(len(front), np.inf)
     for span in path.spans:
         if network.lanes[span.lane].control == Control.SIGNAL:
@@ -134,14 +136,14 @@ def _stop_line_m(
 
 def _hits(
     others: _Others, extent: _Extent, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
-    behind: Bool[np.ndarray, "user start"],
+    from_behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:  # fmt: skip
-    """Whether an agent overlaps ego and did not come from behind; agents that did are added to ``behind``."""
+    """Whether an agent overlaps ego and did not come from behind; those that did are marked in ``from_behind``."""
     half, side = size_m / 2
     near, far, right, left = extent
     is_close = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
-    behind |= is_close & ((near + far) / 2 <= at - half)
-    user, start = np.nonzero(is_close & ~behind)
+    from_behind |= is_close & ((near + far) / 2 <= at - half)
+    user, start = np.nonzero(is_close & ~from_behind)
     result = np.zeros(len(at), bool)
     if not len(user):
         return result

@@ -16,20 +16,20 @@ from drivax.synthetic.events.adversary import (
     vehicles_in_lane,
 )
 from drivax.synthetic.events.destinations import Destination
-from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.roles import ScriptedUser, Staging
 
-#: Length of an actor's path before and beyond the junction, m.
+#: Least length of an actor's path before and beyond the junction, m, where the map is large enough.
 _FROM_M, _BEYOND_M = 180.0, 60.0
-#: Required braking at the stop line beyond which an actor visibly does not stop, m/s2.
+#: Deceleration for a stop at the line beyond which an actor visibly does not stop, m/s2.
 _BRAKING_MPS2 = 5.0
-#: Braking before bends and lateral acceleration in them, m/s2.
+#: Braking before bends and acceleration after them, and lateral acceleration in them, m/s2.
 _SLOWING_MPS2, _LATERAL_MPS2 = 2.0, 3.0
-#: Largest change of heading of a straight connector, rad, and least cosine of headings on the same road.
+#: Largest change of heading of a straight connector, rad, and least absolute cosine of headings on the same road.
 _TURN_RAD, _ALONG = math.radians(45.0), 0.7
 
 
@@ -73,7 +73,7 @@ class _ActorPath:
 def _chain(
     lanes: tuple[Lane, ...], first: int, direction: int, length_m: float, rng: np.random.Generator
 ) -> list[int]:
-    """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
+    """Draw successive lanes before (-1) or after (1) a lane until their total length suffices or the map ends."""
     result: list[int] = []
     total, lane = 0.0, lanes[first]
     while total < length_m and (links := lane.successors if direction > 0 else lane.predecessors):
@@ -121,12 +121,14 @@ class CrossTraffic(EventScript):
         lane = int(rng.choice(connectors))
         path = _ActorPath.through(view, lane, rng)
         fastest = share * path.limit_mps
-        # The event begins this many steps before the entry: the actor can no longer stop.
+        # Steps from the event's first one to the entry: at constant speed, a stop would require about 5 m/s2 or more.
         lead = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
         schedule = self._schedule(view, lane, path, fastest, lead, severity_mps2)
         if schedule is None:
             return None
         entry, adversary, required = schedule
+        # The label ends 1 s after the entry, which may be before the actor reaches ego's path. If it blocks the path
+        # 0.8 s after the entry, the label lasts until it leaves.
         leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
@@ -135,7 +137,7 @@ class CrossTraffic(EventScript):
         return Proposal(staging, required, adversary, entry - lead, last)
 
     def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
-        """Connectors that cross a straight one and have to give way to it."""
+        """Connectors that cross a straight one and have to wait for its traffic; none for a bent one."""
         lane = network.lanes[connector]
         if not _is_straight(lane):
             return []
@@ -158,9 +160,10 @@ class CrossTraffic(EventScript):
     ) -> tuple[int, ScriptedUser, float] | None:
         """Find the entry step of the actor for about this deceleration; also return its motion and severity.
 
-        ``fastest`` is its speed before the junction, m/s, and ``lead`` the number of steps from the event to the entry.
+        ``fastest`` is its highest speed, m/s, and ``lead`` the number of steps from the event to the entry.
         """
         first = view.first_step + EARLIEST + lead
+        # The conflict follows the entry: no entry in the last 1.5 s.
         last = min(view.first_step + LATEST + lead, view.last_step - 15)
 
         def actor(entry: int) -> ScriptedUser:
@@ -175,7 +178,7 @@ class CrossTraffic(EventScript):
         for entry in range(first, last + 1):
             begin = entry - lead + NOTICED
             speed = float(view.motion.speed[0, begin])
-            if speed > 4.0:
+            if speed > SLOWEST_MPS:
                 room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
                 required[entry] = required_on_samples(speed, room)
         low, high = SEVERITY_MPS2
@@ -192,7 +195,10 @@ class CrossTraffic(EventScript):
         return None
 
     def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:
-        """Whether the light was red for the last 1.2 s (red-light runner), or never red in them (turning vehicle)."""
+        """Whether the light is red (red-light runner) or never red (turning vehicle) in the 1.2 s before the entry.
+
+        Without lights only a turning vehicle fits.
+        """
         network = view.roles.network
         if network.signals is None:
             return self.turning

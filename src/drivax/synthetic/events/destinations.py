@@ -15,7 +15,7 @@ from drivax.synthetic.traffic.placement import Placement
 
 #: Free speed of ego as a share of the limit.
 _PACE = 0.88
-#: Road behind ego at the beginning of the recording: seconds at its free speed plus metres.
+#: Requested road behind ego at the beginning of the recording: seconds at its free speed plus metres.
 _BEFORE_S, _BEHIND_M = 6.0, 15.0
 #: Earliest time at which ego's light turns green, and earliest time at which this green ends, s.
 _GREEN_S = (-5.0, 6.0)
@@ -34,7 +34,7 @@ class Destination:
     Attributes:
         along_m: Distance along the lane, low and high.
         when_s: Time of ego's arrival at free speed since the recording's beginning, low and high.
-        alone: Whether the lanes ahead of ego must be empty up to the place.
+        alone: Whether ego's route must be empty ahead of it, up to the end of the lane after that of the place.
         followed: Whether a vehicle must be behind ego.
     """
 
@@ -120,7 +120,7 @@ def route_past(
 def rearrange(
     others: Placement, route: DestinationRoute, ego: tuple[int, float], rng: np.random.Generator
 ) -> Placement:
-    """Adapt the placement of other vehicles to a route: empty lanes ahead of ego, a follower behind it.
+    """Adapt the placement of other vehicles to a route: empty lanes ahead of ego, a follower where there is room.
 
     ``ego`` is the lane on which ego begins, and the distance along it.
     """
@@ -130,9 +130,9 @@ def rearrange(
         ahead = route.lanes[first + 1 : route.place + 2]
         places = [p for p in places if p[0] not in ahead and not (p[0] == ego[0] and p[1] > ego[1])]
     if route.followed:
-        behind = (ego[0], ego[1] - float(rng.uniform(*_FOLLOWS_M)))
-        near = [p for p in places if p[0] == ego[0] and behind[1] - _APART_M < p[1] < ego[1]]
-        places += [behind] if behind[1] > _FROM_BEGIN_M and not near else []
+        follower = (ego[0], ego[1] - float(rng.uniform(*_FOLLOWS_M)))
+        near = [p for p in places if p[0] == ego[0] and follower[1] - _APART_M < p[1] < ego[1]]
+        places += [follower] if follower[1] > _FROM_BEGIN_M and not near else []
     return Placement(tuple(lane for lane, _ in places), tuple(along for _, along in places))
 
 

@@ -15,7 +15,7 @@ from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate
 from drivax.synthetic.traffic.roles import Motion, Roles
 
-#: Earliest and latest first step of an event, and the step before which its actor blocks ego's path.
+#: Steps after the recording's first: earliest and latest start of an event; its actor blocks the path before the third.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
 #: Steps from an event's first one until the actor's behaviour is visible, and the time, s.
 NOTICED = 4
@@ -23,7 +23,7 @@ NOTICED_S = NOTICED * DT_S
 #: Ego's path continues this far beyond its last position, m.
 _BEYOND_M = 160.0
 #: Least speed of ego at the beginning of an event, m/s.
-_SLOWEST_MPS = 4.0
+SLOWEST_MPS = 4.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ def ego_track(motion: Motion) -> Track:
     points, headings, along = xy[distinct], heading[distinct], arc[distinct]
     if motion.paths:
         curve = motion.paths[0].curve
+        # The second sample after the nearest one is ahead of ego.
         index = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
         remainder, turn = curve.xy[index:], curve.heading[index:]
         gaps = np.hypot(*np.diff(np.concatenate([points[-1:], remainder]), axis=0).T)
@@ -112,7 +113,7 @@ class EgoView:
 
     @property
     def last_step(self) -> int:
-        """Last step of the recording."""
+        """Last step of the recording, at most its 91st: events ignore later steps."""
         return min(self.first_step + STEPS, self.steps) - 1
 
     @property
@@ -127,7 +128,7 @@ class EgoView:
     def draw_step(self, rng: np.random.Generator) -> int | None:
         """Draw a step at which an event may begin and ego is not slow, or return None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
-        steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
+        steps = steps[self.motion.speed[0, steps] > SLOWEST_MPS]
         return int(rng.choice(steps)) if len(steps) else None
 
     @cached_property
@@ -172,7 +173,7 @@ class EgoView:
         return result
 
     def edge_m(self, station: float, side: int) -> float:
-        """Distance of the nearest road edge from ego's path at a station, to the left (1) or right (-1), m."""
+        """Distance of the nearest road edge from ego's path at a station, left (1) or right (-1), m (inf: none)."""
         origin, heading = self.track.place(station)
         outward = side * np.array([-np.sin(heading), np.cos(heading)])
         best = math.inf
@@ -189,7 +190,7 @@ class EgoView:
         return best
 
     def plain_road(self, station: float) -> bool:
-        """Whether a station is on a lane outside of junctions, more than 14 m from crossings."""
+        """Whether a station is on a lane outside of junctions, more than 14 m from the middle of any crossing."""
         lane, network = self.lane_at(station), self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
@@ -221,7 +222,10 @@ class EgoView:
         return station, is_on_path
 
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
-        """Return the scenario with a new leader, whose rear bumper is at stations from a step on; IDM slows ego."""
+        """Return the scenario with ego slowed by IDM behind a leader with its rear bumper at ``rear_m`` from a step on.
+
+        The leader itself is not in it.
+        """
         law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
         leader_speed, fastest = np.gradient(rear_m, DT_S), np.maximum(speed.max(keepdims=True), 1.0)
         stations, speeds = at.copy(), speed.copy()

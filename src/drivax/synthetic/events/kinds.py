@@ -42,7 +42,8 @@ class StagedEvent:
     Attributes:
         staging: Changes to the traffic.
         actors: Rows of the actors in the simulated motion, whose last rows are the staging's extras.
-        first_step, last_step: Steps of the misbehaviour, both included.
+        first_step, last_step: Steps of the misbehaviour, both included. That of cross traffic usually ends 1 s after it
+            enters the junction, even before the conflict.
         severity_mps2: Constant deceleration with which ego just avoids the actor if it brakes 0.4 s after the first
             step, when the actor's behaviour is visible, and keeps its speed until then.
     """
@@ -63,7 +64,7 @@ class Proposal:
         adversary: Undisturbed motion of the actor at all steps.
         vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
         others: Rows of further actors.
-        view: The scenario with the actor, where ego reacts to it before the event.
+        view: The scenario in which ego reacts to the actor before the event; None where it does not.
     """
 
     staging: Staging

@@ -11,7 +11,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, along_track, brake_to_halt, speed_change
 from drivax.synthetic.events.adversary import severity
 from drivax.synthetic.events.destinations import Destination, open_road
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED, NOTICED_S, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED, NOTICED_S, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
@@ -19,6 +19,8 @@ from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
 #: Lowest speed limit of the road, m/s; on slower roads a braking leader requires little of ego.
 _LEAST_MPS = 10.0
+#: Speed above which an existing leader may brake, m/s.
+_LEADER_MPS = 3.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
 #: Time that a leader stands after ego would have reached it at constant speed, s.
@@ -48,7 +50,7 @@ def draw_braking(
 ) -> tuple[float, float] | None:
     """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
 
-    Return None if hard braking requires too little.
+    Return None if that range hardly overlaps ``SEVERITY_MPS2``, or the leader would have to stop at once.
     """
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
@@ -104,9 +106,9 @@ class LeadBrakes(EventScript):
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
         if self.tailgater:
-            behind = np.where(on_path & (station < own), own - station, np.inf)
-            follower = int(np.argmin(behind))
-            if not behind[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
+            distance_m = np.where(on_path & (station < own), own - station, np.inf)
+            follower = int(np.argmin(distance_m))
+            if not distance_m[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
                 return None
             followers, tailgates = (follower,), (Tailgate(follower, tailgating),)
         length = motion.size_m[: motion.vehicles, 0]
@@ -114,8 +116,8 @@ class LeadBrakes(EventScript):
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
-        lead = float(motion.speed[leader, step])
-        draft = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        leader_mps = float(motion.speed[leader, step])
+        draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > _LEADER_MPS else None
         if draft is None:
             return None
         braking, requested = draft
@@ -155,12 +157,12 @@ def _propose_leader(
 ) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; without
-    it stays.
+    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; with
+    None it stays where it stopped.
 
     Returns:
-        The proposal; None near junctions, if even hard braking would require too little of ego, or if the leader would
-        drive on only after the recording.
+        The proposal; None near junctions, if :func:`draw_braking` returns None, or if the leader would drive on only
+        after the recording.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
     lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
@@ -267,16 +269,16 @@ class CutIn(EventScript):
         station, side = ends[int(rng.integers(len(ends)))]
         speed = view.motion.speed[0]
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST + 1)
-        # The merge and its gap take about three seconds, and it ends within the last metres of the lane.
+        # The merge and its gap take about three seconds, and it ends within ``before_end_m`` of the lane's end.
         remaining_m = station - view.track.at[steps] - 3.0 * speed[steps]
         is_timely = (remaining_m > 0.0) & (remaining_m < self.before_end_m)
-        candidates = steps[is_timely & (speed[steps] > 4.0)]
+        candidates = steps[is_timely & (speed[steps] > SLOWEST_MPS)]
         return (int(rng.choice(candidates)) if len(candidates) else None), side
 
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Return the lateral offset of the actor's lane, and a mask of its steps; None without one."""
+        """Return the offset of the actor's lane, and a mask of the steps with a lane there; None without one."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
         for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():

@@ -10,7 +10,7 @@ import numpy as np
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, Size, Times, along_track, gait, scripted_motion, travel_s
 from drivax.synthetic.events.adversary import waiting_room
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, SLOWEST_MPS, EgoView
 from drivax.synthetic.events.kinds import EventScript, Proposal
 from drivax.synthetic.roads.curves import smooth_step
 from drivax.synthetic.roads.network import RoadNetwork
@@ -38,7 +38,7 @@ def _is_open_street(view: EgoView, station: float) -> bool:
 
 
 def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
-    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to reach it, s."""
+    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to it at its speed, s."""
     own, speed = view.at_step(step)
     room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
     return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
@@ -47,7 +47,7 @@ def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: f
 def _entry(
     view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
 ) -> tuple[Times, Times] | None:
-    """Return distance and speed of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
+    """Return :func:`gait` of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
     gain, loss = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
     return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
@@ -56,7 +56,7 @@ def _entry(
 def _crossing_actor(
     view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size
 ) -> ScriptedUser:
-    """Build an actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
+    """Build an actor that moves at a right angle to ego's path at a station; an actor that never moves faces it."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
     return scripted_motion(xy, toward, kind, size, np.ones(view.steps, bool))
@@ -83,7 +83,7 @@ class Jaywalker(_StreetScript):
         step, station, offset = origin
         if not _is_open_street(view, station):
             return None
-        # The walk ends beyond the other side of the road.
+        # The walk ends 0.6 m beyond the other side of the road, at most 14.6 m beyond ego's path.
         side = -int(math.copysign(1, offset))
         walk_m = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
@@ -99,7 +99,10 @@ class Jaywalker(_StreetScript):
     def _required_room(
         self, view: EgoView, offset: float, speed: float, pace: float, requested: float
     ) -> float | None:
-        """Return the distance from ego's front to the pedestrian's line at the first step; None if ego passes first."""
+        """Return the distance from ego's front to the pedestrian's line at the first step.
+
+        None if ego, at its speed, is past the line or less than 0.5 m before it when the pedestrian enters its lane.
+        """
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
@@ -146,7 +149,7 @@ class Jaywalker(_StreetScript):
             front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
             rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
             rooms = [math.inf if room is None else room for room in rooms]
-            error = np.where(speed > 4.0, rooms, math.inf) - (line - front)
+            error = np.where(speed > SLOWEST_MPS, rooms, math.inf) - (line - front)
             best = int(np.argmin(np.abs(error)))
             if abs(error[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
@@ -216,7 +219,7 @@ class WrongWayCyclist(_StreetScript):
     """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
-        out_s: Time in ego's lane, low and high.
+        out_s: Time from the first step until ego's lane is clear again, low and high.
         swing_s: Duration of each swing.
     """
 

@@ -191,16 +191,16 @@ def _box_conflicts(
     coarse = ego[::_STRIDE, :2]
     xy = others[user, step, :2]
     gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
-    row, block = np.nonzero(gap < reach[user, None] ** 2)
+    entry, block = np.nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
-    row = np.repeat(row, _STRIDE)
+    entry = np.repeat(entry, _STRIDE)
     is_inside = (point >= 0) & (point < len(ego))
-    row, point = row[is_inside], point[is_inside]
-    other, ego_box = others[user[row], step[row]], ego[point]
-    is_close = overlap(_grow_boxes(ego_box, margin_m[user[row]]), other)
-    row, point, other, ego_box = row[is_close], point[is_close], other[is_close], ego_box[is_close]
+    entry, point = entry[is_inside], point[is_inside]
+    other, ego_box = others[user[entry], step[entry]], ego[point]
+    is_close = overlap(_grow_boxes(ego_box, margin_m[user[entry]]), other)
+    entry, point, other, ego_box = entry[is_close], point[is_close], other[is_close], ego_box[is_close]
     hard = overlap(_grow_boxes(ego_box, np.array(HARD_M)), other)
-    return Conflicts(user[row], step[row], point, hard)
+    return Conflicts(user[entry], step[entry], point, hard)
 
 
 def _grow_boxes(
@@ -254,7 +254,10 @@ def arrivals(
     network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
     valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
 ) -> dict[int, _Steps]:  # fmt: skip
-    """Return the steps at which a vehicle other than ego is on a connector with priority, or about to enter it."""
+    """Return, for connectors to which others yield, the steps at which a vehicle is or will be on them within 2 s.
+
+    Ego, row 0, does not count. Connectors on no other path are left out.
+    """
     watched = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):

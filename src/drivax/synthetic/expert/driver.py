@@ -61,7 +61,7 @@ def expert_lanes(
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Adjacent lanes of a lane that is long enough for a planned change and shorter than 100 m."""
+    """Return the adjacent lanes of a lane that is 70 to 100 m long and no connector; of others none."""
     current = network.lanes[lane]
     if current.connector or not 70.0 < current.length_m < 100.0:
         return []
@@ -78,9 +78,10 @@ def expert_path(
 def drive_ego(
     traffic: Traffic, staging: Staging, first_step: int, aware_step: int = 0, unplanned: Motion | None = None
 ) -> Generator[Run, Motion, tuple[Motion, str]]:
-    """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
+    """Drive ego like other traffic if that is acceptable and comfortable, else along a plan.
 
-    Others react to a plan, so each plan is simulated, checked, and replaced if it fails.
+    A plan knows the motion of the others, but they react to it: each of at most three plans is simulated, checked, and
+    replaced by one that begins no later if it fails. A safe but uncomfortable motion without a plan is the last resort.
 
     Args:
         traffic: All users, and the times of all steps on the clock of the lights.
@@ -110,7 +111,6 @@ def drive_ego(
     violation = check_motion(motion)
     if (not violation.cause and is_comfortable(motion)) or violation.cause in unfixable:
         return motion, violation.cause
-    # A safe but uncomfortable motion is the fallback.
     fallback = None if violation.cause else motion
     unreactive: frozenset[int] = frozenset()
     for begin in _first_steps(roles, motion, violation, first_step, aware_step):

@@ -37,9 +37,9 @@ _BOUNDS_BY_COMFORT = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0
 _GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
 _SHIFT_COST, _OFFSET_COST, _WRONG_WAY_COST = 8.0, 2.0, 6.0
-#: Cost of passing a line when the light is about to turn red or ego must give way.
+#: Weight, in ``Occupancy.near``, of a line at which the light is about to turn red or ego must give way.
 _LATE_COST = 30.0
-#: Factor on proximity costs for pedestrians and cyclists.
+#: Weight, in ``Occupancy.near``, of places close to pedestrians and cyclists.
 _VULNERABLE_FACTOR = 12.0
 #: Steps by which motion is extrapolated beyond the recording.
 _EXTRA_STEPS = 20
@@ -49,14 +49,14 @@ _PASSING_GAPS_M, _SHIFT_MPS2 = (0.8, 0.4), (1.6, 3.8)
 _FADE_M = 10.0
 #: Largest shift, m, and largest second derivative of the quintic step from 0 to 1, 10 / sqrt(3).
 _MAX_SHIFT_M, _STEP_CURVATURE = 4.5, 5.77
-#: Excess over a bound that counts as rounding, m, m/s or m/s2.
+#: Excess over a bound that counts as rounding, in the units of ``SpeedProfile.excess``.
 _TOLERANCE = 0.03
 
 _Series = Float64[np.ndarray, " time"]
 
 
 class _Hit(NamedTuple):
-    """Conflict with a user: its row, the step, and the sample of ego's path."""
+    """Conflict with another user: its index in ``_State.others``, the step, and the sample of ego's path."""
 
     user: int
     step: int
@@ -79,9 +79,9 @@ class _State:
         pose, from_m: Ego's pose and path position.
         acceleration: Ego's acceleration in the step before.
         others, valid: Boxes of the other users, and when they exist.
-        passed_m: Ego's distance along the path at each step of the last run.
+        passed_m: Ego's distance ahead of ``from_m`` at each step of the last run.
         vulnerable: Mask of pedestrians and cyclists among the others.
-        unreactive: Mask of others that do not react to ego.
+        unreactive: Mask of others that are not expected to react to ego.
     """
 
     roles: Roles
@@ -120,7 +120,8 @@ def plan_ego(
 ) -> EgoPlan:
     """Plan ego's motion from a given step on, given all users' motion in the last run.
 
-    ``unreactive`` users hit ego in an earlier run and are not expected to react; ``times_s`` are on the lights' clock.
+    ``unreactive`` are users that hit ego in an earlier run and so are not expected to react; ``times_s`` are on the
+    clock of the lights.
     """
     state = _state(roles, motion, times_s, first_step, unreactive)
     candidate, profile = _best_candidate(state)
@@ -184,7 +185,7 @@ def _extrapolate(
 
 
 def _lines(motion: Motion, times_s: _Series, state: _State) -> list[StopLine]:
-    """Return the stop lines ahead, during the plan and after it."""
+    """Return the stop lines ahead, at the steps of the plan and of its extrapolation."""
     steps, half = len(times_s), motion.size_m[: motion.vehicles, 0] / 2
     roles = state.roles
     distance, valid = motion.distance_m[:, -steps:], motion.valid[: motion.vehicles, -steps:]
@@ -248,6 +249,7 @@ def _occupancy(state: _State, candidate: CandidatePath, conflicts: Conflicts) ->
     weight = np.where(state.vulnerable[conflicts.user], _VULNERABLE_FACTOR, 1.0)
     np.maximum.at(near, (conflicts.step, conflicts.point), weight)
     hard[conflicts.step[conflicts.hard], conflicts.point[conflicts.hard]] = True
+    # Lines are so thick that ego does not pass over them within 0.1 s.
     thickness = int(np.ceil((0.1 * (float(candidate.preferred_mps.max()) + state.speed) + 0.5) / SPACING_M))
     for line in state.lines:
         if line.base_m < candidate.base_m[-1]:
@@ -285,7 +287,7 @@ def _smooth(state: _State, option: _Option) -> SpeedProfile:
 
 
 def _passing_options(state: _State, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
-    """Return options that pass the first obstacle, if there is one."""
+    """Return options that pass the first obstacle, if there is one; tight gaps only where wider ones fail."""
     hit = _first_hit(state, candidate, conflicts)
     if hit is None:
         return []
@@ -366,7 +368,7 @@ def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> 
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))
     offset = corners(box) - candidate.xy[point]
     along, left = offset @ np.array([c, s]), offset @ np.array([-s, c])
-    # Moving users are passed over a longer stretch.
+    # Moving users are passed over a longer stretch, which grows with their speed along the path.
     later = min(step + 10, len(state.others[user]) - 1)
     moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
     position = point * SPACING_M

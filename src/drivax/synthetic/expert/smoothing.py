@@ -15,11 +15,11 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S
 
-#: Weights of squared acceleration, jerk, and deviation from the coarse speed and position.
-_ACCELERATION, _JERK, _SPEED, _POSITION = 0.3, 0.6, 0.4, 0.03
-_PENALTY = 3e5
+#: Weights of squared acceleration, jerk, deviation from the coarse speed and position, and excess over a bound.
+_ACCELERATION, _JERK, _SPEED, _POSITION, _PENALTY = 0.3, 0.6, 0.4, 0.03, 3e5
 #: Steps from one knot of acceleration to the next.
 _KNOT_STEPS = 3
+#: Largest number of Newton steps, bisections of the line search, and largest change of a bounded value at the end.
 _NEWTON_STEPS, _BISECTIONS, _MIN_CHANGE = 40, 12, 1e-4
 
 _Series = Float64[np.ndarray, " time"]
@@ -42,7 +42,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Distance and speed from the present step on, and the largest excess over a bound (in its unit)."""
+    """Distance and speed from the present step on, and the largest excess over a bound: m, m/s, m/s2 or 10 m/s3."""
 
     at_m: _Series
     speed: _Series
@@ -76,9 +76,9 @@ def _matmul(rows: _Matrix, values: _Knots) -> _Rows:
 
 
 def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bounds: Bounds) -> SpeedProfile:
-    """Return the smoothest speed profile near a coarse plan (distances from 0, speeds; the first speed is kept).
+    """Return a smooth speed profile near a coarse plan: distances from 0, and speeds, the first of which is kept.
 
-    ``acceleration_mps2`` is the acceleration just before the first step.
+    ``acceleration_mps2`` is the acceleration just before the first step. Bounds that cannot be kept are exceeded.
     """
     steps = len(at_m) - 1
     rows, base = _matrices(steps)

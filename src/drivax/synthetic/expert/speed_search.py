@@ -16,15 +16,16 @@ from drivax.scenario.schema import DT_S
 #: Steps of the recording in one step of the search.
 COARSE = 5
 _STEP_S = COARSE * DT_S
-#: Approximate spacing of speeds, m/s, at most 30 % more: accelerations are about 1.5 m/s2 apart.
+#: Approximate spacing of speeds, m/s; it is fitted to the present speed, to at most 30 % more. Accelerations are then
+#: about 1.5 m/s2 apart.
 _SPEED_STEP_MPS = 0.75
 #: Lowest and highest acceleration, and the one below which braking costs more, m/s2.
 _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
 #: Costs per second of (m/s2)^2, and of (m/s)^2 below and above the preferred speed and above the limit of bends.
 _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
-#: Costs of hard braking, of a short time gap, and of a small distance at 5 m/s.
+#: Costs per second of (m/s2)^2 of hard braking, and, at 5 m/s, of a short gap ahead and of a small distance.
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
-#: Preferred time gap to users ahead, added to 1.5 m, s.
+#: Preferred time gap to places that ego must avoid ahead, added to 1.5 m, s.
 _HEADWAY_S = 1.1
 #: Cost of contact; even 0.02 of it exceeds any sum of other costs.
 TOUCH = 1e5
@@ -135,7 +136,7 @@ def _trace_back(
 
 
 class _OccupiedStates:
-    """Costs of occupied states (speed, place), which keep their speed within half a coarse step."""
+    """Costs of states (speed, place) by their occupancy; within half a coarse step before and after, speed is kept."""
 
     def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
         self._occupancy = occupancy
@@ -156,7 +157,7 @@ class _OccupiedStates:
         self._preferred_gap = _HEADWAY_S * grid.speed[:, None] + 0.5
 
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
-        """Cost of all states around a step."""
+        """Cost of all states from half a coarse step before a step to half a coarse step after it."""
         first = (step - COARSE // 2) * self._places
         contact = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
@@ -171,7 +172,7 @@ class _OccupiedStates:
 
 
 def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
-    """Return the distance from each place to the next hard one ahead, m (1 km: none)."""
+    """Return the distance from each place to the next hard one, m (0: it is hard itself; 1 km or more: none)."""
     places = occupancy.hard.shape[1]
     index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]

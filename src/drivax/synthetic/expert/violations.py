@@ -30,7 +30,7 @@ _STANDING_MPS, _BEFORE_LINE_M, _STOP_WINDOW_S = 0.5, 3.0, 3.0
 _WRONG_WAY_M = 2.0
 #: Distance from the route's lanes beyond which ego is off its route, m; the metric uses 2.
 _OFF_ROUTE_M = 1.9
-#: Difference of the distances to lanes of both directions below which the direction is open, m.
+#: A lane against the heading counts only if it is nearer than all others by more than this, m.
 _AMBIGUITY_M = 0.5
 #: Lowest and highest value of each quantity of comfort (nuPlan).
 LIMITS: dict[str, tuple[float, float]] = {
@@ -56,7 +56,7 @@ class Violation:
 
     Attributes:
         cause: Name of the violation (empty: none).
-        users, step: Users that ego collides with, and the first step of a collision.
+        users, step: Users that ego collides with, and the first step of a collision (other causes: none, 0).
     """
 
     cause: str = ""
@@ -76,10 +76,10 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
 def find_violation(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, staging: Staging, hardest_mps2: float
 ) -> Violation:
-    """Find the first violation of a motion from a given step on.
+    """Return the first violation of a motion from a given step on, in the order of the checks below.
 
-    Ego may drive against traffic in a staged event, or where cars are parked, which it may have to pass.
-    ``times_s`` are on the clock of the lights.
+    Ego may drive against traffic in scenarios with a staged event or with parked cars, which it may have to pass.
+    ``times_s`` are on the clock of the lights; ``hardest_mps2`` is the hardest accepted braking of ego.
     """
     window = slice(first_step, None)
     speed = motion.speed[0, window]
@@ -134,10 +134,10 @@ def first_overlap_step(
     dx, dy = (box[first, :, axis] - box[second, :, axis] for axis in (0, 1))
     gap = dx * dx + dy * dy
     near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
-    pair, time = np.nonzero(near)
-    hit = overlap(box[first[pair], time], box[second[pair], time])
+    index, time = np.nonzero(near)
+    hit = overlap(box[first[index], time], box[second[index], time])
     result = np.full((len(box), len(box)), box.shape[1])
-    np.minimum.at(result, (first[pair[hit]], second[pair[hit]]), time[hit])
+    np.minimum.at(result, (first[index[hit]], second[index[hit]]), time[hit])
     return np.minimum(result, result.T)
 
 
@@ -204,7 +204,7 @@ def _find_rule_violation(roles: Roles, motion: Motion, times_s: _Series, first_s
 def _passes_red_off_route(
     network: RoadNetwork, path: Path, xy: _Points, front: _Points, heading: _Series, red_steps: _LaneSteps
 ) -> bool:
-    """Whether ego, off its route, passes the line of another lane at red, as the metric does."""
+    """Whether ego, off its route, passes the line of another lane at red; the metric counts this, too."""
     own = {span.lane for span in path.spans}
     others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
     passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
@@ -223,7 +223,7 @@ def _front(motion: Motion, user: int) -> _Points:
 
 
 def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
-    """Return the step of ego's last stop at a stop sign that it then passes, else the first step."""
+    """Return the last step at which ego stands before it passes a stop sign, else the first step."""
     front, result = _front(motion, 0), first_step
     for span in (motion.paths or roles.paths)[0].spans:
         lane = roles.network.lanes[span.lane]
@@ -235,7 +235,7 @@ def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
 
 
 def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
-    """Whether ego stopped before each passing of a line."""
+    """Whether ego stopped at most 3 m before the line and 3 s before each passing of it."""
     for step in np.flatnonzero(passed):
         # The stop may lie before the recording.
         begin = max(0, first_step + int(step) - round(_STOP_WINDOW_S / DT_S))
@@ -250,9 +250,9 @@ def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Po
 def against_traffic(
     network: RoadNetwork, xy: Float64[np.ndarray, "place 2"], heading: Float64[np.ndarray, " place"]
 ) -> Bool[np.ndarray, " place"]:
-    """Mask of poses whose nearest lane leads the other way (more than 135 degrees apart).
+    """Mask of poses whose nearest lane leads the other way (headings differ by more than 135 degrees).
 
-    Where lanes cross, a lane that is at most 0.5 m further away and not against the heading decides.
+    It must be nearer than all lanes that do not, by more than 0.5 m: where lanes cross, these decide.
     """
     points = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
@@ -279,8 +279,8 @@ def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) ->
 def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float64[np.ndarray, "count count"]:
     """Return the Savitzky-Golay filter (Savitzky and Golay 1964) of ``count`` samples as a matrix.
 
-    The first and last polynomials extend to the ends. As in SciPy, an even window is centred half a sample before its
-    upper middle.
+    ``count`` is at least ``window``; derivatives are per sample. The first and last polynomials extend to the ends. As
+    in SciPy, an even window is evaluated half a sample before the upper one of its two middle samples.
     """
     half = window // 2
     first = np.clip(np.arange(count) - half + (window % 2 == 0), 0, count - window)

@@ -1,4 +1,4 @@
-"""Smooth plane curves of roads: positions with exact tangent headings, sampled at about 0.5 m."""
+"""Smooth plane curves of roads: positions and tangent headings, sampled at about 0.5 m."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Float64
 from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
 
-#: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
+#: Distance between the samples of a curve, m: chords stay within 3.2 mm of an arc of 10 m radius.
 STEP_M = 0.5
 #: Change of heading below which a quintic joins two poses, and above which a fillet does.
 _FILLET_ANGLE = math.radians(25.0)
-#: Length below which straight remainders are dropped, m.
+#: Length up to which straight remainders are dropped, m.
 _SHORTEST_M = 1e-3
 
 
@@ -85,7 +85,7 @@ class Curve:
     def at(
         self, along_m: Float64[np.ndarray, " n"]
     ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
-        """Positions and headings at distances along the curve, interpolated linearly."""
+        """Positions and headings at distances along the curve, interpolated linearly; beyond an end, that end."""
         return interpolate(along_m, self.arc_m, self.xy), np.interp(along_m, self.arc_m, self.heading)
 
     def parallel(self, left_m: float) -> Curve:
@@ -182,7 +182,7 @@ def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Cu
     unit = shape(513, 1.0, Pose(0.0, 0.0, 0.0))
     unit_tangent = math.hypot(*unit.xy[-1]) / 2 / math.cos(angle / 2)
     length = tangent_m / unit_tangent
-    # Integrate at an eighth of the step: the end meets the tangent point within a millimetre.
+    # Integrate at an eighth of the step: the end meets the tangent point within 2 mm.
     count = 8 * max(4, math.ceil(length / STEP_M))
     fine = shape(count + 1, length, start)
     return Curve(fine.xy[::8], fine.heading[::8])
@@ -208,7 +208,7 @@ def quintic(start: Pose, end: Pose) -> Curve:
 def tangent_lengths(start: Pose, end: Pose, sin: float) -> tuple[float, float]:
     """Return the distances ahead of ``start`` and behind ``end`` of the tangents' intersection.
 
-    ``sin`` is the sine of the angle between the tangents.
+    ``sin`` is the sine of the turn between the headings. A distance on the other side of its pose is negative.
     """
     dx, dy = end.x - start.x, end.y - start.y
     before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / sin
@@ -219,7 +219,7 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
     """Connect poses by a smooth curve: a fillet of the two tangents, or a quintic for small changes of heading.
 
     Raises:
-        ValueError: The tangents do not meet at least 1 m ahead of the start and behind the end.
+        ValueError: The tangents of a fillet do not meet at least 1 m ahead of the start and behind the end.
     """
     angle = float(wrap(end.heading - start.heading))
     if abs(angle) < _FILLET_ANGLE:
@@ -239,7 +239,7 @@ def connect_poses(start: Pose, end: Pose) -> Curve:
 def draw_winding_curve(
     rng: np.random.Generator, length_m: float, *, max_curvature: float, max_turn: float, start: Pose
 ) -> Curve:
-    """Draw a winding road: curvature is linear between random knots 35 to 90 m apart.
+    """Draw a winding road: curvature is linear between random knots 35 to 90 m apart, and 0 at the start.
 
     Curvature is at most ``max_curvature`` (1/m). Headings differ by at most ``max_turn`` (rad): below pi the curve
     cannot intersect itself.

@@ -56,9 +56,9 @@ class Lane:
         left, right: Neighbours of the same direction.
         connector: Whether the lane leads across a junction; connectors may cross, and have rules at the entry.
         control: Rule at the entry of a connector; the stop line is where it begins.
-        yields_to: Conflicting connectors with right of way; empty at all-way stops.
+        yields_to: Conflicting connectors with right of way, at lights only of the same phase; empty at all-way stops.
         ends: Whether the lane ends without a successor while the road continues (lane drops, acceleration lanes).
-        exit_only: Whether the lane leads off the road (deceleration lanes).
+        exit_only: Whether the lane leads off the road (deceleration lanes and off-ramps).
         kind: Type of the lane: for cars, or for bicycles only.
     """
 
@@ -149,7 +149,7 @@ class RoadNetwork:
     derived: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def with_signals(self, signals: SignalPlan | None) -> RoadNetwork:
-        """Return the same roads with other times of their lights; groups of lights must stay, cached results do."""
+        """Return the same roads with another plan for the same groups of lights; both share the cached results."""
         result = replace(self, signals=signals)
         result.__dict__["derived"] = self.derived
         return result
@@ -196,8 +196,8 @@ def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
 
 def _shared_length(a: Curve, b: Curve) -> float:
     """Return the distance along ``a`` over which it shares space with ``b``, m."""
-    separation = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
-    return float(a.arc_m[int(np.argmax(separation)) if separation.any() else -1])
+    is_clear = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
+    return float(a.arc_m[int(np.argmax(is_clear)) if is_clear.any() else -1])
 
 
 def _distances(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> Float64[np.ndarray, "a b"]:

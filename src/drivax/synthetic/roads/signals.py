@@ -30,7 +30,7 @@ class LightGroup:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Fixed-time plan of all junctions of a network: each phase is green, then yellow, then all lights are red.
+    """Fixed-time plan of all junctions of a network: each phase is green, then yellow, then its junction is all red.
 
     Attributes:
         phases: Indices of the groups that are green, per phase.
@@ -92,7 +92,7 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """Return the colours of ``lanes`` lanes (NONE without a light), and the time until yellow ends, s (else 0)."""
+        """Return the colours of ``lanes`` lanes (NONE without a light), and the rest of yellow, s (else 0)."""
         colour = np.zeros((len(times_s), lanes), np.int8)
         remaining_s = np.zeros((len(times_s), lanes))
         for group in self.groups:
@@ -101,7 +101,7 @@ class SignalPlan:
         for program in self._programs:
             cycle = self._duration_s(program)
             for phase in program:
-                # The offset keeps rounding from delaying a change that falls on a step.
+                # The microsecond keeps rounding from delaying a change that falls on a step.
                 since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
                 green = since < self.green_s[phase]
                 to_red = self.green_s[phase] + self.yellow_s - since
@@ -114,7 +114,7 @@ class SignalPlan:
 
 
 def yellow_time_s(limit_mps: float) -> float:
-    """Duration of yellow on an approach: one second of reaction, then a stop at 3.05 m/s2, at least 3 s.
+    """Duration of yellow: 1 s of reaction and half the time of a stop from the limit at 3.05 m/s2; at least 3 s.
 
     Kinematic formula ``t + v / (2 a)`` of the Institute of Transportation Engineers (Guidelines for Determining
     Traffic Signal Change and Clearance Intervals, 2020) on level ground.
@@ -125,7 +125,7 @@ def yellow_time_s(limit_mps: float) -> float:
 def combine_plans(first: SignalPlan, second: SignalPlan, lag_s: float) -> SignalPlan:
     """Combine the plans of two junctions, each with its own cycle; phase 0 of ``second`` turns green ``lag_s`` later.
 
-    The yellow and all-red times of ``first`` hold for both.
+    Offset, yellow and all-red times of ``first`` hold for both; each plan has one junction.
     """
     groups, phases = len(first.groups), len(first.phases)
     return replace(

@@ -16,7 +16,7 @@ class RoadStyle:
 
     Attributes:
         width_m, shoulder_m: Width of lanes, and drivable width beyond the outer ones, low and high.
-        limits_mps, fast_limits_mps: Speed limits of streets and of highways.
+        limits_mps, fast_limits_mps: Speed limits of streets and of highways; repeated ones are drawn more often.
         curvature: Factor on the curvature of streets without junctions.
         sidewalk_share, parking_share: Shares of roads with sidewalks and with bays, in families where they vary.
     """
@@ -32,7 +32,7 @@ class RoadStyle:
 
 #: Wide lanes and higher speeds.
 GRID = RoadStyle()
-#: Narrow lanes, low speeds, parked cars everywhere.
+#: Narrow lanes, low speeds, bays along most streets.
 RING = RoadStyle(
     width_m=(2.9, 3.3),
     limits_mps=(8.3, 8.3, 11.1, 13.9),
@@ -45,6 +45,6 @@ RING = RoadStyle(
 
 
 def draw_layout(rng: np.random.Generator, layouts: Layouts) -> tuple[int, int]:
-    """Draw the numbers of lanes of a street."""
+    """Draw the numbers of lanes ahead and of opposite lanes."""
     ahead, back, _ = layouts[rng.choice(len(layouts), p=[share for *_, share in layouts])]
     return ahead, back

@@ -3,7 +3,8 @@
 MOBIL: Kesting, Treiber and Helbing, "General lane-changing model MOBIL for car-following models", Transportation
 Research Record 1999 (2007). A change is made when it is safe for the new follower, ``a_n' > -b_safe``, and when
 ``a' - a + p (a_n' - a_n + a_o' - a_o) > threshold``, with the own acceleration a, those of the new and the old
-follower a_n and a_o, a dash for after the change, and the politeness p.
+follower a_n and a_o, a dash for after the change, and the politeness p. Here it must also be safe for the vehicle
+itself (``a' > -b_safe``), with minimum gaps on the new lane.
 """
 
 from __future__ import annotations
@@ -30,12 +31,15 @@ _SAFE_BRAKING_MPS2, _URGENT_BRAKING_MPS2 = 2.5, 4.5
 _MANDATORY_M, _MANDATORY_S = 120.0, 9.0
 #: Duration of a change, s, its least length, m, and the lowest speed of a discretionary one, m/s.
 _DURATION_S, _MIN_LENGTH_M, _MIN_SPEED_MPS = 4.2, 14.0, 3.0
-#: Required bumper-to-bumper gap ahead and behind, m and s.
-_GAP_M, _GAP_S = 2.0, 0.25
+#: Required bumper-to-bumper gap on the new lane, m; times added at the follower's speed behind and at the closing speed
+#: ahead, s; share by which urgency reduces the time behind.
+_GAP_M, _FOLLOWER_S, _CLOSING_S, _URGENT_SHARE = 2.0, 0.25, 1.0, 0.6
 #: Least distances of a discretionary change from the junction behind and to the one ahead, m.
 _FROM_JUNCTION_M, _TO_JUNCTION_M = 12.0, 25.0
-#: Half the length of a static obstacle, m.
-_HALF_OBSTACLE_M = 2.4
+#: Half the length of a static obstacle, m, and distance behind a vehicle up to which it counts as ahead, m.
+_HALF_OBSTACLE_M, _OBSTACLE_BEHIND_M = 2.4, 3.0
+#: Half the width of a car that an obstacle may block, m.
+_HALF_CAR_M = 0.95
 #: Largest braking to open a gap for others, m/s2.
 MAKE_ROOM_MPS2 = 1.8
 
@@ -54,7 +58,10 @@ class _ChainPositions(NamedTuple):
 
 
 class _Neighbours(NamedTuple):
-    """Nearest vehicle ahead of or behind each candidate: row (-1: none, or an obstacle), gap and speed."""
+    """Nearest vehicle or obstacle ahead of each candidate, or nearest vehicle behind it: row, gap and speed.
+
+    The row is -1 for none and for an obstacle; the gap is infinite for none.
+    """
 
     row: _Indices
     gap_m: _Values
@@ -63,7 +70,7 @@ class _Neighbours(NamedTuple):
 
 @dataclass(frozen=True)
 class LaneChains:
-    """Chains of successive lanes without a fork or a connector between them.
+    """Chains of successive lanes without a fork, a merge or a connector between them.
 
     Attributes:
         chain, offset_m: Chain of each lane (-1: a connector), and position of the lane's start along it.
@@ -134,7 +141,7 @@ def _next_in_chain(network: RoadNetwork, lane: int) -> int:
 
 
 def _targets(network: RoadNetwork, neighbours: list[int]) -> Int64[np.ndarray, " lane"]:
-    """Replace neighbours that cars may not change to by -1."""
+    """Return the neighbours, with -1 in place of those to which cars may not change."""
 
     def is_open(lane: int) -> bool:
         return not network.lanes[lane].connector and network.lanes[lane].kind != RoadKind.LANE_BIKE
@@ -170,7 +177,7 @@ NO_GAP_PAIRS = GapPairs(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 class VehicleState:
     """State of all vehicles, with the highest speed and the preferred acceleration on the own path.
 
-    ``free`` is a mask of vehicles that may change lanes: neither ego nor vehicles in a manoeuvre.
+    ``free`` is a mask of vehicles that may change lanes: neither ego nor vehicles in or just after a manoeuvre.
     """
 
     at_m: PerVehicle
@@ -289,8 +296,8 @@ class LaneChanges:
         safe = _SAFE_BRAKING_MPS2 + urgency * (_URGENT_BRAKING_MPS2 - _SAFE_BRAKING_MPS2)
         follower_speed = np.where(follower.row >= 0, now.speed[np.maximum(follower.row, 0)], 0.0)
         accepted = o.possible & (new_after > -safe) & (own_after > -safe)
-        accepted &= leader.gap_m > _GAP_M + _GAP_S * np.maximum(speed - leader.speed, 0.0) * 4
-        accepted &= follower.gap_m > _GAP_M + _GAP_S * follower_speed * (1 - 0.6 * urgency)
+        accepted &= leader.gap_m > _GAP_M + _CLOSING_S * np.maximum(speed - leader.speed, 0.0)
+        accepted &= follower.gap_m > _GAP_M + _FOLLOWER_S * follower_speed * (1 - _URGENT_SHARE * urgency)
         accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
         changes = self._select_changes(now, options, accepted, gain)
         changing = {change.vehicle for change in changes}
@@ -316,9 +323,9 @@ class LaneChanges:
     def _neighbours(
         self, now: VehicleState, vehicles: _Indices, positions: _ChainPositions, occupancy: _ChainPositions
     ) -> tuple[_Neighbours, _Neighbours]:
-        """Return the nearest vehicle or obstacle ahead of each position on its chain, and the nearest one behind."""
+        """Return the nearest vehicle or obstacle ahead of each position on its chain, and nearest vehicle behind it."""
         chain, position = positions
-        pair, world = np.arange(len(vehicles)), self._worlds.world[vehicles]
+        candidates, world = np.arange(len(vehicles)), self._worlds.world[vehicles]
         rows = self._worlds.rows[world]
         separation = occupancy.position_m.take(rows, axis=0) - position[:, None, None]
         is_candidate = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
@@ -330,24 +337,27 @@ class LaneChanges:
             # NumPy would reduce so short a last axis several times more slowly.
             gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - half_of_column
             column = gap.argmin(axis=1)
-            nearest, row = gap[pair, column], rows[pair, column]
-            neighbours.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
-        (row, nearest, speed), (behind, behind_gap, behind_speed) = neighbours
+            row, gap_m = rows[candidates, column], gap[candidates, column] - self._half[vehicles]
+            neighbours.append(_Neighbours(np.where(np.isfinite(gap_m), row, -1), gap_m, now.speed[row]))
+        leader, follower = neighbours
         if len(self._obstacle_m):
             ahead = self._obstacle_m - position[:, None]
-            on_chain = (self._obstacle_chain == chain[:, None]) & (ahead > -3.0)
-            obstacle = np.where(on_chain, ahead, np.inf).min(axis=1) - _HALF_OBSTACLE_M
-            row, speed = np.where(obstacle < nearest, -1, row), np.where(obstacle < nearest, 0.0, speed)
-            nearest = np.minimum(nearest, obstacle)
-        half = self._half[vehicles]
-        return _Neighbours(row, nearest - half, speed), _Neighbours(behind, behind_gap - half, behind_speed)
+            is_ahead = (self._obstacle_chain == chain[:, None]) & (ahead > -_OBSTACLE_BEHIND_M)
+            gap_m = np.where(is_ahead, ahead, np.inf).min(axis=1) - _HALF_OBSTACLE_M - self._half[vehicles]
+            is_nearer = gap_m < leader.gap_m
+            row, speed = np.where(is_nearer, -1, leader.row), np.where(is_nearer, 0.0, leader.speed)
+            leader = _Neighbours(row, np.minimum(leader.gap_m, gap_m), speed)
+        return leader, follower
 
     def _select_changes(
         self, now: VehicleState, options: _Options, accepted: _Mask, gain: _Values
     ) -> list[Change]:
-        """Return the best option of each vehicle; only one vehicle enters a gap at a time."""
+        """Return the best option of each vehicle.
+
+        Of vehicles less than 40 m apart (in positions along their own paths) only the best one enters a chain.
+        """
         changes: dict[int, Change] = {}
-        entries: list[tuple[int, float]] = []
+        entries: list[tuple[int, float]] = []  # chain and position of the changes so far
         order = sorted(
             (-float(gain[k]) - 100.0 * bool(options.mandatory[k]), int(options.vehicles[k]), k)
             for k in np.flatnonzero(accepted)
@@ -355,8 +365,8 @@ class LaneChanges:
         for _, row, k in order:
             target, position = int(options.target[k]), float(now.at_m[row])
             chain = int(self.chains.chain[target])
-            contested = any(chain == other and abs(position - at) < 40.0 for other, at in entries)
-            if row not in changes and not contested:
+            is_taken = any(chain == other and abs(position - entry_m) < 40.0 for other, entry_m in entries)
+            if row not in changes and not is_taken:
                 entries.append((chain, position))
                 changes[row] = Change(row, target, float(options.length_m[k]))
         return list(changes.values())
@@ -389,6 +399,6 @@ def _obstacle_positions(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, f
         curve = network.lanes[index].curve
         dx, dy = (np.subtract.outer(boxes.xy[:, k], curve.xy[::2, k]) for k in (0, 1))
         gap = dx * dx + dy * dy
-        for box in np.flatnonzero(gap.min(axis=1) < (0.95 + boxes.size_m[:, 1] / 2) ** 2):
+        for box in np.flatnonzero(gap.min(axis=1) < (_HALF_CAR_M + boxes.size_m[:, 1] / 2) ** 2):
             result.append((index, float(curve.arc_m[::2][np.argmin(gap[box])])))
     return result

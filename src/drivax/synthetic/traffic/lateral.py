@@ -100,7 +100,7 @@ def _moved_spans(
 def _enter_span(
     span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
-    """Enter a lane into the first free slot of the samples on which it is occupied."""
+    """Enter a lane into the first free slot of the samples on which it is occupied, if there is a free one."""
     is_occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
     for slot in range(SLOTS):
         is_free = is_occupied & (lane[:, slot] < 0)
@@ -112,7 +112,8 @@ def _enter_span(
 def quintic_step(at: _Samples, begin: tuple[float, float, float], length_m: float) -> _Samples:
     """Offset that fades to zero, with zero slope and curvature at the end, over a length.
 
-    ``begin`` is the first position with the offset (m) and slope (m/m) there; the second derivative is zero.
+    ``begin`` is the first position, with the offset (m) and slope (m/m) there; the second derivative is zero. Before it
+    the offset is linear with this slope, at most 10 m back.
     """
     start_m, offset, slope = begin
     u = np.clip((at - start_m) / length_m, 0.0, 1.0)
@@ -181,7 +182,7 @@ def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) 
 
 
 class DetourPositions(NamedTuple):
-    """Path positions of a detour: begin, end of the way out, begin of the way back, and end, m."""
+    """Path positions of a detour: beginning and end of the way out, beginning and end of the way back, m."""
 
     begin: float
     out_end: float
@@ -237,7 +238,7 @@ class Detours:
         self._edge = Boxes(xy, np.zeros(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 2)))
 
     def find(self, request: DetourRequest, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
-        """Return a path around the obstacles ahead, and the position where it rejoins the old one (m), if any."""
+        """Return a path around the next obstacles, and the old position (m) where it rejoins, or None without one."""
         half_width, half_length = request.size_m[1] / 2, request.size_m[0] / 2
         obstacles, _ = _extents(request, standing, request.at_m, LOOK_M + 40.0)
         front, side = request.at_m + half_length, half_width + DETOUR_MARGIN_M
@@ -262,14 +263,10 @@ class Detours:
         return None
 
     def _is_free(
-        self,
-        request: DetourRequest,
-        positions: DetourPositions,
-        lateral: float,
-        obstacles: Extents,
+        self, request: DetourRequest, positions: DetourPositions, lateral: float, obstacles: Extents,
         moving: Boxes,
-    ) -> bool:
-        """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
+    ) -> bool:  # fmt: skip
+        """Whether the detour is free of road edges, standing obstacles and oncoming, crossing or overtaking users."""
         begin, out_end, back, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
@@ -290,7 +287,7 @@ class Detours:
         nearest_m = others.near_m + np.minimum(speed, 0.0) * duration_s
         is_ahead = (others.far_m > position) & (nearest_m < end + 5.0)
         is_behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
-        # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
+        # A user beyond the detour that drives on is a leader, not a conflict.
         is_ahead &= ~((speed > 1.0) & (others.near_m > back))
         return not bool(np.any(is_in_corridor & (is_ahead | is_behind)))
 

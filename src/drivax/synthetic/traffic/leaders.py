@@ -15,7 +15,7 @@ from drivax.synthetic.traffic.path_arrays import (
 from drivax.synthetic.traffic.paths import SLOTS
 from drivax.synthetic.traffic.roles import Drivers
 
-#: Half of the lane width that passing a cyclist takes, m: half a bicycle, its distance from the kerb, 1.5 m to a car.
+#: Right part of a lane that a cyclist takes, m: half a bicycle, its distance from the kerb, 1.5 m to a passing car.
 _CYCLIST_PASSING_M = 0.35 + 0.55 + 1.5
 
 
@@ -27,7 +27,7 @@ class Leaders:
         self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
         self._rows = np.arange(len(self._half_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist within each lane.
+        # Half the width of the widest car that may pass a cyclist in the middle of each lane.
         widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
         self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
         self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
@@ -35,37 +35,39 @@ class Leaders:
     def find(
         self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
     ) -> tuple[PerVehicle, VehicleRows]:
-        """Return the gap to the nearest vehicle ahead on the own lanes (infinite: none), and its row."""
-        own, world = at_m[:, None], self._worlds.world
+        """Return the gap to the nearest vehicle ahead on the lanes of the path (infinite: none), and its row.
+
+        A world without a vehicle on a lane keeps its last result.
+        """
+        own_m, world = at_m[:, None], self._worlds.world
         lane, along = tables.lanes_at(at_m)
         lane[~active] = -1
-        # The k-th occupied (vehicle, lane) of each world, and its position on the path of each vehicle.
+        # Occupied (vehicle, lane) of each world, padded with -1, and their positions on the path of each vehicle.
         slots = (lane.ravel() >= 0).nonzero()[0]
         if not len(slots):
             return self._nearest
         vehicle, lane = slots // SLOTS, lane.ravel().take(slots)
-        k = group_indices(world[vehicle], len(self._worlds))
-        lanes = np.where(k < 0, self._worlds.first_lane[:-1, None], lane[k])
+        entry = group_indices(world[vehicle], len(self._worlds))
+        lanes = np.where(entry < 0, self._worlds.first_lane[:-1, None], lane[entry])
         index = lanes.take(world, axis=0)
         index += tables.column[:, None]
         position = tables.scale.take(index)
-        position *= along.ravel().take(slots)[k].take(world, axis=0)
+        position *= along.ravel().take(slots)[entry].take(world, axis=0)
         # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
         position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = vehicle[k]
-        is_ahead = (position > own) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
+        vehicle_ahead = vehicle[entry]
+        is_ahead = (position > own_m) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
         if self._any_cyclist:
             # Cyclists are overtaken within lanes that are wide enough.
             limit_m = np.where(self._cyclist[vehicle_ahead], self._passing_half_m[lanes], -np.inf)
             is_ahead &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
-        position -= np.where(k < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
+        position -= np.where(entry < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
         gap = np.where(is_ahead, position, np.inf)
-        gap -= own
+        gap -= own_m
         gap -= self._half_m[:, None]
         nearest = gap.argmin(axis=1)
         result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
-        # A world without a vehicle on a lane keeps the last result.
-        empty = (k[:, 0] < 0)[world]
+        empty = (entry[:, 0] < 0)[world]
         for values, last in zip(result, self._nearest, strict=True):
             values[empty] = last[empty]
         self._nearest = result

@@ -14,7 +14,7 @@ from drivax.synthetic.traffic.paths import Path
 
 #: Lateral margin of the corridor for vehicles, which keep to their lanes, and for other users, m.
 _VEHICLE_MARGIN_M, _SIDE_MARGIN_M = 0.05, 0.2
-#: Half width of other vehicles at most, m: of a turning one only the middle counts.
+#: Largest half extent of another vehicle across a path, m: of a turning one only the middle counts.
 _MAX_HALF_WIDTH_M = 1.3
 #: Search for moving obstacles: range ahead, spacing of the path's samples, and half width, m.
 _RANGE_M, _SAMPLE_M, _MAX_LATERAL_M = 50.0, 2.0, 16.0
@@ -74,7 +74,7 @@ class Extents:
 
 
 def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " box"]]:
-    """Return the extents of the boxes near a path, and their rows; over the length of a box the path is straight."""
+    """Return the extents of the boxes near a path, and their rows, as if the path were straight along each box."""
     coarse = path.curve.xy[::8]
     near_bounds = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
     inside = np.flatnonzero(near_bounds[:, 0] & near_bounds[:, 1])
@@ -178,6 +178,7 @@ def nearest_obstacles(
 ) -> tuple[PerVehicle, PerVehicle]:  # fmt: skip
     """Return the gap from each front bumper to the nearest obstacle in the path's corridor, and its speed along it.
 
+    Without an obstacle the gap is infinite and the speed 0, which is also the speed of obstacles that come closer.
     ``others`` are the moving users that are not vehicles; ``by_world`` has their indices, padded with -1.
     """
     count, users = len(vehicles), vehicles.concatenate(others)
@@ -186,7 +187,7 @@ def nearest_obstacles(
     if not len(viewer):
         return gap, speed
     pose, sample_m, squared_gap = _nearest_samples(tables, at_m, viewer, users.xy[user])
-    # Ignore obstacles beyond the last sample of the path, and next to the vehicle.
+    # Ignore users at least 8 m from all samples ahead.
     k = (squared_gap < 64.0).nonzero()[0]
     viewer, user, pose, sample_m = viewer[k], user[k], pose[k], sample_m[k]
     position, left, relative_heading = _relative_poses(users, user, pose[:, :2], pose[:, 2])
@@ -254,8 +255,8 @@ def _nearest_samples(
     points, index = tables.samples_ahead(at_m, viewer, _SAMPLES_M)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
     separation = dx * dx + dy * dy
-    pair = np.arange(len(viewer)), separation.argmin(axis=1)
-    return points[pair], index[pair] * tables.step_m[viewer], separation[pair]
+    nearest = np.arange(len(viewer)), separation.argmin(axis=1)
+    return points[nearest], index[nearest] * tables.step_m[viewer], separation[nearest]
 
 
 def _leaves_corridor(

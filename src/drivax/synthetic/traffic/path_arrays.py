@@ -18,7 +18,7 @@ VehicleRows = Int64[np.ndarray, " v"]
 #: Vehicles of a look-up.
 Rows = slice | VehicleRows
 ALL_ROWS = slice(None)
-#: Initial columns for crossings, spare columns for connectors, and initial capacity for samples per sample.
+#: Initial columns for crossings, spare columns for connectors, and initial capacity over the number of samples.
 _CROSSING_COLUMNS, _SPARE_COLUMNS, _CAPACITY = 4, 4, 1.3
 
 
@@ -87,7 +87,7 @@ class Worlds:
         return len(self.networks)
 
     def vehicles(self, world: int) -> slice:
-        """Rows of a world."""
+        """Rows of the vehicles of a world."""
         return slice(int(self.first_row[world]), int(self.first_row[world + 1]))
 
     def mask(self, worlds: Int64[np.ndarray, " item"]) -> Bool[np.ndarray, " world"]:
@@ -109,7 +109,7 @@ class PathTables:
         column: Offset from a lane to its index in these arrays, flattened.
         connector, connector_begin, connector_end: Connectors in order of travel (-1: none), and path positions.
         crossing, crossing_m: Marked crossings in order of travel (-1: none), and positions of their near side.
-        crossings: Largest number of crossings on a path of each world.
+        crossings: Largest number of marked crossings on a path of each world, at least 4.
         stop_m: End of the last lane if the road continues without it, m (else infinite).
     """
 
@@ -134,7 +134,7 @@ class PathTables:
             self.replace(row, path)
 
     def replace(self, row: int, path: Path) -> None:
-        """Enter the path of one vehicle."""
+        """Replace the path of one vehicle."""
         self.paths[row] = path
         n, world = len(path.curve.xy), self.worlds.world[row]
         self._grow(self._sample_count + n)

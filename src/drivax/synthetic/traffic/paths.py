@@ -92,11 +92,11 @@ class LaneChange:
 
 def next_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Return successors that keep a path free of repeated lanes and full roundabout turns."""
-    seen = set(lanes)
+    visited = set(lanes)
     return [
         lane
         for lane in network.lanes[lanes[-1]].successors
-        if lane not in seen and not seen.issuperset(network.lanes[lane].successors or (-1,))
+        if lane not in visited and not visited.issuperset(network.lanes[lane].successors or (-1,))
     ]
 
 
@@ -200,9 +200,9 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
             along[(current < span.from_m) | (current > span.until_m)] = math.inf
         for shared_lane, until_m in _shared_lanes(network)[span.lane]:
             on_lane = ((along < until_m) & (slots < SLOTS)).nonzero()[0]
-            place = (first + on_lane) * SLOTS + slots[on_lane]
-            lane.put(place, shared_lane)
-            lane_m.put(place, along[on_lane])
+            slot_index = (first + on_lane) * SLOTS + slots[on_lane]
+            lane.put(slot_index, shared_lane)
+            lane_m.put(slot_index, along[on_lane])
             slots[on_lane] += 1
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
@@ -238,7 +238,7 @@ def _shared_lanes(network: RoadNetwork) -> list[list[tuple[int, float]]]:
         for before in network.lanes[lane].predecessors:
             for other in network.lanes[before].successors:
                 if other != lane:
-                    # The rear of a vehicle leaves later than its centre, by half its length.
+                    # The rear of a car of 5 m leaves 2.5 m later than its centre.
                     shared.append((other, network.shared_m[lane, other] + 2.5))
     return result
 

@@ -153,7 +153,8 @@ class Pedestrians:
         self._has_crossing = self._crossing >= 0
         self._crossing += worlds.first_crossing[self.world]
         self._any_crosses = bool(self._has_crossing.any())
-        # At lights and unmarked crossings drivers need not yield to pedestrians at the kerb.
+        # Pedestrians expect drivers to yield at marked crossings and lights; at the kerb they have priority only at
+        # marked crossings without lights.
         marked = np.concatenate([conflicts.marked for conflicts in self._conflicts])
         lights = np.concatenate([conflicts.red.any(axis=1) for conflicts in self._conflicts])
         self._has_yielding_drivers = marked | lights
@@ -166,7 +167,7 @@ class Pedestrians:
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Return all pedestrians at step ``t`` and a mask of occupied crossings, then advance.
 
-        A crossing is occupied if a pedestrian is on it or, where drivers must yield, about to step on it.
+        A crossing is occupied if a pedestrian is on it, or within 1 m of it and released or with priority.
         """
         sample = np.minimum(np.maximum(self._position_m / self._step_m, 0.0), self._last)
         index = np.minimum(sample.astype(int), self._last - 1)
@@ -222,14 +223,14 @@ class Pedestrians:
     def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
         """Release pedestrians of a world if its active vehicles leave them a gap."""
         conflicts, crossing = self._conflicts[world], self._crossing[waiting]
-        local, place = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
+        local, inverse = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
-        any_s, hard_s = (s[place] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
+        any_s, hard_s = (s[inverse] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
         has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
         safe = np.where(self._has_yielding_drivers[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(safe):
-            is_blocked = overlap(conflicts.strip[local[place[safe]], None], boxes[None]).any(axis=1)
+            is_blocked = overlap(conflicts.strip[local[inverse[safe]], None], boxes[None]).any(axis=1)
             self._is_released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:
@@ -252,7 +253,7 @@ class Pedestrians:
 def _remaining_red_s(
     network: RoadNetwork, red: Bool[np.ndarray, "crossing lane"], times_s: Float64[np.ndarray, " time"]
 ) -> Float64[np.ndarray, "time crossing"]:
-    """Return the time until a conflicting light turns green, s, by step and crossing (infinite: no lights)."""
+    """Return the time for which all conflicting lights stay red, s, by step and crossing (infinite: no lights)."""
     remaining_s = np.full((len(times_s), len(red)), math.inf)
     if network.signals is None or not red.any():
         return remaining_s
@@ -260,10 +261,10 @@ def _remaining_red_s(
     next_cycle_s = times_s[-1] + DT_S * np.arange(1, math.ceil(network.signals.cycle_s / DT_S) + 1)
     colour, _ = network.signals.colours(np.concatenate([times_s, next_cycle_s]), len(network.lanes))
     for crossing in np.flatnonzero(red.any(axis=1)):
-        is_green = (colour[:, red[crossing]] != Colour.RED).any(axis=1)
-        steps = np.where(is_green, np.arange(len(is_green)), len(is_green))
-        next_green = np.minimum.accumulate(steps[::-1])[::-1]
-        remaining_s[:, crossing] = ((next_green - np.arange(len(is_green))) * DT_S)[: len(times_s)]
+        is_red = (colour[:, red[crossing]] == Colour.RED).all(axis=1)
+        steps = np.arange(len(is_red))
+        red_end = np.minimum.accumulate(np.where(is_red, len(is_red), steps)[::-1])[::-1]
+        remaining_s[:, crossing] = ((red_end - steps) * DT_S)[: len(times_s)]
     return remaining_s
 
 
@@ -310,7 +311,8 @@ def place_pedestrians(
 ) -> tuple[Pedestrian, ...]:
     """Draw pedestrians along sidewalks, in both directions, and at crossings, ``per_100m / 2`` on average at each.
 
-    Those at crossings reach the kerb between 4 s before and 8 s after time 0 if nothing stops them.
+    Those at crossings reach the kerb between 4 s before and 8 s after time 0 if nothing stops them, or earlier if the
+    way to it is short.
     """
     pedestrians = []
     for sidewalk in network.sidewalks:
@@ -353,7 +355,7 @@ def _draw_crossing_pedestrian(
 def _along_sidewalk(
     network: RoadNetwork, kerb: _Point, outward: _Point, rng: np.random.Generator
 ) -> Float64[np.ndarray, "point 2"]:
-    """Continue from a kerb: along a nearby sidewalk, in either direction, or straight off the road."""
+    """Continue from a kerb: along the nearest sidewalk within 6 m, in either direction, else straight off the road."""
     best: tuple[float, Curve, int] | None = None
     for sidewalk in network.sidewalks:
         gap = np.hypot(*(sidewalk.xy - kerb).T)

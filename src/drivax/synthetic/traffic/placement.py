@@ -21,8 +21,8 @@ _PASSAGE_M = 2.3
 _MANOEUVRING_ROOM_M = 0.6
 #: Distance of double-parked cars from the ends of lanes, m.
 _MIN_FROM_ENDS_M = 15.0
-#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time gap added to it, s.
-_GAP_M, _GAP_S = 5.0, 0.9
+#: Smallest distance between centres of vehicles placed on a lane: a vehicle's length and a gap, m, and a time gap, s.
+_LENGTH_M, _GAP_M, _GAP_S = 10.0, 5.0, 0.9
 #: Free gaps on busy lanes relative to those elsewhere.
 _BUSY_GAP_SHARE = 0.4
 #: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
@@ -132,11 +132,11 @@ class Density:
     """Density and composition of traffic.
 
     Attributes:
-        spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
+        spacing_m: Mean gap between vehicles of a lane beyond the smallest one, drawn per scenario, low and high.
         vehicles: Maximum number of vehicles without ego; those nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
-        cyclist_share: Share of cyclists on streets.
-        leader_share: Share of scenarios with a vehicle right ahead of ego.
+        cyclist_share: Share of cyclists on lanes with a limit of at most 16 m/s.
+        leader_share: Share of scenarios with a vehicle 18 to 45 m ahead of ego, of those with room on its lane.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
@@ -173,7 +173,7 @@ def place_vehicles(
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
-        minimum = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
+        minimum = _least_spacing_m(lane)
         occupied = [along for other, along in vehicles if other == index]
         occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY_GAP_SHARE if index in network.busy or index in busy else 1.0)
@@ -192,8 +192,12 @@ def place_vehicles(
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
+def _least_spacing_m(lane: Lane) -> float:
+    return _LENGTH_M + _GAP_M + _GAP_S * lane.limit_mps
+
+
 def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles that overlap an earlier one on another lane, for example where lanes fork or merge."""
+    """Drop vehicles close to an earlier one, which may be on another lane, for example where lanes fork or merge."""
     centres: list[tuple[float, float]] = []
     result = []
     for lane, along in [ego, *vehicles]:
@@ -201,19 +205,19 @@ def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _
         x, y = _point_on_lane(network, lane, along)
         heading = float(np.interp(along, curve.arc_m, curve.heading))
         cos, sin = np.cos(heading), np.sin(heading)
-        overlaps = (
+        is_close = (
             abs((x - a) * cos + (y - b) * sin) < _MIN_SEPARATION_M
             and abs((y - b) * cos - (x - a) * sin) < _MAX_WIDTH_M
             for a, b in centres
         )
-        if not any(overlaps):
+        if not any(is_close):
             centres.append((float(x), float(y)))
             result.append((lane, along))
     return result[1:]
 
 
 def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[ScriptedUser, ...]) -> bool:
-    """Whether a parked car is in the lane at or close to a position."""
+    """Whether a parked car is in the lane up to 30 m ahead of a position or up to 14 m behind it."""
     curve = network.lanes[lane].curve
     index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[index]), np.sin(curve.heading[index])
@@ -234,7 +238,7 @@ def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) 
         first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
     for lane, along in vehicles:
         current = network.lanes[lane]
-        minimum = 10.0 + _GAP_M + _GAP_S * current.limit_mps
+        minimum = _least_spacing_m(current)
         next_along = min((first.get(b, np.inf) for b in current.successors), default=np.inf)
         # Only the last vehicle of a lane can be too close to the first one of the next lane. Ego always stays.
         along_before_ego = network.lanes[ego[0]].length_m - ego[1] + along
@@ -255,7 +259,7 @@ def draw_drivers(
 ) -> Drivers:
     """Draw vehicles and drivers.
 
-    If ``lanes`` has the first lane of each, fast roads get no cyclists, and bicycle lanes only cyclists.
+    With ``lanes``, the first lane of each vehicle, fast roads get no cyclists, and bicycle lanes only cyclists.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     # Types in the order of the shares; the rest are cars.

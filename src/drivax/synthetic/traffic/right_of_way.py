@@ -1,7 +1,8 @@
 """Right of way at connectors: lights, signs, priority, and room to leave.
 
-A driver requests a connector shortly before it would have to brake for its stop line. Once granted, the connector is
-held until the rear bumper has left the conflict zones; conflicting connectors are not granted meanwhile.
+A driver requests a connector shortly before it would have to brake for its stop line. Until the rear bumper has left
+the zone in which two connectors conflict, the other one is granted only to drivers that cannot stop any more. A light
+that closes takes back a grant.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from drivax.synthetic.traffic.roles import Drivers
 
 #: Braking with which a driver can still stop when it requests a connector, m/s2, and reserves of time and distance.
 _REQUEST_MPS2, _REQUEST_S, _REQUEST_M = 2.0, 0.7, 3.5
-#: Required braking up to which a driver waits for a blocker to clear, m/s2, and speed of turning vehicles, m/s.
+#: Required braking below which a driver does not brake yet for blockers that clear in time, m/s2, and their top speed
+#: while they do, m/s.
 _WAITING_MPS2, _TURNING_MPS = 3.4, 7.0
-#: Hardest braking for others, m/s2.
-_HARDEST_MPS2 = 6.5
+#: Largest required braking to stop: for others, at red, and at yellow that turns red before the line is reached, m/s2.
+_HARDEST_MPS2, _RED_MPS2, _LATE_YELLOW_MPS2 = 6.5, 8.0, 5.0
 #: A vehicle has stopped at a sign below this speed, m/s, and within this distance of the line, m.
 _STOPPED_MPS, _STOPPED_M = 0.2, 4.5
 #: Least duration of a stop at a stop sign, s.
@@ -97,8 +99,8 @@ def conflict_zones(
             for i, j, hit in ((a, b, is_near.any(axis=1)), (b, a, is_near.any(axis=0))):
                 if hit.any():
                     step = network.lanes[i].length_m / (hit.size - 1)
-                    places = np.flatnonzero(hit)
-                    begin[i, j], end[i, j] = places[0] * step, places[-1] * step
+                    samples = np.flatnonzero(hit)
+                    begin[i, j], end[i, j] = samples[0] * step, samples[-1] * step
     return begin, end
 
 
@@ -233,7 +235,7 @@ class RightOfWay:
         return result
 
     def _closed_lines(self, state: TrafficState) -> tuple[PerVehicle, VehicleRows]:
-        """Return the distance to the nearest line closed by a light, and the slot of its connector (last + 1: none)."""
+        """Return the distance to the nearest line closed by a light, and its slot (infinite, number of slots: none)."""
         begin, connector = state.tables.connector_begin, state.tables.connector
         count = connector.shape[1]
         if not np.count_nonzero(state.colour):
@@ -244,8 +246,9 @@ class RightOfWay:
         to_stop = speed**2 / (2 * np.maximum(distance, 0.05))
         colour = state.colour.take(connector)
         is_late = distance > speed * state.to_red.take(connector)
-        stops_at_yellow = (to_stop <= self._drivers.yellow_mps2[:, None]) | (is_late & (to_stop <= 5.0))
-        is_closed = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= 8.0))
+        stops_at_yellow = to_stop <= self._drivers.yellow_mps2[:, None]
+        stops_at_yellow |= is_late & (to_stop <= _LATE_YELLOW_MPS2)
+        is_closed = ((colour == _YELLOW) & stops_at_yellow) | ((colour == _RED) & (to_stop <= _RED_MPS2))
         is_closed &= distance < np.inf
         first = is_closed.argmax(axis=1)
         flat = first + count * self._rows
@@ -255,7 +258,10 @@ class RightOfWay:
     def _grant(
         self, state: TrafficState, world: int, requests: list[_Request], holders: _Holders, stop: PerVehicle
     ) -> None:
-        """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival."""
+        """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival.
+
+        A request that only waits for blockers which clear in time is postponed.
+        """
         rules = self._rules[world]
         for request in requests:
             i = request.row
@@ -333,7 +339,7 @@ class RightOfWay:
     def _clears_in_time(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
     ) -> bool:
-        """Whether a driver with priority need not brake yet, since all blockers will clear before it arrives."""
+        """Whether a driver with priority over all blockers need not brake, since they clear before it arrives."""
         connector = request.connector
         if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
@@ -366,13 +372,13 @@ class RightOfWay:
         if not is_coming.any():
             return True
         rows, columns = np.nonzero(is_coming)
-        speed, own = state.speed[vehicles][rows], others[columns]
+        speed, rivals = state.speed[vehicles][rows], others[columns]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         departure = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, acceleration = request.speed, float(self._drivers.acceleration_mps2[i])
-        to_zone = request.distance_m + rules.zone_begin[connector, own]
-        through_zone = request.distance_m + rules.zone_end[connector, own] + self._length[i]
+        to_zone = request.distance_m + rules.zone_begin[connector, rivals]
+        through_zone = request.distance_m + rules.zone_end[connector, rivals] + self._length[i]
         enter = time_to_cover(to_zone, own_speed, acceleration, top)
         leave = time_to_cover(through_zone, own_speed, acceleration, top)
         wait_s = state.step * DT_S - self._stopped_at_s[i] if self._stopped_at_s[i] < np.inf else 0.0

@@ -39,9 +39,9 @@ _FEEDER_LENGTH_M = 160.0
 _ARRIVAL_S = (0.4, 4.0)
 #: Least position of ego along its path, m.
 _MIN_START_M = 12.0
-#: Number of further draws of a route on which ego does not have to give way.
+#: Largest number of further draws of a route, until ego must give way on it.
 _EXTRA_ROUTES = 4
-#: Shares of the phases in which ego meets its next light: green on arrival, turning green, turning red.
+#: Shares of the states of ego's next light at time 0: green, turning green, turning yellow within 5 s.
 SignalTiming = tuple[float, float, float]
 _Values = Float64[np.ndarray, " n"]
 
@@ -95,11 +95,12 @@ def assign_roles(
         network: The roads.
         domain: Density and composition of traffic.
         times_s: Times of all steps; the warm-up of traffic ends at time 0.
-        lane_change_share: Share of scenarios, of those with room, in which ego plans a lane change.
-        timing: Shares of the phases in which ego meets its next light.
+        lane_change_share: Share of random routes with room for it on which ego plans a lane change.
+        timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination it is green
+            on arrival.
         rng: Source of randomness.
-        destinations: Candidate places for ego to pass in free traffic; without any, ego's route is random.
-        critical: Whether ego must give way to dense traffic, if the roads allow it.
+        destinations: Candidate places for ego to pass; if it can reach none, its route is random.
+        critical: Whether ego must give way to dense traffic, if the roads allow it; ``destinations`` are ignored.
     """
     driver = expert.draw_expert(rng)
     destination_route = draw_route(network, yielding_destinations(network) if critical else destinations, rng)
@@ -137,7 +138,7 @@ def _draw_route(
     network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
     destination_route: DestinationRoute | None, attempts: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
-    """Draw ego's lanes, path and position before the warm-up, up to ``attempts`` times more without a conflict."""
+    """Draw ego's lanes, path and position before the warm-up; again, up to ``attempts`` times, without a conflict."""
     if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
@@ -158,7 +159,7 @@ def _shift_lights(
     network: RoadNetwork, lanes: tuple[int, ...], timing: SignalTiming,
     destination_route: DestinationRoute | None, rng: np.random.Generator,
 ) -> SignalPlan | None:  # fmt: skip
-    """Shift the plan: ego's next light is green when the recording begins, or turns green or yellow within 5 s."""
+    """Shift the plan: ego's next light is green at time 0 or on arrival, or turns green or yellow within 5 s."""
     plan, ahead = network.signals, lanes if destination_route is None else lanes[destination_route.place :]
     signalised = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
     if plan is None or not signalised:
@@ -179,7 +180,7 @@ def _shift_lights(
 def _first_speeds(
     network: RoadNetwork, paths: list[Path], drivers: Drivers, distance: _Values, rng: np.random.Generator
 ) -> _Values:
-    """Draw speeds at which each vehicle can stop at its next stop line."""
+    """Draw speeds at which each vehicle can stop 2 m before its next connector with 1.5 m/s2."""
     speeds = []
     for i, path in enumerate(paths):
         fastest = driver_profile(path, drivers, i)

@@ -96,7 +96,7 @@ class Pedestrian:
 
 @dataclass(frozen=True)
 class ScriptedUser:
-    """A road user with a fixed trajectory, parked or part of an event; it reverses at negative speeds."""
+    """A road user with a fixed trajectory, parked or an actor of an event; at negative speeds it reverses."""
 
     kind: AgentKind
     size_m: tuple[float, float, float]
@@ -190,8 +190,9 @@ class Motion:
     Attributes:
         xy, heading, speed: Pose of the box centre and signed speed along the heading.
         valid: Mask of the steps at which a user is on the map.
-        distance_m: Position along each vehicle's present path.
+        distance_m: Position along the path that each vehicle follows at the step.
         acceleration: Acceleration of each vehicle from each step to the next one.
+        paths: Path of each vehicle at the last step; empty: those of the roles.
     """
 
     kind: Int8[np.ndarray, " user"]

@@ -60,8 +60,12 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, ScriptedUser,
 _LINE_GAP_M = 1.0
 #: Distance kept to an obstacle in the lane, which leaves room for passing it, m.
 _OBSTACLE_GAP_M = 5.0
-#: Distance kept to the end of a lane in addition to the IDM's gap of 2 m, m.
-_LANE_END_GAP_M = 10.0
+#: Gap that the IDM keeps, and distance kept to the end of a lane in addition to it, m.
+_IDM_GAP_M, _LANE_END_GAP_M = 2.0, 10.0
+#: Largest speed of a vehicle that starts a detour; in worlds with a stuck vehicle or a halted user, m/s.
+_DETOUR_MPS, _SLOW_DETOUR_MPS = 9.0, 3.0
+#: Speed below which vehicles and users count as halted, m/s, and length of users that need a detour, m.
+_HALTED_MPS, _LARGE_M = 0.05, 1.2
 #: Time constant with which a driver follows the speed profile, s.
 _SPEED_TIME_S = 0.6
 #: Deceleration beyond which a driver's own jerk limit is replaced, m/s2, and the limit that replaces it, m/s3.
@@ -160,7 +164,7 @@ class Traffic:
             self.colour, self.to_red = roles.network.signals.colours(times_s, shape[1])
 
     def before_step(self, steps: int) -> Traffic:
-        """Return the traffic with fewer steps."""
+        """Return the traffic of the first ``steps`` steps."""
         shorter = copy.copy(self)
         shorter.times_s = self.times_s[:steps]
         return shorter
@@ -194,7 +198,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 
 
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
-    """Run tasks and return their results in order.
+    """Run tasks and yield their results in order.
 
     Each task yields runs and receives their motion. Up to six runs of different tasks are simulated together.
     """
@@ -324,12 +328,12 @@ class _Simulation:
         """Record a step and advance all users to the next one."""
         log = self._log
         plans = [
-            (row, plan, min(t - plan.first_step, len(plan.speed) - 1), at)
-            for row, plan, at in self._plans
+            (row, plan, min(t - plan.first_step, len(plan.speed) - 1), position_m)
+            for row, plan, position_m in self._plans
             if t >= plan.first_step
         ]
-        for row, plan, k, at in plans:
-            self._position_m[row], self._speed[row] = at[k], plan.speed[k]
+        for row, plan, k, position_m in plans:
+            self._position_m[row], self._speed[row] = position_m[k], plan.speed[k]
         active = self._position_m + self._half_m < self._tables.length_m
         ahead_m = self._position_m + self._speed * _SPEED_TIME_S
         sample = self._tables.interpolate(np.concatenate((self._position_m, ahead_m)).reshape(2, -1))
@@ -346,7 +350,7 @@ class _Simulation:
         log.acceleration[t] = self._advance(self._apply_reaction_times(t, preferred), active)
 
     def _switch_path(self, t: int, row: int, path: Path, position_m: float, end_m: float) -> None:
-        """Put a vehicle at a position on another path; it makes no decisions before ``end_m``."""
+        """Put a vehicle at a position on another path; it starts no further manoeuvre before ``end_m``."""
         world = int(self._worlds.world[row])
         crossings = self._tables.crossings[world]
         self._tables.replace(row, path)
@@ -358,7 +362,7 @@ class _Simulation:
         self._busy_m[row], self._rest_until[row] = end_m, t + _REST_STEPS
 
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
-        """Advance the pedestrians and gather scripted users."""
+        """Advance the pedestrians, and gather them and the moving scripted users of this step."""
         users = _NO_BOXES
         if self._pedestrians is not None:
             users, self._occupied_crossings = self._pedestrians.step(t, self._vehicles, active)
@@ -374,7 +378,7 @@ class _Simulation:
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """Return the least acceleration for leaders, lines, obstacles, and the present and next highest speeds."""
+        """Return the least acceleration for leaders, lines, obstacles, and the highest speeds here and ahead."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.find(self._tables, self._position_m, active)
         leads[0] = self._speed[leader]
@@ -384,13 +388,9 @@ class _Simulation:
         else:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
+            others = self._moving_users, self._users_by_world
             gaps[2], leads[2] = nearest_obstacles(
-                self._tables,
-                self._vehicles,
-                self._position_m,
-                active,
-                self._moving_users,
-                self._users_by_world,
+                self._tables, self._vehicles, self._position_m, active, *others
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
@@ -398,7 +398,7 @@ class _Simulation:
         speed = np.maximum(self._speed, 0.0)
         accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
-        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _LINE_GAP_M), 0.1))
+        to_stop = speed**2 / (2 * np.maximum(gaps[1] - (_IDM_GAP_M - _LINE_GAP_M), 0.1))
         lines = np.maximum(accelerations[1], -_LINE_BRAKING_FACTOR * to_stop - 0.5)
         preferred = np.minimum(np.minimum(accelerations[0], lines), accelerations[2])
         preferred = np.minimum(preferred, (fastest_ahead - self._speed) / _SPEED_TIME_S)
@@ -417,13 +417,14 @@ class _Simulation:
         return preferred
 
     def _stop_gap(self, t: int, active: VehicleMask, leader: VehicleRows) -> PerVehicle:
-        """Return the gap for the IDM, which keeps 2 m, to the next line, crossing, obstacle or lane end to stop at."""
+        """Return the gap for the IDM to the next line, crossing, static obstacle or lane end to stop at."""
         tables, front = self._tables, self._position_m + self._half_m
         committed = {}
-        for row, plan, at in self._plans:
+        for row, plan, position_m in self._plans:
             if t >= plan.first_step:
-                ahead_m = at[min(t - plan.first_step + _LOOKAHEAD_STEPS, len(at) - 1)] + self._half_m[row]
-                committed[row] = int(np.sum(tables.connector_begin[row] < ahead_m))
+                step = min(t - plan.first_step + _LOOKAHEAD_STEPS, len(position_m) - 1)
+                front_m = position_m[step] + self._half_m[row]
+                committed[row] = int(np.sum(tables.connector_begin[row] < front_m))
         state = TrafficState(
             tables=tables,
             step=t,
@@ -438,16 +439,16 @@ class _Simulation:
             leader_speed=self._leads[0],
             committed=committed,
         )
-        room = self._right_of_way.stop_line_m(state) + 2.0 - _LINE_GAP_M
+        room = self._right_of_way.stop_line_m(state) + _IDM_GAP_M - _LINE_GAP_M
         if np.count_nonzero(self._occupied_crossings):
-            room = np.minimum(room, self._crossing_gap(front) + 2.0 - _LINE_GAP_M)
+            room = np.minimum(room, self._crossing_gap(front) + _IDM_GAP_M - _LINE_GAP_M)
         room = np.minimum(room, tables.stop_m - front - _LANE_END_GAP_M)
         if self._has_standing.any():
-            room = np.minimum(room, self._standing.gap(front) + 2.0 - _OBSTACLE_GAP_M)
+            room = np.minimum(room, self._standing.gap(front) + _IDM_GAP_M - _OBSTACLE_GAP_M)
         return room
 
     def _crossing_gap(self, front: PerVehicle) -> PerVehicle:
-        """Return the distance to the next occupied crossing before which a vehicle can stop."""
+        """Return the distance to the next occupied marked crossing before which a vehicle can stop."""
         crossing, distance = self._tables.crossing, self._tables.crossing_m - front[:, None]
         required_mps2 = self._speed[:, None] ** 2 / (2 * np.maximum(distance, 0.05))
         brakes = self._brakes_for_crossing
@@ -473,7 +474,7 @@ class _Simulation:
         return result
 
     def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
-        """Advance by one step and return the accelerations; speeds stay non-negative."""
+        """Advance by one step and return the accelerations (until the stop, where a vehicle stops)."""
         last, jerk = self._last_acceleration, self._drivers.jerk_mps3 * DT_S
         braking_jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, last - braking_jerk, last + jerk)
@@ -523,13 +524,13 @@ class _Simulation:
         self._switch_path(t, row, path, position, position + change.length_m)
 
     def _start_detours(self, t: int, may_decide: VehicleMask) -> None:
-        """Start detours of vehicles near a standing obstacle."""
+        """Start detours of vehicles near a standing obstacle: a static one, a stuck vehicle or a halted user."""
         is_stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
         for row, override in self._overrides:
             is_overridden = override.first_step <= t <= override.last_step
-            is_stuck[row] |= is_overridden and self._speed[row] < 0.05
-        is_halted = np.abs(self._moving_users.speed) < 0.05
-        is_large = is_halted & (self._moving_users.size_m[:, 0] > 1.2)
+            is_stuck[row] |= is_overridden and self._speed[row] < _HALTED_MPS
+        is_halted = np.abs(self._moving_users.speed) < _HALTED_MPS
+        is_large = is_halted & (self._moving_users.size_m[:, 0] > _LARGE_M)
         has_stuck = worlds.mask(worlds.world[is_stuck])
         has_halted = has_stuck | worlds.mask(self._user_world[is_large])
         considered = has_halted | self._has_standing
@@ -537,8 +538,8 @@ class _Simulation:
             return
         front = self._position_m + self._half_m
         slow_only = (has_stuck | worlds.mask(self._user_world[is_halted]))[worlds.world]
-        is_near = np.where(slow_only, self._speed < 3.0, self._standing.gap(front) < 45.0)
-        is_near &= may_decide & considered[worlds.world] & (self._speed < 9.0)
+        is_near = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
+        is_near &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
         for row in is_near.nonzero()[0].tolist():
             if has_halted[worlds.world[row]] or self._standing.is_blocked(
@@ -549,9 +550,9 @@ class _Simulation:
     def _start_detour(
         self, t: int, row: int, is_stuck: VehicleMask, is_large: Bool[np.ndarray, " user"]
     ) -> None:
-        """Start a detour around an obstacle ahead, if there is one; ``is_large`` are halted users."""
+        """Start a detour around an obstacle ahead, if there is one; ``is_large`` is a mask of large halted users."""
         world, worlds = int(self._worlds.world[row]), self._worlds
-        own_users, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= 0.05
+        own_users, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= _HALTED_MPS
         is_other = (self._position_m > 0.0) & ~is_stuck & (worlds.world == world)
         is_other[row] = False
         standing = self._standing.boxes[world].concatenate(

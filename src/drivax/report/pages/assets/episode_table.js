@@ -60,9 +60,10 @@
     return scenario.map((_, row) => row).filter((row) => tests.every((test) => test(row)));
   }
 
-  // Undefined values come last in either direction; without a column the list stays worst first.
+  // Worst first, or best first when reversed.
   const ascending = () => (data.metrics[state.sort].better === "low") === state.reversed;
 
+  // Undefined values come last in either direction; without a column the list stays worst first.
   function sorted(matches) {
     if (state.sort < 0) return matches;
     const column = run().values[state.sort], sign = ascending() ? 1 : -1;
@@ -83,12 +84,13 @@
     heads.replaceChildren();
     for (const text of ["scenario", "outcome"]) make("th", heads, text).scope = "col";
     for (const i of columns()) {
-      const head = make("th", heads), here = state.sort === i, sign = !here ? "" : ascending() ? " ▲" : " ▼";
+      const head = make("th", heads), isSorted = state.sort === i;
+      const sign = !isSorted ? "" : ascending() ? " ▲" : " ▼";
       head.scope = "col";
-      head.setAttribute("aria-sort", !here ? "none" : ascending() ? "ascending" : "descending");
+      head.setAttribute("aria-sort", !isSorted ? "none" : ascending() ? "ascending" : "descending");
       const button = make("button", head, data.metrics[i].label + sign, "plain");
       button.type = "button";
-      button.title = "sort, worst first; again: best first";
+      button.title = "sort, worst first; again: best first; again: as at first";
       button.addEventListener("click", () => sort(i));
     }
   }
@@ -183,7 +185,7 @@
   // The player goes on showing another episode, which is not in the list.
   function missing() {
     return run().playable ? "None of these plays in this page: --episodes N packs more episodes, --video ID draws a video"
-      : "None of these plays in this page: they have no pairs among the policy's episodes";
+      : "None of these plays in this page: they cannot be paired with the policy's episodes";
   }
 
   document.querySelectorAll("[data-link]").forEach((node) => {

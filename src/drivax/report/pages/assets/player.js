@@ -53,19 +53,19 @@
     };
   }
 
-  // Pose at a time between two steps; null where the agent is absent. `first` is the index of its step 0.
+  // Pose at a time (in steps), interpolated; null where the agent is absent. `first` is the index of its first pose.
   function poseAt(pose, first, time, steps, unit) {
     const step = Math.min(Math.floor(time), steps - 1);
     const at = 3 * (first + step);
     if (pose[at] === ABSENT) return null;
-    const here = [pose[at] * unit, pose[at + 1] * unit, pose[at + 2] / 1e4];
-    const part = time - step;
-    if (part <= 0 || step + 1 >= steps || pose[at + 3] === ABSENT) return here;
-    const turn = pose[at + 5] / 1e4 - here[2];
+    const [x, y, heading] = [pose[at] * unit, pose[at + 1] * unit, pose[at + 2] / 1e4];
+    const fraction = time - step;
+    if (fraction <= 0 || step + 1 >= steps || pose[at + 3] === ABSENT) return [x, y, heading];
+    const turn = pose[at + 5] / 1e4 - heading;
     return [
-      here[0] + part * (pose[at + 3] * unit - here[0]),
-      here[1] + part * (pose[at + 4] * unit - here[1]),
-      here[2] + part * Math.atan2(Math.sin(turn), Math.cos(turn)),
+      x + fraction * (pose[at + 3] * unit - x),
+      y + fraction * (pose[at + 4] * unit - y),
+      heading + fraction * Math.atan2(Math.sin(turn), Math.cos(turn)),
     ];
   }
 

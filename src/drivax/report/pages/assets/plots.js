@@ -27,7 +27,7 @@
   const short = (value) => String(Number(value.toPrecision(2))).replace("-", "−");
   const digits = (step) => Math.round(-Math.log10(step));
 
-  // A round distance between grid lines: 1, 2 or 5 times a power of ten, at most four of them.
+  // Grid lines at multiples of a round distance (1, 2 or 5 times a power of ten), at most five.
   function grid(low, high) {
     const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
     const apart = [1, 2, 5, 10].map((factor) => factor * power).find((width) => width >= rough);
@@ -81,9 +81,9 @@
     const bar = draw("line", svg, { class: "now", y1: TOP, y2: HEIGHT - BOTTOM, x1: LEFT, x2: LEFT });
     svg.addEventListener("click", (event) => {
       const { left, width } = svg.getBoundingClientRect();
-      const part = (((event.clientX - left) / width) * WIDTH - LEFT) / (WIDTH - LEFT - RIGHT);
+      const share = (((event.clientX - left) / width) * WIDTH - LEFT) / (WIDTH - LEFT - RIGHT);
       const scrub = document.querySelector("[data-control=scrub]");
-      scrub.value = String(Math.round(part * last));
+      scrub.value = String(Math.round(share * last));
       scrub.dispatchEvent(new Event("input"));
     });
     return { signal, lines, caption, bar, x };

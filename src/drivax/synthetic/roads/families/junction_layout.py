@@ -107,7 +107,7 @@ class Approach:
 
     Attributes:
         mouth_m: Distance of the mouth from the arm's base.
-        middle, side: Middle line outwards from the stop line (range of the lanes), and from the mouth (of the edges).
+        middle, side: Middle line outwards: from the stop line, along the lanes, and from the mouth, along the edges.
         inward, outward: Lanes, each from the middle to the edge.
     """
 
@@ -121,7 +121,7 @@ class Approach:
 
 @dataclass(frozen=True)
 class Move:
-    """A connector, its approaches and its turn."""
+    """A connector, the numbers of the approaches from which (``arm``) and to which it leads, and its turn."""
 
     lane: int
     arm: int
@@ -201,9 +201,9 @@ class Geometry:
             if abs(angle) < _NO_CORNER:
                 continue
             tangent = radius * math.tan(angle / 2)
-            right_m, left_m = _intersection(arm, arms[k])
-            mouths[i] = max(mouths[i], right_m + tangent)
-            mouths[k] = max(mouths[k], left_m + tangent)
+            before_m, after_m = _intersection(arm, arms[k])
+            mouths[i] = max(mouths[i], before_m + tangent)
+            mouths[k] = max(mouths[k], after_m + tangent)
         return mouths
 
 
@@ -217,11 +217,11 @@ def draw_street(
     return CrossSection(*lanes, width, float(rng.uniform(*style.shoulder_m)), limit_mps, marked)
 
 
-def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
+def _intersection(before: Arm, after: Arm) -> tuple[float, float]:
     """Intersect an arm's left edge with the next arm's right edge; return the distances along both middle lines."""
-    start, end = right.base.aside(right.street.left_m), left.base.aside(-left.street.right_m)
-    right_m, behind = tangent_lengths(start, end, math.sin(end.heading - start.heading))
-    return right_m, -behind
+    start, end = before.base.aside(before.street.left_m), after.base.aside(-after.street.right_m)
+    before_m, behind_m = tangent_lengths(start, end, math.sin(end.heading - start.heading))
+    return before_m, -behind_m
 
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
@@ -268,8 +268,8 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
     """Add the connectors.
 
     Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
-    outside. The innermost lane is for turning only where fewer lanes leave than arrive, and on ``left_only`` approaches
-    with several lanes and a left turn.
+    outside. The innermost lane is only for left turns where fewer lanes leave straight on than arrive, and on
+    ``left_only`` approaches with several lanes and a left turn.
     """
     moves = []
     for i, approach in enumerate(site.approaches):
@@ -327,7 +327,7 @@ def finish_sites(
     rng: np.random.Generator, style: RoadStyle, draft: Draft, sites: Sequence[Site],
     links: dict[Place, Place], geometry: Geometry,
 ) -> None:  # fmt: skip
-    """Add the boundary around all sites, counter-clockwise, sidewalks along it, markings and crossings.
+    """Add the counter-clockwise boundary of all sites, markings, crossings, and, at the style's rate, sidewalks.
 
     ``links`` pairs the approaches at the two ends of a street, in both directions; linked sites form a tree.
     """

@@ -135,9 +135,9 @@ class SignalisedJunction:
 
     Attributes:
         cross_skew: Largest deviation of the two streets from a right angle, rad.
-        left_lane_share: Share of left-turn lanes on streets with two lanes in each direction.
-        protected_share: Share of streets with left-turn lanes whose left turns are protected.
-        permissive_share: Share of the other streets whose left turns are permissive.
+        left_lane_share: Share of the streets with two lanes in each direction whose left lane is for turning.
+        protected_share: Share of the streets with left-turn lanes whose left turns are protected, where possible.
+        permissive_share: Share of the other streets whose left turns are permissive, where possible.
     """
 
     geometry: Geometry = field(default_factory=Geometry)
@@ -215,7 +215,7 @@ class TJunction:
 class AllWayStop:
     """Settings of the family ``all_way_stop``: two streets with stop signs on all approaches.
 
-    Limits are at most ``fastest_mps``, unless the domain has only higher ones.
+    Limits are at most ``fastest_mps``; a style with only higher ones gets its lowest.
     """
 
     geometry: Geometry = field(default_factory=lambda: Geometry(corner_m=(5.0, 9.0)))
@@ -258,7 +258,7 @@ class UnprotectedLeft:
     name: str = "unprotected_left"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a junction; ego starts on the main road, most often in a left-turn lane, in dense oncoming traffic."""
+        """Draw a junction with dense oncoming traffic; ego starts on the main road, mostly in a left-turn lane."""
         lights = bool(rng.random() < self.signal_share)
         limit = float(rng.choice(style.limits_mps))
         slower = min(limit, float(rng.choice(style.limits_mps)))
@@ -312,16 +312,17 @@ class _Plot:
 
 @dataclass(frozen=True)
 class Corridor:
-    """Settings of the family ``corridor``: a main road with two junctions, with lights, stop signs or a side road.
+    """Settings of the family ``corridor``: a main road with two junctions.
 
-    The junctions share the lanes between them. Two lights may be coordinated: the same cycle, and the second one turns
-    green when vehicles arrive that left the first one at the beginning of green.
+    Each has lights, or gives the main road priority over two side roads or one. The junctions share the lanes between
+    them. Two lights may be coordinated: the same cycle, and the second one turns green when vehicles arrive that left
+    the first one at the beginning of green.
 
     Attributes:
         side_reach: Shape of side roads: nearly straight, which keeps those of both junctions separate.
         between_m: Length of the road between the stop lines of both junctions, low and high.
-        left_lane_share: Share of left-turn lanes at lights of two-lane roads.
-        protected_share: Share of protected left turns at lights with left-turn lanes.
+        left_lane_share: Share of lights on two-lane main roads at which the left lane is for turning.
+        protected_share: Share of those at which the main road's left turns are protected, where possible.
     """
 
     geometry: Geometry = field(

@@ -38,7 +38,7 @@ from drivax.synthetic.roads.network import (
 )
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
-#: Least radius of the fillets of entries and exits, m.
+#: Least radius of the fillets of entries and exits, m, where the arc between them leaves room.
 _FILLET_M = 11.5
 #: Distances from the yield line at which a splitter island begins to narrow and ends, m.
 _SPLITTER_M = (13.0, 42.0)
@@ -95,7 +95,8 @@ class Roundabout:
         radius_m: Radius of the outer circle's lane centre with one lane and with two, low and high.
         gap_m: Gap between the directions at the yield lines, low and high.
         skew: Largest deviation of an arm from an even division, rad, where room permits.
-        limit_mps, circle_mps: Highest limit of the arms, and the limit in the circle.
+        limit_mps: Highest limit of the arms; a style with only higher ones gets its lowest.
+        circle_mps: Limit of the circle, the entries and the exits.
     """
 
     arm_m: float = 230.0
@@ -137,7 +138,7 @@ class Roundabout:
         join, reach = zip(
             *(_solve_join(r, gap / 2 + (j + 0.5) * width) for j, r in enumerate(radius)), strict=True
         )
-        limits = [limit for limit in style.limits_mps if limit <= self.limit_mps]
+        limits = [v for v in style.limits_mps if v <= self.limit_mps] or [min(style.limits_mps)]
         return _Plan(
             radius_m=tuple(radius),
             join=join,
@@ -177,7 +178,7 @@ def _solve_join(radius: float, lateral: float) -> tuple[float, float]:
     """Find the angle from an arm at which its lane joins the circle, and the distance at which the bend begins.
 
     The arm's lane (at a distance ``lateral`` from the arm) and the circle's tangent at angle d intersect at a distance
-    ``t = (r sin d - lateral) / cos d`` from the circle; its fillet has the radius ``t / tan(45 - d/2)``.
+    ``t = (r sin d - lateral) / cos d`` from the tangent point; their fillet has the radius ``t / tan(45° - d/2)``.
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
     tangents = (radius * np.sin(angles) - lateral) / np.cos(angles)
@@ -272,7 +273,7 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
 
 
 def _add_markings(draft: Draft, plan: _Plan, arm: _Arm) -> None:
-    """Add the markings of an arm."""
+    """Add the markings of an arm; the yellow ones are 8 cm inside the innermost lanes."""
     spread, lanes = plan.spread_m(arm.middle), len(arm.inward)
     for side in (-1.0, 1.0):
         draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.offset_by(side * (spread + 0.08)))

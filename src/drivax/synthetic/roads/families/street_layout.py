@@ -23,7 +23,7 @@ _BAY_CLEAR_M = 8.0
 
 @dataclass(frozen=True)
 class Strip:
-    """A lane's width along the street.
+    """A lane over some sections of a street.
 
     Attributes:
         place: -1 is the first lane right of the middle line, -2 the next one, 1 the first one to the left.
@@ -171,7 +171,7 @@ class Street:
         self.lanes[strip.place, k] = lane
 
     def add_median(self) -> None:
-        """Add the median, if any; traffic may pass around its ends."""
+        """Add the median, if any, up to 2 m before both ends of the street."""
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
             inner = self.middle.piece(end, len(self.middle.xy) - 1 - end)

@@ -14,7 +14,7 @@ from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, 
 from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
 from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Limits below which curved roads may have bays and streets crosswalks away from junctions, m/s.
+#: Limits below which curved roads may have bays, and of streets with crossings away from junctions, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
 _CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
 #: Length over which a ramp's curvature rises and falls, m.
@@ -62,7 +62,7 @@ class CurvedRoad(StreetFamily):
         return street.network(self.name)
 
 
-#: The family ``straight_road``: up to four lanes, slight bends.
+#: The family ``straight_road``: up to four lanes ahead, slight bends.
 STRAIGHT_ROAD = CurvedRoad(
     tightest_m=(500.0, 5000.0),
     widest_turn=math.radians(25.0),
@@ -77,7 +77,7 @@ class LaneDrop(StreetFamily):
 
     Attributes:
         gain_share: Share of roads that gain a lane instead of losing one.
-        left_share: Share of the one-way roads that lose a lane on which this is the left one.
+        left_share: Of the one-way roads that lose a lane, the share that loses the left one.
         taper_m: Length over which the road narrows beyond the lane's end, low and high.
     """
 
@@ -89,7 +89,7 @@ class LaneDrop(StreetFamily):
     name: str = "lane_drop"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a road with two or three lanes; one ends, or has its full width, 85 to 200 m ahead of ego."""
+        """Draw a road with two or three lanes ahead; one ends, or reaches full width, 85 to 200 m ahead of ego."""
         street = Street(
             middle=self.draw_middle(rng, style.curvature),
             cuts=self.cuts,
@@ -140,12 +140,13 @@ class MidblockCrosswalk(StreetFamily):
         ahead, back = draw_layout(rng, _CROSSWALK_LAYOUTS)
         middle = self.draw_middle(rng, style.curvature)
         row = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
+        limits = [v for v in style.limits_mps if v < _CROSSING_LIMIT_MPS] or [min(style.limits_mps)]
         street = Street(
             middle=middle,
             cuts=self.cuts,
             strips=strips(ahead, back, len(self.cuts) - 1),
             width_m=float(rng.uniform(*style.width_m)),
-            limit_mps=float(rng.choice([v for v in style.limits_mps if v < _CROSSING_LIMIT_MPS])),
+            limit_mps=float(rng.choice(limits)),
             shoulder_m=float(rng.uniform(*style.shoulder_m)),
             median_m=float(rng.uniform(1.8, 3.0)) if back and rng.random() < self.median_share else 0.0,
             rows_m=(row, row if back else 0.0),
@@ -163,7 +164,7 @@ class MidblockCrosswalk(StreetFamily):
 
 @dataclass(frozen=True)
 class ParkedStreet(StreetFamily):
-    """Settings of the family ``parked_street``: a narrow street with parked cars along one or both sides.
+    """Settings of the family ``parked_street``: a narrow street with bays along one or both sides.
 
     A share of the streets (``crossing_share``) has a crossing, half of these a crosswalk.
     """
@@ -177,7 +178,7 @@ class ParkedStreet(StreetFamily):
     name: str = "parked_street"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a street with one of the two lowest limits of the style and its narrowest lanes."""
+        """Draw a street with one of the two lowest limits of the style, and lanes of about its least width."""
         one_way = rng.random() < self.one_way_share
         middle = self.draw_middle(rng, style.curvature)
         row = float(rng.uniform(*self.row_m))
@@ -246,7 +247,7 @@ class Highway(StreetFamily):
         """Draw a highway; ego starts 25 to 70 m before the auxiliary lane begins, or on the on-ramp."""
         middle = self.draw_middle(rng)
         lanes = int(rng.integers(2, 5))
-        # At most five lanes in total fit the map of a stored scenario.
+        # At most five lanes and the auxiliary lane fit the map of a stored scenario.
         back = int(rng.integers(2, 6 - lanes)) if lanes < 4 and rng.random() < self.two_way_share else 0
         extra = self._draw_auxiliary_lane(rng, lanes)
         street = Street(
@@ -287,7 +288,7 @@ class Highway(StreetFamily):
         length = self.ramp_m[0 if direction < 0 else 1]
         line = street.draft.lanes[auxiliary].curve
         gore = line.start.turned() if direction < 0 else line.end
-        # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
+        # Followed away from the highway, an on-ramp bends to the left and an off-ramp to the right.
         curvature = np.gradient(street.middle.heading, STEP_M)[cut::direction] * direction
         side = curvature[: round(length / STEP_M) + 1]
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
@@ -335,7 +336,7 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
 
 
 def _add_boundary(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
-    """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
+    """Add the median, and the boundary: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
     main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
     pieces, begin = [], 0
