@@ -1,4 +1,7 @@
-"""Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid."""
+"""Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid.
+
+``lane_paths`` searches paths in the lane graph; ``routes`` selects and samples those of ego.
+"""
 
 import lazy_loader
 
