@@ -1,6 +1,7 @@
 """Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid.
 
-``lane_paths`` searches paths in the lane graph; ``routes`` selects and samples those of ego.
+``assemble`` runs them. ``lane_paths.LaneSearch`` is the route search; ``routes``, with the published
+search, selects and samples paths.
 """
 
 import lazy_loader

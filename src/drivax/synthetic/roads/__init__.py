@@ -1,6 +1,6 @@
 """Random road networks of the built-in world: curves, lanes, rules, lights and families.
 
-``families.junctions`` assigns the phases of traffic lights; ``signals`` computes their colours.
+``families.junctions.set_lights`` assigns the phases of traffic lights; ``signals`` computes their colours over time.
 """
 
 import lazy_loader
