@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from drivax.errors import UsageError
@@ -42,7 +42,7 @@ def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
 
 def _with_actions(planner: Any, actions: ActionSpace) -> Any:
     """Return a planner, and the planner in its field ``planner``, with another action space."""
-    names = {field.name for field in fields(planner)} if is_dataclass(planner) else set()
+    names = getattr(planner, "__dataclass_fields__", {})
     changes: dict[str, Any] = {"actions": actions} if "actions" in names else {}
     if "planner" in names:
         changes["planner"] = _with_actions(planner.planner, actions)
