@@ -535,7 +535,9 @@ def _call_on_disk() -> int:
 def main() -> int:
     """Return 1 if an output differed, a command hung or failed, or a file was left."""
     args = _parse()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # A job in the background would ignore it.
+    # A job in the background ignores Ctrl-C, one of nohup SIGHUP, and so would the commands.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if args.disk is None:
         return _call_on_disk()
     last = max(list(COMMANDS).index(name) for name in args.only)

@@ -1,4 +1,4 @@
-"""Puts ego where a test says, step by step, and returns every metric and step value. One compiled program for all."""
+"""Evaluate given motions of ego: every metric and step value, in one compiled program."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivax.simulator.traffic.log import logged_history
 from drivax.tasks.task import Task
 from scenes import bank_of
 
-#: Scenarios of one call; fewer are filled up.
+#: Scenarios of a program call; shorter batches are padded.
 BATCH = 16
 START = 10
 
@@ -25,9 +25,9 @@ START = 10
 def _program():
     simulator = Simulator(evaluation_task(Task()))
 
-    def one(bank, row, motion):
-        def step(state, here):
-            state, _ = simulator.replay(bank, state, here, jnp.zeros(2))
+    def evaluate(bank, row, motion):
+        def step(state, pose):
+            state, _ = simulator.replay(bank, state, pose, jnp.zeros(2))
             return state, step_metrics(simulator.situation(bank, state))
 
         begin = simulator.reset(bank, row, START)
@@ -37,20 +37,20 @@ def _program():
     def log(bank, row):
         return jax.vmap(lambda t: logged_history(bank, row, t, 0)[-1])(jnp.arange(bank.steps))
 
-    return jax.jit(jax.vmap(one, (None, 0, 0))), jax.jit(jax.vmap(log, (None, 0)))
+    return jax.jit(jax.vmap(evaluate, (None, 0, 0))), jax.jit(jax.vmap(log, (None, 0)))
 
 
 def judge(recordings, motions=None):
     """Metrics of ego's logs, or of other motions.
 
     Args:
-        recordings: Any number of them, of hand-made size.
-        motions: For each None (the log is driven exactly), or a function from the logged motion ``[91, 4]`` in the
-            scenario's frame (x, y, heading, speed) to the driven one, of which the rows after ``START`` count.
+        recordings: The recordings.
+        motions: For each None (the log), or a function from the logged motion ``[91, 4]`` in the scenario's frame (x,
+            y, heading, speed) to ego's motion, of which the rows after ``START`` count.
 
     Returns:
-        A dict by name for each: numbers, None where undefined, ``<event>_step`` of the first events; and under
-        ``series`` each step value as an array ``[80]``, NaN where undefined.
+        For each recording a dict: metrics by name (None where undefined), ``<event>_step`` of the first events (-1 for
+        none), and under ``series`` each step value as an array ``[80]``, NaN where undefined.
     """
     results = []
     judge_all, logs = _program()
@@ -62,9 +62,9 @@ def judge(recordings, motions=None):
         for row in range(count):
             if motions is not None and motions[first + row] is not None:
                 log[row] = motions[first + row](log[row])
-        driven = jnp.asarray(log[:, START + 1 :], jnp.float32)
-        found = jax.tree.map(np.asarray, judge_all(bank, jnp.arange(BATCH), driven))
-        results += [_named(jax.tree.map(partial(_row, row), found)) for row in range(count)]
+        motion = jnp.asarray(log[:, START + 1 :], jnp.float32)
+        values = jax.tree.map(np.asarray, judge_all(bank, jnp.arange(BATCH), motion))
+        results += [_named(jax.tree.map(partial(_row, row), values)) for row in range(count)]
     return results
 
 
@@ -72,8 +72,8 @@ def _row(row, leaf):
     return leaf[row]
 
 
-def _named(found):
-    metrics, events, series = found
+def _named(values):
+    metrics, events, series = values
     named = {name: float(v.value) if v.defined else None for name, v in metrics.items()}
     named |= {f"{name}_step": int(step) for name, step in events.items()}
     named["series"] = {name: np.where(v.defined, v.value, np.nan) for name, v in series.items()}

@@ -1,4 +1,4 @@
-"""Metrics once more by other means: float64, shapely, marching in 1 ms steps, SciPy's filter, plain loops.
+"""Metrics computed by other methods: float64, shapely, marching in 1 ms steps, SciPy's filter, plain loops.
 
 For the straight roads of :mod:`scenes` and :mod:`metric_scenes`, whose lanes run along y = 0 and y = 3.7, and straight
 lanes that cross them or begin on them. Written from the definitions alone; shares no code with the package.
@@ -27,25 +27,24 @@ def corners(x, y, heading, length, width):
     return local @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
 
 
-def marched_ttc(me, velocity, boxes, velocities, step_s=1e-3, horizon_s=5.0):
+def marched_ttc(ego, velocity, boxes, velocities, step_s=1e-3, horizon_s=5.0):
     """First of the moments 0, 1 ms, 2 ms, ... at which boxes overlap (separating axes on corners); 5 for none.
 
-    Boxes are x, y, heading, length, width; ``me [5]``, ``boxes [N, 5]``. Returns ``[N]``.
+    Boxes are x, y, heading, length, width; ``ego [5]``, ``boxes [N, 5]``. Returns ``[N]``.
     """
     moments = np.arange(0.0, horizon_s, step_s)
     result = np.full(len(boxes), horizon_s)
-    mine = corners(*me)
-    for number, (box, moving) in enumerate(zip(boxes, velocities, strict=True)):
-        theirs = corners(*box)
+    ego_corners = corners(*ego)
+    for number, (box, box_velocity) in enumerate(zip(boxes, velocities, strict=True)):
+        box_corners = corners(*box)
         apart = np.zeros(len(moments), bool)
-        relative = np.outer(moments, moving - velocity)
-        for shape in (mine, theirs):
-            for one, other in ((0, 1), (1, 2)):
-                edge = shape[other] - shape[one]
+        relative = np.outer(moments, box_velocity - velocity)
+        for shape in (ego_corners, box_corners):
+            for edge in np.diff(shape[:3], axis=0):
                 axis = np.array([-edge[1], edge[0]]) / np.hypot(*edge)
                 shift = relative @ axis
-                low, high = (theirs @ axis).min() + shift, (theirs @ axis).max() + shift
-                apart |= (high <= (mine @ axis).min()) | (low >= (mine @ axis).max())
+                low, high = (box_corners @ axis).min() + shift, (box_corners @ axis).max() + shift
+                apart |= (high <= (ego_corners @ axis).min()) | (low >= (ego_corners @ axis).max())
         if not apart.all():
             result[number] = moments[np.argmin(apart)]
     return result
@@ -74,7 +73,7 @@ class StraightLane:
 
 
 class Judge:
-    """Drives ego along ``motion [91, 4]`` through a recording and judges every step."""
+    """Evaluates ego's ``motion [91, 4]`` in a recording; ``ambiguous`` if a decision is near its threshold."""
 
     def __init__(self, recording, motion, two_way):
         self.tracks, self.motion, self.two_way = recording.tracks, motion, two_way
@@ -101,7 +100,7 @@ class Judge:
         return (*self.tracks.xy[a, t], self.tracks.heading[a, t], *self.size[a, :2])
 
     def near(self, value, threshold, margin=EDGE):
-        """Notes a decision that float32 may take the other way."""
+        """Mark the scene as ambiguous if the value is so near the threshold that float32 may decide otherwise."""
         if abs(value - threshold) < margin:
             self.ambiguous = True
 
@@ -157,7 +156,7 @@ class Judge:
         return any(value > 0.3 for value in beyond), not ((centre >= low) & (centre <= high)).all()
 
     def on(self, lane, centre):
-        """Whether the centre is between the ends of a lane; next to the ends of loose ones the answer is open."""
+        """Whether the centre is between the ends of a lane; ambiguous near the ends of a ``loose`` lane."""
         along, across = lane.place(centre)
         if lane.loose and across < 5.0:
             self.near(along, -2.0, 2.6)
@@ -165,11 +164,11 @@ class Judge:
         return 0.0 <= along <= lane.length
 
     def holds(self, lane, centre, box):
-        """Whether all corners are between the borders of a lane, which go on straight beyond its ends."""
+        """Whether all corners are between the borders of a lane, extended straight beyond its ends."""
         return self.on(lane, centre) and max(lane.place(corner)[1] for corner in box) <= HALF + 0.2
 
     def limit(self, centre, turns, apart):
-        """Limit of the lane that is driven, by area: of the route, else the highest; else that of the nearest."""
+        """Highest limit of the lanes that contain the centre, those of the route first; else that of the nearest."""
         lanes = list(zip(self.lanes, turns, apart, strict=True))
         fit = [
             lane
@@ -230,37 +229,36 @@ class Judge:
         return fault, kind
 
     def contacts(self, places):
-        """Collision and fault per step, the first one's kind, and how many overlaps were ignored at most."""
+        """Collision and fault per step, type of the first, most ignored overlaps, and overlaps without ego's fault."""
         count = len(self.tracks.valid)
-        code, judged = {}, set()
+        code, were_hit = {}, set()
         hit, fault, kinds, ignored = np.zeros(91, bool), np.zeros(91, bool), [], 0
         blameless = [set() for _ in range(91)]
         for t in range(START, END + 1):
-            fresh = []
+            new = []
             for a in range(1, count):
                 if not self.tracks.valid[a, t]:
                     code.pop(a, None)
-                    judged.discard(a)
+                    were_hit.discard(a)
                 elif not self.overlap(a, t):
                     code[a] = "apart"
                 elif code.get(a, "ignored") == "ignored":
                     code[a] = "ignored"
                 elif code[a] == "apart":
                     code[a] = "hit"
-                    if a not in judged:
-                        fresh.append(a)
-                    judged.add(a)
-            found = {
-                a: self.fault_and_kind(a, t, places[t][0] or places[t][1] or places[t][3]) for a in fresh
-            }
-            for a, (own, _) in found.items():
+                    if a not in were_hit:
+                        new.append(a)
+                    were_hit.add(a)
+            unlawful = places[t][0] or places[t][1] or places[t][3]
+            contacts = {a: self.fault_and_kind(a, t, unlawful) for a in new}
+            for a, (own, _) in contacts.items():
                 if own:
                     code[a] = "own fault"
             hit[t] = any(c in ("hit", "own fault") for c in code.values())
-            fault[t] = any(own for own, _ in found.values())
-            if found and not kinds:
-                nearest = min(found, key=lambda a: np.hypot(*(self.tracks.xy[a, t] - self.motion[t, :2])))
-                kinds.append(found[nearest][1])
+            fault[t] = any(own for own, _ in contacts.values())
+            if contacts and not kinds:
+                nearest = min(contacts, key=lambda a: np.hypot(*(self.tracks.xy[a, t] - self.motion[t, :2])))
+                kinds.append(contacts[nearest][1])
             ignored = max(ignored, sum(c == "ignored" for c in code.values())) if t > START else 0
             blameless[t] = {a for a, c in code.items() if c in ("hit", "ignored")}
         return hit, fault, (kinds or [0])[0], ignored, blameless
@@ -284,7 +282,7 @@ class Judge:
             now = self.ego(t) + size
             return marched_ttc(now, self.motion[t, 3] * along, boxes + size, velocities).min(initial=5.0)
 
-        # A corner may be grazed between two moments of the march: then boxes that are a little smaller never meet.
+        # Corners may touch between two moments only; slightly smaller boxes then never overlap.
         return marched(0.0), lambda: marched(-0.06)
 
     def red_light(self, t):
@@ -334,8 +332,8 @@ class Judge:
     def episode(self, times):
         """Metrics by name, and times to collision at every eighth step.
 
-        Of all 80 steps they would take too long: those at the others are ``times``, of whoever is to be compared.
-        Beyond the ends of lanes and route, lines are no longer straight on: what depends on them is left out there.
+        At all 80 steps they would take too long: metrics of the time to collision are those of ``times``, the package's
+        values. Metrics that depend on the lines of lanes or route are left out if ego drives beyond their ends.
         """
         steps = range(START + 1, END + 1)
         places = {t: self.place(t) for t in range(START, END + 1)}
@@ -377,27 +375,27 @@ class Judge:
         return result | {"success_moving": result["success"] if whole - log[START, 0] > 5 else None}, ttc
 
 
-def scores(found):
-    """The two scores and what they are made of, by their formulas, from the metrics of an episode."""
-    over = found["speeding_mean"]
+def scores(metrics):
+    """The two scores and their inputs, by their formulas, from the other metrics of an episode."""
+    over = metrics["speeding_mean"]
     speed = None if over is None else max(0.0, 1 - over / 2.23)
-    worst, straddle = found["wrong_way_worst"], round(found["lane_straddle"], 3)
+    worst, straddle = metrics["wrong_way_worst"], round(metrics["lane_straddle"], 3)
     direction = 1.0 if worst <= 2 else 0.5 if worst <= 6 else 0.0
     lanes = 1.0 if straddle <= 3.4 else 0.5 if straddle <= 5.7 else 0.0
-    least = 5.0 if found["min_ttc"] is None else found["min_ttc"]
+    least = 5.0 if metrics["min_ttc"] is None else metrics["min_ttc"]
     gates = (
-        (1 - found["at_fault_collision"])
-        * (1 - found["offroad"])
-        * (found["progress_ratio"] >= 0.2)
+        (1 - metrics["at_fault_collision"])
+        * (1 - metrics["offroad"])
+        * (metrics["progress_ratio"] >= 0.2)
         * direction
     )
-    terms = 5 * (least >= 0.95) + 5 * found["progress_ratio"] + 2 * (found["comfort"] > 1 - 1e-6)
-    red = 1 - found["red_light"]
-    clean = not (found["collision"] or found["offroad"] or found["red_light"])
-    lawful = not (found["at_fault_collision"] or found["offroad"] or found["red_light"])
-    reached = found["goal_distance"] <= 3 or found["progress_ratio"] >= 0.95
+    terms = 5 * (least >= 0.95) + 5 * metrics["progress_ratio"] + 2 * (metrics["comfort"] > 1 - 1e-6)
+    red = 1 - metrics["red_light"]
+    clean = not (metrics["collision"] or metrics["offroad"] or metrics["red_light"])
+    lawful = not (metrics["at_fault_collision"] or metrics["offroad"] or metrics["red_light"])
+    reached = metrics["goal_distance"] <= 3 or metrics["progress_ratio"] >= 0.95
     result = {
-        "making_progress": found["progress_ratio"] >= 0.2,
+        "making_progress": metrics["progress_ratio"] >= 0.2,
         "accuracy": clean, "accuracy_at_fault": lawful, "reached_goal": reached, "success": clean and reached,
         "direction": direction, "lane_keeping": lanes, "speed_compliance": speed,
     }  # fmt: skip

@@ -110,15 +110,15 @@ def shifted_left(offset, steps=None):
     """The log, shifted by ``offset`` metres to the left for the first ``steps`` steps (None: all)."""
 
     def drive(log):
-        here = np.arange(STEPS) - 10
-        shift = np.where((here >= 1) & (here <= (steps or STEPS)), offset, 0.0)
+        step = np.arange(STEPS) - 10
+        shift = np.where((step >= 1) & (step <= (steps or STEPS)), offset, 0.0)
         return log + np.stack([0 * shift, shift, 0 * shift, 0 * shift], -1)
 
     return drive
 
 
 def at_rest(log):
-    """Ego stays where it is at step 10, at a speed of zero."""
+    """Ego stays at its pose of step 10, at a speed of zero."""
     return np.concatenate([log[:11], np.tile(log[10] * [1, 1, 1, 0], (80, 1))])
 
 
@@ -173,7 +173,7 @@ def _collisions():
         SAFE | CRASHED | LOST | SMOOTH | closing(25.0, 7.0, 4.8)
         | {"at_fault_collision": 1, "collision_type": 1, "collision_step": 46, "accuracy_at_fault": 0},
     )  # fmt: skip
-    # 25.2 m to go at 10 m/s. A car alongside hides nothing.
+    # A gap of 25.2 m at 10 m/s. A car alongside changes nothing.
     stopped = (
         SAFE | CRASHED | LOST | closing(25.2, 10.0, 4.8) | {"at_fault_collision": 1, "collision_type": 6}
     )
@@ -251,11 +251,11 @@ def _traffic():
         "closing in, never there",
         Scene(straight_road([EGO, car(30, speed=8.0)]), None, PERFECT | closing(25.2, 2.0)),
     )
-    yield "less than 0.95 s", Scene(
+    yield "closing in to 1.9 s", Scene(
         straight_road([EGO, car(14.7, speed=9.0)]), None,
         PERFECT | closing(9.9, 1.0) | {"min_ttc": 1.9, "ttc_ok": 1},
     )  # fmt: skip
-    yield "tailgating", Scene(
+    yield "closing in to 0.9 s", Scene(
         straight_road([EGO, car(13.7, speed=9.0)]), None,
         PERFECT | closing(8.9, 1.0)
         | {"min_ttc": 0.9, "ttc_ok": 0, "vmax_score": 14 / 19, "nuplan_score": 11 / 16},

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from orbax.checkpoint._src import asyncio_utils
 
 from drivax import cli
 from drivax.errors import DataError, UsageError
@@ -239,6 +240,21 @@ def test_signals_wait_for_the_end_of_an_import(number, tmp_path, monkeypatch):
         time.sleep(5)
         raise AssertionError(f"{number.name} was lost")
     assert sys.modules["interrupted"].complete
+
+
+def test_signals_wait_until_orbax_has_closed_its_event_loop():
+    events = []
+
+    async def read():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)  # Blocks the loop; a signal would raise here.
+        events.append("read")
+
+    with pytest.raises(cli.Stopped), cli._stop_at_signals():
+        asyncio_utils.run_sync(read())
+        time.sleep(5)
+        raise AssertionError("SIGTERM was lost")
+    assert events == ["read"]
 
 
 def test_import_that_never_ends_is_interrupted(tmp_path, monkeypatch):

@@ -9,8 +9,8 @@ from drivax.errors import UsageError
 RNG = np.random.default_rng(3)
 STEPS = RNG.random((6, 40))
 VALID = RNG.random((6, 40)) < 0.7
-VALID[4] = False  # nobody is there
-VALID[5] = np.arange(40) == 7  # for one step only
+VALID[4] = False  # no valid step
+VALID[5] = np.arange(40) == 7  # one valid step
 
 
 def by_hand(name, values):
@@ -27,7 +27,7 @@ def by_hand(name, values):
 def test_aggregators(name):
     expected = [by_hand(name, steps[valid]) for steps, valid in zip(STEPS, VALID, strict=True)]
     np.testing.assert_allclose(aggregate(STEPS, VALID, name), expected, atol=1e-12)
-    # What is beside the valid steps does not matter.
+    # Values of invalid steps have no effect.
     np.testing.assert_array_equal(
         aggregate(np.where(VALID, STEPS, 9.0), VALID, name), aggregate(STEPS, VALID, name)
     )
@@ -35,22 +35,22 @@ def test_aggregators(name):
 
 def test_step_scores_are_weighted_means():
     """The sum of the weights does not matter, and no score is clipped."""
-    parts = {"a": STEPS, "b": STEPS[::-1], "unused": STEPS}
-    steps, scenarios = Combination({"a": 0.9, "b": 0.3}, "mean").combine(parts, VALID)
+    components = {"a": STEPS, "b": STEPS[::-1], "unused": STEPS}
+    steps, scenarios = Combination({"a": 0.9, "b": 0.3}, "mean").combine(components, VALID)
     expected = np.where(VALID, 0.75 * STEPS + 0.25 * STEPS[::-1], 0.0)
     np.testing.assert_allclose(steps, expected)
     np.testing.assert_allclose(scenarios, aggregate(expected, VALID, "mean"))
 
 
 def test_components_have_their_own_aggregators():
-    parts = {"a": STEPS, "b": STEPS[::-1]}
+    components = {"a": STEPS, "b": STEPS[::-1]}
     both = Combination({"a": 0.6, "b": 0.3}, {"a": "p90", "b": "std"})
     expected = (2 * aggregate(STEPS, VALID, "p90") + aggregate(STEPS[::-1], VALID, "std")) / 3
-    np.testing.assert_allclose(both.combine(parts, VALID)[1], expected)
+    np.testing.assert_allclose(both.combine(components, VALID)[1], expected)
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("arguments", "words"),
     [
         (({"a": -1.0},), "weight of 'a' is -1.0"),
         (({"a": float("nan")},), "weight of 'a' is nan"),
@@ -63,6 +63,6 @@ def test_components_have_their_own_aggregators():
         (({"a": 1.0}, {"a": "best"}), "unknown aggregator 'best'"),
     ],
 )
-def test_invalid_arguments_are_refused(given, words):
+def test_invalid_arguments_are_refused(arguments, words):
     with pytest.raises(UsageError, match=words):
-        Combination(*given)
+        Combination(*arguments)

@@ -51,8 +51,9 @@ def data(tmp_path_factory):
     with ScenarioWriter(path, SMALL) as writer:
         for row in range(10):
             cars = [car(speed=8.0 + 0.2 * row), car(x=60.0, speed=8.0)]
-            drive = replace(straight_road(cars), scenario_id=f"drive-{row}", segment=f"recording-{row // 2}")
-            writer.add(assemble(drive, SMALL))
+            recording = straight_road(cars)
+            recording = replace(recording, scenario_id=f"drive-{row}", segment=f"recording-{row // 2}")
+            writer.add(assemble(recording, SMALL))
     return ScenarioSet.open(path)
 
 
@@ -92,8 +93,8 @@ def test_error_is_that_of_the_member_that_excluded_the_scenario():
     np.testing.assert_allclose(predictions.error(np.array([0.1]), None)[:, 0], [6.5**2, 1.5**2], rtol=1e-5)
 
 
-def stacked(*ones):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *ones)
+def stacked(*distributions):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *distributions)
 
 
 def test_information_of_grids_is_the_jensen_shannon_divergence():
@@ -111,13 +112,15 @@ def test_information_of_grids_is_the_jensen_shannon_divergence():
 def test_information_depends_on_modes_with_equal_means():
     """Two members with the same two modes have no mutual information; two members with one mode each have."""
 
-    def sides(first):
+    def two_modes(logit):
         parts = SquashedGaussian(jnp.array([[0.0, -1.0], [0.0, 1.0], [0.0, 0.0]]), jnp.full((3, 2), 0.05))
-        return Mixture(jnp.array([first, -first, -50.0]), parts)
+        return Mixture(jnp.array([logit, -logit, -50.0]), parts)
 
     key = jax.random.key(0)
-    assert float(mutual_information(stacked(sides(0.0), sides(0.0)), key)) == pytest.approx(0.0, abs=1e-5)
-    assert float(mutual_information(stacked(sides(50.0), sides(-50.0)), key)) == pytest.approx(math.log(2))
+    same = stacked(two_modes(0.0), two_modes(0.0))
+    assert float(mutual_information(same, key)) == pytest.approx(0.0, abs=1e-5)
+    different = stacked(two_modes(50.0), two_modes(-50.0))
+    assert float(mutual_information(different, key)) == pytest.approx(math.log(2))
 
 
 @pytest.mark.slow
@@ -150,9 +153,9 @@ def test_stacked_and_sequential_updates_agree(ensemble, data):
 def test_sampled_recordings_are_whole():
     clusters = [f"recording-{number}" for number in np.random.default_rng(0).integers(0, 40, 300)]
     rows = sample_recordings(clusters, 100, seed=1)
-    taken = {clusters[row] for row in rows}
-    assert rows.tolist() == [row for row, name in enumerate(clusters) if name in taken]
-    largest = max(clusters.count(name) for name in taken)
+    sampled = {clusters[row] for row in rows}
+    assert rows.tolist() == [row for row, name in enumerate(clusters) if name in sampled]
+    largest = max(clusters.count(name) for name in sampled)
     assert 100 <= len(rows) < 100 + largest
     assert sample_recordings(clusters, 100, seed=2).tolist() != rows.tolist()
     assert (
@@ -180,8 +183,8 @@ def test_ensemble_trained_on_some_recordings_scores_all(data):
 
 
 def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
-    one = ScenarioBank.from_scenarios(list(data)).nbytes / 10
-    monkeypatch.setattr(ensemble_module, "free_memory", lambda device: int(16.5 * one))
+    scenario_bytes = ScenarioBank.from_scenarios(list(data)).nbytes / 10
+    monkeypatch.setattr(ensemble_module, "free_memory", lambda device: int(16.5 * scenario_bytes))
     with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from 4 to"):
         train_ensemble(TINY, data)
     with pytest.raises(UsageError, match="are free; free memory"):
@@ -248,11 +251,12 @@ def test_ensemble_table(data, ensemble, weighted):
     assert sorted(table.components) == ["action_0", "action_1", "disagreement"]
     predictions = trained.predictions(data)
     whole = predictions.disagreement(trained.deviation).sum(axis=-1)
-    # A half at the percentile 99, more beyond it: the order stays to the top.
+    # 0.5 at the 99th percentile, more beyond it, so the largest disagreements stay in order.
     expected = whole / (whole + np.percentile(whole, 99.0))
     np.testing.assert_allclose(table.steps, expected)
-    one = predictions.disagreement(trained.deviation)[..., 0]
-    np.testing.assert_allclose(table.components["action_0"], one / (one + np.percentile(whole, 99.0)))
+    action_0 = predictions.disagreement(trained.deviation)[..., 0]
+    expected_0 = action_0 / (action_0 + np.percentile(whole, 99.0))
+    np.testing.assert_allclose(table.components["action_0"], expected_0)
     assert np.unique(table.steps[expected > 0.5]).size > 5 and table.steps.max() < 1.0
     error = predictions.error(trained.deviation, trained.fold)[predictions.known]
     by_hand = scipy.stats.spearmanr(table.steps[predictions.known], error).statistic

@@ -15,7 +15,7 @@ from drivax.scenario.schema import AgentKind, Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import bank_of, car, moved, straight_road
 
-NOW = 10  # where `car` puts everyone at (x, y)
+NOW = 10  # the step at which `car` is at (x, y)
 CONFIG = KinematicConfig()
 
 TIME = (np.arange(91) - NOW) * 0.1
@@ -84,7 +84,7 @@ def conflict(result):
 
 @pytest.fixture(scope="module")
 def steps(components):
-    """Return the mean of urgency and braking."""
+    """Mean of urgency and braking by scene."""
     return {scene: conflict(result) for scene, result in components.items()}
 
 
@@ -111,7 +111,7 @@ def test_components_equal_hand_computed_values(steps):
 
 
 def test_every_step_of_an_approach(steps):
-    """From a distance of 74 m to nearly 0, without a discontinuity between the two route windows."""
+    """From a gap of 66 m to one of 4 m, without a discontinuity between the two route windows."""
     at = np.arange(3, 45)
     gap = 60.0 - 4.8 - 15.0 * (at - NOW) * 0.1
     reference = [expected(g / 15.0, 15.0**2 / (2 * g)) for g in gap]
@@ -155,7 +155,7 @@ def test_last_motion_is_repeated_where_ego_is_missing(steps):
 
 
 def test_speed_noise_of_one_cm_per_s_is_negligible(components):
-    """Two least-squares windows of 1.5 s: the published heuristic scores the same noise 0.6."""
+    """A fit over 1.5 s removes most of it; the published heuristic scores the same noise 0.6."""
     assert components["noise"]["volatility"].max() < 0.02
 
 
@@ -168,11 +168,11 @@ def test_jerk_and_yaw_acceleration(components):
 BRAKING = 30.0 - 2.0 * (TIME + 1.0)
 
 
-@pytest.mark.parametrize("there", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
+@pytest.mark.parametrize("present", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
 @pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * (TIME - 4.5) ** 2, 0.5)])
-def test_volatility_ignores_steps_without_ego(there, speeds, jerk):
+def test_volatility_ignores_steps_without_ego(present, speeds, jerk):
     """Constant deceleration or jerk up to the last valid step; 0 without 1.5 s of valid steps."""
-    valid = np.isin(np.arange(91), list(there))
+    valid = np.isin(np.arange(91), list(present))
     track = with_speeds(speeds)
     bank = bank_of(straight_road([track | {"valid": valid}]))
     result = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
@@ -198,7 +198,7 @@ def test_distances_are_to_segments(components):
     assert components["aside"]["off_road"].max() == 0.0
     assert components["kerb"]["off_road"][NOW] == pytest.approx(1 - 0.35 / 0.75, abs=1e-3)
     assert components["verge"]["off_road"][NOW] == 1.0
-    # Beyond the reach of a query for edges the stored side of the place tells, and off the map nothing does.
+    # Beyond the edge cut-off the stored side of the grid cell decides; off the map the car counts as on the road.
     assert (components["field"]["off_road"] == 1.0).all()
     nowhere = components["off the map"]
     assert nowhere["off_road"].max() == 0.0 and nowhere["lane_deviation"].max() == 0.0

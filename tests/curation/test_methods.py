@@ -48,7 +48,7 @@ def data(tmp_path_factory):
 def tables(data, tmp_path_factory):
     like = tmp_path_factory.mktemp("tables") / "kinematic.npz"
     write_scores(curate("kinematic", Request(data)), like)
-    # An ensemble has to be trained first, and has tests of its own.
+    # An ensemble needs training, and has its own tests.
     names = [name for name in METHODS if name != "ensemble"]
     return {name: curate(name, Request(data, like if name == "random_matched" else None)) for name in names}
 
@@ -67,8 +67,8 @@ def test_methods_return_their_declared_components(tables):
     for table in tables.values():
         method = METHODS[table.method]
         if table.components:
-            weighed = method.combination(method.config).weights
-            assert set(table.components) == {*weighed, *method.extra_components(method.config)}
+            weights = method.combination(method.config).weights
+            assert set(table.components) == {*weights, *method.extra_components(method.config)}
 
 
 def test_commands_offer_every_method_and_arm():
@@ -115,7 +115,7 @@ def test_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
     assert [entry["scenario_id"] for entry in top.entries] == [f"drive-{row}" for row in rows]
     np.testing.assert_array_equal(top.records(range(3)), data.records(rows))
     assert top.manifest["source"]["part_of"]["method"] == "kinematic"
-    assert top_rows(tables["uniform"], 2) == [0, 1]  # of equal ones the first
+    assert top_rows(tables["uniform"], 2) == [0, 1]  # equal scores by index
     assert main(["inspect", str(tmp_path / "top")]) == 0
 
 

@@ -14,7 +14,7 @@ NOISE = 0.01 * np.random.default_rng(0).standard_normal(91)
 
 
 def ego(speeds=None, heading=None):
-    """A car with given speeds or headings; its position does not matter."""
+    """A car with these speeds or headings; its position does not matter."""
     track = car(speed=10.0)
     speeds = np.full(91, 10.0) if speeds is None else speeds
     heading = np.zeros(91) if heading is None else heading

@@ -112,7 +112,7 @@ def lively(tmp_path_factory):
     return ScenarioSet.open(path)
 
 
-#: By method that needs no training: the score of that drive, and of every twelfth step.
+#: By method that needs no training: the scores of the scenario ``lively``, and of every twelfth step.
 FROZEN = {
     "kinematic": [0.4294, 0.1504, 0.0496, 0.2123, 0.254, 0.0595, 0.1475, 0.1588, 0.3365],
     "published": [0.5311, 0.2493, 0.1308, 0.6747, 0.6327, 0.2418, 0.5099, 0.5612, 0.3822],
@@ -242,24 +242,25 @@ def test_command_writes_scores(data, tmp_path, capsys):
     out, top = tmp_path / "scores.npz", tmp_path / "top"
     command = ["curate", "kinematic", "--data", str(data.path)]
     assert main([*command, "--out", str(out), "--export", str(top), "1"]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     result = read_scores(out, data)
     assert result.scenarios[1] > result.scenarios[0] and result.steps[1].max() > 0.5
-    assert "2 scenarios, kinematic" in said and "effective sample" in said and "the 1 most critical" in said
-    assert max(map(len, said.replace(str(tmp_path), "").splitlines())) < 100
+    for words in ("2 scenarios, kinematic", "effective sample", "the 1 most critical"):
+        assert words in printed
+    assert max(map(len, printed.replace(str(tmp_path), "").splitlines())) < 100
     assert [entry["scenario_id"] for entry in ScenarioSet.open(top).entries] == ["drive-1"]
     # Other weights and another aggregator, without scoring again.
-    anew = [*command, "--out", str(tmp_path / "anew.npz"), "--again", str(out)]
-    assert main([*anew, "--weights", "urgency", "0.5", "density", "0.25", "--scenario", "max"]) == 0
-    other = read_scores(tmp_path / "anew.npz", data)
+    recombine = [*command, "--out", str(tmp_path / "recombined.npz"), "--again", str(out)]
+    assert main([*recombine, "--weights", "urgency", "0.5", "density", "0.25", "--scenario", "max"]) == 0
+    other = read_scores(tmp_path / "recombined.npz", data)
     by_hand = (2 * result.components["urgency"] + result.components["density"]) / 3
     np.testing.assert_allclose(other.steps, np.where(result.valid, by_hand, 0.0), rtol=1e-6)
     np.testing.assert_array_equal(other.scenarios, other.steps.max(axis=1))
     assert other.combination == Combination({"urgency": 0.5, "density": 0.25}, "max")
     # And one aggregator for each component.
     weights, apart = ["--weights", "urgency", "0.5", "braking", "0.25"], ["urgency", "max", "braking", "mean"]
-    assert main([*anew, "--overwrite", *weights, "--scenario", *apart]) == 0
-    other = read_scores(tmp_path / "anew.npz", data)
+    assert main([*recombine, "--overwrite", *weights, "--scenario", *apart]) == 0
+    other = read_scores(tmp_path / "recombined.npz", data)
     urgency, braking = (
         np.where(result.valid, result.components[name], 0.0) for name in ("urgency", "braking")
     )
@@ -278,9 +279,9 @@ def test_command_writes_scores(data, tmp_path, capsys):
         ([*weights, "--scenario", "urgency", "max", "braking", "most"], "unknown aggregator 'most'"),
         (["--scenario", "urgency=max", "braking=p95"], "unknown aggregator 'braking=p95'"),
     ):
-        assert main([*anew, "--overwrite", *wrong]) == 2
+        assert main([*recombine, "--overwrite", *wrong]) == 2
         assert words in capsys.readouterr().err
-    # Or before anything is trained or scored.
+    # Without --again, such errors are found before training or scoring.
     begin = ["--data", str(data.path), "--out", str(tmp_path / "x")]
     mixture = ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
     for wrong, words in (
@@ -293,10 +294,10 @@ def test_command_writes_scores(data, tmp_path, capsys):
         assert main(["curate", *wrong[:1], *begin, *wrong[1:]]) == 2
         messages = capsys.readouterr().err
         assert words in messages and "scor" not in messages.split(words)[0]
-    assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
+    assert main(["curate", "published", *recombine[2:], "--overwrite"]) == 2
     assert "is a table of kinematic; use curate kinematic" in capsys.readouterr().err
     for ignored in (["--seed", "1"], ["--like", str(out)]):
-        assert main([*anew, "--overwrite", *ignored]) == 2
+        assert main([*recombine, "--overwrite", *ignored]) == 2
         assert f"has no such setting; leave out {ignored[0]}" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "x"), "--seed", "1"]) == 2
     assert "kinematic has no such setting; leave out --seed" in capsys.readouterr().err

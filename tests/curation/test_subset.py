@@ -36,7 +36,7 @@ def data(tmp_path_factory):
 
 def hand_made(data, scenarios, means=None):
     """A table with given scores of scenarios and means of their valid steps."""
-    valid = np.stack([np.asarray(one.record["agent_valid"][:, 0], bool) for one in data])
+    valid = np.stack([np.asarray(scenario.record["agent_valid"][:, 0], bool) for scenario in data])
     means = np.zeros(len(data)) if means is None else np.asarray(means)
     steps = np.where(valid, means[:, None], 0.0)
     ids = tuple(entry["scenario_id"] for entry in data.entries)
@@ -121,7 +121,7 @@ def test_subset_folder_holds_its_scores(data, tmp_path):
     part = {"set": "set", "hash": data.hash, "most_critical": 3, "all_windows": False}
     assert own.config["part_of"] == part and own.combination == table.combination
     assert own.config["urgent_s"] == table.config["urgent_s"]
-    # Scores of the whole set are not those of the subset, and where those are is said.
+    # The scores of the whole set are refused for the subset; the message names the subset's own.
     write_scores(table, tmp_path / "whole.npz")
     with pytest.raises(DataError, match=r"scores belong to another set .*; use .*top/scores\.npz"):
         read_scores(tmp_path / "whole.npz", top)
@@ -142,19 +142,18 @@ def test_failed_subset_leaves_no_folder(data, tmp_path, monkeypatch):
 def test_command_prints_the_most_critical(data, tmp_path, capsys):
     out, top = tmp_path / "scores.npz", tmp_path / "top"
     command = ["curate", "kinematic", "--data", str(data.path), "--export", str(top), "3"]
-    for lost in (top, top / "scores.npz"):
-        assert main([*command, "--out", str(lost)]) == 2
+    for inside in (top, top / "scores.npz"):
+        assert main([*command, "--out", str(inside)]) == 2
         assert "output is inside the --export folder; choose another --out" in capsys.readouterr().err
         assert not list(tmp_path.iterdir())
     assert main([*command, "--out", str(out)]) == 0
     lines = capsys.readouterr().out.replace(str(tmp_path), "").splitlines()
     assert max(map(len, lines)) < 100
-    place = lines.index("/top: the 3 most critical scenarios, at most one per recording")
-    assert lines[place + 1 : place + 3] == ["/top/scores.npz: their scores", "  rank  score  scenario"]
+    first = lines.index("/top: the 3 most critical scenarios, at most one per recording")
+    assert lines[first + 1 : first + 3] == ["/top/scores.npz: their scores", "  rank  score  scenario"]
     table = read_scores(out, data)
     rows = top_rows(table, 3, recordings_of(data.entries))
-    message = [line.split() for line in lines[place + 3 :]]
-    assert message == [
+    assert [line.split() for line in lines[first + 3 :]] == [
         [str(rank), f"{table.scenarios[row]:.3f}", f"drive-{row}"] for rank, row in enumerate(rows, start=1)
     ]
 

@@ -19,10 +19,10 @@ def make_table(steps, valid=None, scenarios=None):
     return ScoreTable("made", {}, "hash", ids, valid, np.where(valid, steps, 0.0), scenarios)
 
 
-def plain(**given):
-    return WeightConfig(
-        **({"normalise": "none", "temperature": 1.0, "most": float("inf"), "uniform": 0.0} | given)
-    )
+def plain(**changes):
+    """Weights in proportion to the scores, with some settings changed."""
+    settings = {"normalise": "none", "temperature": 1.0, "most": float("inf"), "uniform": 0.0}
+    return WeightConfig(**(settings | changes))
 
 
 TABLE = make_table(RNG.permutation(2000 * 51).reshape(2000, 51) / (2000 * 51))
@@ -52,7 +52,7 @@ def test_mixture_with_uniform():
 
 
 def test_clipping_and_floor():
-    table = make_table([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step leads nowhere
+    table = make_table([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step has no action
     np.testing.assert_allclose(
         sampling_weights(table, plain(), "step")[0], np.array([0, 0.1, 0.1, 0.8, 0]) / 0.25
     )
@@ -65,7 +65,7 @@ def test_clipping_and_floor():
 
 @pytest.mark.parametrize("most", [1.1, 2.0, 10.0])
 def test_clip_bounds_all_weights(most):
-    """For any tail; other weights keep their proportions, and as few weights as possible are clipped."""
+    """For several tails; other weights keep their proportions, and as few weights as possible are clipped."""
     rng = np.random.default_rng(0)
     for power in (0.5, 1.0, 4.0):
         score = rng.uniform(0.001, 1.0, (20, 11)) ** power
@@ -132,10 +132,11 @@ def test_low_temperature_is_stable():
 
 
 def test_one_step_with_all_the_weight():
-    one = np.zeros((4, 26))
-    one[2, 3] = 1.0
+    scores = np.zeros((4, 26))
+    scores[2, 3] = 1.0
     result = draw_statistics(
-        sampling_weights(make_table(one), plain(), "step"), np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1)))
+        sampling_weights(make_table(scores), plain(), "step"),
+        np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1))),
     )
     assert (result.effective, result.effective_scenarios) == (pytest.approx(0.01), pytest.approx(0.25))
     assert (result.largest, result.concentration) == (pytest.approx(100.0), pytest.approx(1.0))
@@ -150,11 +151,11 @@ def test_permuted_scores_keep_the_distribution_of_weights(config, scale):
     table = make_table(np.clip(RNG.random((500, 1)) ** 3 + 0.1 * RNG.random((500, 41)), 0, 1))
     control = permute_scores(table, seed=7)
     drawn = table.drawable
-    own, other = (sampling_weights(one, config, scale) for one in (table, control))
+    own, other = (sampling_weights(scores, config, scale) for scores in (table, control))
     np.testing.assert_allclose(np.sort(own[drawn]), np.sort(other[drawn]))
-    one, two = draw_statistics(own, drawn), draw_statistics(other, drawn)
-    assert one.effective == pytest.approx(two.effective, rel=1e-9)
-    assert one.effective_scenarios == pytest.approx(two.effective_scenarios, rel=1e-9) and one.effective < 0.8
+    own_draws, other_draws = draw_statistics(own, drawn), draw_statistics(other, drawn)
+    assert own_draws.effective == pytest.approx(other_draws.effective, rel=1e-9) and own_draws.effective < 0.8
+    assert own_draws.effective_scenarios == pytest.approx(other_draws.effective_scenarios, rel=1e-9)
     # Of 500 scenarios: a standard error of 0.045.
     assert abs(np.corrcoef(own[drawn], other[drawn])[0, 1]) < 0.14
     np.testing.assert_array_equal(permute_scores(table, seed=7).steps, control.steps)
@@ -178,9 +179,8 @@ def test_permuted_scores_of_scenarios_of_unequal_length():
     control = permute_scores(table, seed=1)
     drawn = table.drawable
     for row in np.flatnonzero(drawn.any(axis=1)):
-        assert (
-            len({*control.steps[row, drawn[row]], control.scenarios[row]}) == 1
-        )  # all of one other scenario
+        # All scores of a scenario come from the same one.
+        assert len({*control.steps[row, drawn[row]], control.scenarios[row]}) == 1
     assert sorted(control.scenarios) == sorted(table.scenarios) and not control.steps[5].any()
 
 
@@ -208,7 +208,7 @@ def test_scenario_ranks_count_drawable_steps(config):
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("settings", "words"),
     [
         ({"floor": -0.1}, "floor is -0.1"),
         ({"temperature": 0.0}, "temperature is 0.0"),
@@ -216,9 +216,9 @@ def test_scenario_ranks_count_drawable_steps(config):
         ({"uniform": 1.1}, "uniform is 1.1"),
     ],
 )
-def test_invalid_arguments_are_refused(given, words):
+def test_invalid_arguments_are_refused(settings, words):
     with pytest.raises(UsageError, match=words):
-        WeightConfig(**given)
+        WeightConfig(**settings)
 
 
 def test_zero_weights_are_refused():

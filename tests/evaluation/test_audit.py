@@ -78,7 +78,7 @@ def test_batch_size_and_other_scenarios_change_no_finding(world, findings):
 
 
 def test_collision_has_its_first_step():
-    # Bumper to bumper 30 - 4.8 = 25.2 m at 8 m/s: 3.15 s after the current step, so seen at the 32nd step after it.
+    # Bumper to bumper 30 - 4.8 = 25.2 m at 8 m/s: contact after 3.15 s, so at the 32nd step after the current one.
     (finding,) = audited(straight_road([car(0, 0, 0, 8), car(30, 0, 0, 0)]))
     assert (finding["log_collides"], finding["first_collision_step"]) == (True, CURRENT_STEP + 32)
     assert finding["clean"] is False and finding["log_offroad_fraction"] == 0.0
@@ -97,7 +97,7 @@ def test_leaving_and_entering_the_road_have_their_first_steps():
         return straight_road([{**across, "heading": np.zeros(91)}])
 
     # A centre below y = -5.85 has left the map, and is still off the road.
-    # y = -0.525 - 0.1 k: off the road from k = 7 on, the map from 54 on. y = -2.975 + 0.05 k: on the road from 37 on.
+    # y = -0.525 - 0.1 k: off the road from k = 7 on, off the map from 54 on. y = -2.975 + 0.05 k: on the road from 37.
     leaves, enters = audited(slides(-0.525, -1.0), slides(-2.975, 0.5))
     assert leaves["first_offroad_step"] == CURRENT_STEP + 7
     assert leaves["log_offroad_fraction"] == 74 / 80
@@ -135,7 +135,7 @@ def test_manoeuvre_in_reverse_is_measured_and_no_violation():
 def test_other_agents_with_headings_off_by_pi_are_counted():
     kinds = (AgentKind.VEHICLE, AgentKind.CYCLIST, AgentKind.PEDESTRIAN)
     others = [turned(car(30 + 20 * i, 3.7, speed=6, kind=kind)) for i, kind in enumerate(kinds)]
-    gap = turned(car(120, 3.7, speed=6, steps=[*range(30), *range(70, 91)]))  # seen for 4 s: 23.4 m
+    gap = turned(car(120, 3.7, speed=6, steps=[*range(30), *range(70, 91)]))  # 39 moves of 0.6 m: 23.4 m
     slow = turned(car(150, 3.7, speed=2))  # 16 m
     (finding,) = audited(straight_road([car(speed=6), *others, gap, slow]))
     assert finding["agents_reversing"] == 4  # whichever way pedestrians look
@@ -168,10 +168,10 @@ def test_route_that_ends_elsewhere_does_not_reach_the_goal():
 
 
 def test_steps_without_a_logged_ego_are_not_evaluated():
-    # Ego is lost after step 30; another car later drives through the place where it was seen last.
-    seen = straight_road([car(0, 0, 0, 8), car(-60, 0, 0, 20)])
-    gone = straight_road([car(0, 0, 0, 8, steps=range(31)), car(-60, 0, 0, 20, steps=range(91))])
-    whole, part = audited(seen, gone)
+    # Ego is lost after step 30; another car later drives through its last position.
+    complete = straight_road([car(0, 0, 0, 8), car(-60, 0, 0, 20)])
+    lost = straight_road([car(0, 0, 0, 8, steps=range(31)), car(-60, 0, 0, 20, steps=range(91))])
+    whole, part = audited(complete, lost)
     assert whole["log_collides"] is True
     assert part["log_collides"] is False and part["clean"] is True
     assert part["distance_m"] == pytest.approx(16.0, abs=0.05)
@@ -269,7 +269,7 @@ def test_clipped_shares_count_logged_actions_beyond_the_bounds():
     soft, hard = audited(straight_road([braking(5.0)]), straight_road([braking(9.0)]))
     assert (soft["clipped_physical"], soft["clipped_published"]) == (0.0, 10 / 80)
     assert (hard["clipped_physical"], hard["clipped_published"]) == (10 / 80, 10 / 80)
-    # Steps at which the log does not know ego are judged by nobody: 40 to 49, and the one after.
+    # Steps without a logged ego (40 to 49) and the action into the step after them do not count.
     gap = car(0, 0, 0, 5, steps=[*range(40), *range(50, 91)])
     (finding,) = audited(straight_road([gap]))
     assert (finding["clipped_physical"], finding["clipped_published"]) == (0.0, 0.0)

@@ -26,9 +26,9 @@ PLAN = ComparisonPlan(minimum_scenarios=10, resamples=400, secondary=("collision
 def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, **metrics):
     """An evaluation with score, collisions and comfort; ``rows`` are numbers of scenarios."""
     rng, rows = np.random.default_rng(seed), np.array(rows)
-    scene = np.random.default_rng(0).normal(0.6, 0.2, 10 * N)[rows]
+    scenario_score = np.random.default_rng(0).normal(0.6, 0.2, 10 * N)[rows]
     values = {
-        "vmax_score": scene + shift + rng.normal(0, 0.05, rows.size),
+        "vmax_score": scenario_score + shift + rng.normal(0, 0.05, rows.size),
         "collision": (rng.random(rows.size) < 0.3 - shift).astype(float),
         "comfortable": (rng.random(rows.size) < 0.5).astype(float),
         "min_ttc": np.full(rows.size, np.nan),
@@ -42,8 +42,8 @@ def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, *
         "seed": ("0",) * rows.size,
         "traffic": ("log",) * rows.size,
     }
-    known = {"traffic": "log", "data": {"hash": "abc"}} | (about or {})
-    return EpisodeTable(Path("runs") / name, name, known, keys, values | metrics)
+    info = {"traffic": "log", "data": {"hash": "abc"}} | (about or {})
+    return EpisodeTable(Path("runs") / name, name, info, keys, values | metrics)
 
 
 def test_paired_comparison_equals_hand_computed_values():
@@ -83,6 +83,17 @@ def test_recordings_are_resampled_as_a_whole():
     assert result.primary.evidence.units == 20
 
 
+def test_planners_of_one_name_are_distinguished_by_their_folders():
+    """Every algorithm has a ``seed-0``."""
+    tables = [table("seed-0", seed=seed) for seed in (1, 2, 3)]
+    folders = ("runs/bc/seed-0", "runs/ppo/seed-0", "runs/ppo/other")
+    bc, ppo, other = (
+        dataclasses.replace(one, folder=Path(f)) for one, f in zip(tables, folders, strict=True)
+    )
+    assert compare(PLAN, [bc], [ppo]).names == ("seed-0 (bc/seed-0)", "seed-0 (ppo/seed-0)")
+    assert compare(PLAN, [bc], [other]).names == ("seed-0 (seed-0)", "seed-0 (other)")
+
+
 def test_order_does_not_matter_and_only_common_scenarios_count():
     a = table("one", rows=range(N))
     part = table("two", rows=list(reversed(range(20, N + 10))))
@@ -116,20 +127,21 @@ def test_power_separates_no_difference_from_too_few_scenarios():
         result = compare(dataclasses.replace(PLAN, smallest_difference=smallest), [a], [b])
         assert result.primary.winner is None and result.decision.because == "power"
         assert result.decision.recommendation == recommendation
-        seen = result.sensitivity
-        assert seen.power == pytest.approx(power(smallest / deviation, N)) and seen.design_effect == 1.0
-        assert seen.needed == scenarios_needed(smallest / deviation)
-        assert power(seen.detectable / deviation, N) == pytest.approx(0.8)
+        sensitivity = result.sensitivity
+        assert sensitivity.power == pytest.approx(power(smallest / deviation, N))
+        assert sensitivity.design_effect == 1.0
+        assert sensitivity.needed == scenarios_needed(smallest / deviation)
+        assert power(sensitivity.detectable / deviation, N) == pytest.approx(0.8)
     assert result.decision.needed == result.sensitivity.needed > N
-    # Without a number of its own: a tenth of the deviation, for which textbooks ask for 787 pairs.
+    # By default a tenth of the deviation, for which textbooks ask for 787 pairs.
     assert compare(PLAN, [a], [b]).sensitivity.needed == scenarios_needed(0.1) == 787
 
 
 def test_clustered_scenarios_need_more_of_them():
     a, b = table("one", per_recording=4, seed=2), table("two", per_recording=4)
     a.metrics["vmax_score"][:] += np.repeat(np.random.default_rng(5).normal(0, 0.2, N // 4), 4)
-    seen = compare(PLAN, [a], [b]).sensitivity
-    assert 3 < seen.design_effect <= 4.5 and seen.needed > 3 * 787
+    sensitivity = compare(PLAN, [a], [b]).sensitivity
+    assert 3 < sensitivity.design_effect <= 4.5 and sensitivity.needed > 3 * 787
 
 
 def test_equal_planners_give_no_difference():
@@ -168,7 +180,7 @@ def test_splits_give_each_planner_its_own_scenarios(split):
 
 
 def seeds_of(*shifts, folder="runs/bc", first=3, **more):
-    """Evaluations of the seeds of a policy with different shifts of the score."""
+    """Evaluations of a policy's seeds, whose scores are shifted by ``shifts``."""
     tables = [table(f"seed-{n}", shift, seed=first + n, **more) for n, shift in enumerate(shifts)]
     return [dataclasses.replace(one, folder=Path(folder) / one.name) for one in tables]
 
@@ -182,12 +194,12 @@ def test_interval_covers_seeds_and_scenarios():
     apart = rows.mean(axis=0) - other
     one = result.primary
     assert one.difference.mean == pytest.approx(apart.mean()) and one.difference.n == N
-    # By hand: every scenario is its own recording, and the other planner is certain.
-    rest = rows - rows.mean(axis=1, keepdims=True) - rows.mean(axis=0) + rows.mean()
-    agents = rows.mean(axis=1).var(ddof=1) / 3
-    scenarios, both = apart.var(ddof=1) / N, (rest**2).sum() / (N * (N - 1) * 3 * 2)
-    square = max(agents + scenarios - both, agents, scenarios)
-    freedom = square**2 / (agents**2 / 2 + scenarios**2 / (N - 1))
+    # By hand: every scenario is its own recording, and the other planner has no variance of seeds.
+    residuals = rows - rows.mean(axis=1, keepdims=True) - rows.mean(axis=0) + rows.mean()
+    seed_variance = rows.mean(axis=1).var(ddof=1) / 3
+    scenario_variance, interaction = apart.var(ddof=1) / N, (residuals**2).sum() / (N * (N - 1) * 3 * 2)
+    square = max(seed_variance + scenario_variance - interaction, seed_variance, scenario_variance)
+    freedom = square**2 / (seed_variance**2 / 2 + scenario_variance**2 / (N - 1))
     half = scipy.stats.t.ppf(0.975, freedom) * np.sqrt(square)
     assert (one.difference.low, one.difference.high) == pytest.approx(
         (apart.mean() - half, apart.mean() + half)
@@ -197,7 +209,9 @@ def test_interval_covers_seeds_and_scenarios():
     spread = result.seeds[0]
     assert spread.means == pytest.approx(rows.mean(axis=1))
     assert spread.interquartile.low < spread.interquartile.mean < spread.interquartile.high
-    assert result.seeds[1] is None and result.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
+    assert result.seeds[1] is None and result.secondary[0].a.n == N, (
+        "means over several seeds are not only 0 or 1"
+    )
 
 
 def test_no_number_of_scenarios_decides_between_varying_seeds():
@@ -226,7 +240,7 @@ def test_seeds_that_differ_equally_everywhere_need_more_seeds():
     seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
     result = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
     assert (result.decision.recommendation, result.decision.because) == ("not enough scenarios", "seeds")
-    assert (result.primary.a.low, result.primary.a.high) == (0.0, 1.0), "a score is no less, and no more"
+    assert (result.primary.a.low, result.primary.a.high) == (0.0, 1.0), "intervals of a score stay in [0, 1]"
     same = compare(
         PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
     )

@@ -20,7 +20,7 @@ from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
 
 COUNT, LATE = 6, 60
-#: Some of every kind: truths, sums, means, filters over the history.
+#: Metrics of each kind: booleans, ratios, means, filters over the history, sums.
 METRICS = ("accuracy", "offroad", "progress_ratio", "ade", "max_jerk", "distance")
 
 
@@ -74,12 +74,12 @@ def test_automatic_resets_change_no_episode(world):
     simulator = Simulator(Task(metrics=METRICS))
 
     def action(context):
-        # Anything that depends on scenario and step only; some of them end off the road.
+        # Depends only on scenario and step; some episodes leave the road.
         phase = 1.7 * context.index + 0.4 * context.step
         return 0.5 * jnp.stack([jnp.sin(phase), jnp.cos(1.3 * phase)])
 
     @jax.jit
-    def alone(bank, states):
+    def step(bank, states):
         def one(state):
             after, transition = simulator.step(bank, state, action(state.context))
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
@@ -87,20 +87,18 @@ def test_automatic_resets_change_no_episode(world):
         return jax.vmap(one)(states)
 
     @jax.jit
-    def or_begin(bank, states, over, following):
+    def step_or_reset(bank, states, over, next_rows):
         def one(state, over, row):
-            taken = action(state.context)
-            after, transition = simulator.step_or_reset(
-                bank, state, taken, over, simulator.new_episode(bank, row, LATE)
-            )
+            start = simulator.new_episode(bank, row, LATE)
+            after, transition = simulator.step_or_reset(bank, state, action(state.context), over, start)
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
 
-        return jax.vmap(one)(states, over, following)
+        return jax.vmap(one)(states, over, next_rows)
 
     begin = jax.jit(jax.vmap(lambda bank, row: simulator.reset(bank, row, LATE), in_axes=(None, 0)))
     expected, states, live = {}, begin(world, jnp.arange(COUNT)), set(range(COUNT))
     while live:
-        states, done, metrics = alone(world, states)
+        states, done, metrics = step(world, states)
         for row in [row for row in live if done[row]]:
             expected[row] = jax.tree.map(lambda leaf, row=row: np.asarray(leaf[row]), (states, metrics))
             live.remove(row)
@@ -109,11 +107,11 @@ def test_automatic_resets_change_no_episode(world):
     states = jax.tree.map(lambda leaf: leaf[:3], states)
     while len(result) < COUNT:
         rows = np.where(over, rows + 3, rows) % COUNT
-        states, over, metrics = or_begin(world, states, over, jnp.asarray(rows))
-        for place in np.flatnonzero(over):
-            row = int(states.context.index[place])
-            assert row == rows[place]
-            result[row] = jax.tree.map(lambda leaf, at=place: np.asarray(leaf[at]), (states, metrics))
+        states, over, metrics = step_or_reset(world, states, over, jnp.asarray(rows))
+        for environment in np.flatnonzero(over):
+            row = int(states.context.index[environment])
+            assert row == rows[environment]
+            result[row] = jax.tree.map(lambda leaf, at=environment: np.asarray(leaf[at]), (states, metrics))
     assert len({int(state.context.step) for state, _ in expected.values()}) > 1, "some end early"
     for row in range(COUNT):
         same_but_rounding(expected[row], result[row])

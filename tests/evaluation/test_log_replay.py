@@ -27,7 +27,7 @@ def driven_by(planner, scenarios):
 
 def check_exact(scenarios):
     metrics = driven_by(EXACT, scenarios)
-    # Heights and headings are stored as float32 and headings as an angle: nothing is added to them.
+    # Logged poses are replayed as stored, so not even rounding adds to them.
     assert np.nanmax(metrics["ade"]) == 0.0 and np.nanmax(metrics["fde"]) == 0.0
     for name in ("collision", "at_fault_collision", "offroad", "red_light"):
         assert np.nansum(metrics[name]) == 0.0, name

@@ -18,9 +18,9 @@ from drivax.evaluation.memory import (
 
 
 def test_half_of_free_memory_holds_two_copies_and_the_program():
-    # 1 GB for us: 16 x 8 MB for the program leave 872 MB, for 436 scenarios of 1 MB that are there twice.
+    # Half of 2 GB: 16 x 8 MB for the program leave 872 MB, for two copies of 436 scenarios of 1 MB.
     assert scenarios_at_a_time(1_000_000, 16, 2_000_000_000) == 436
-    assert scenarios_at_a_time(1_000_000, 16, 100_000_000) == 16, "never fewer than are driven side by side"
+    assert scenarios_at_a_time(1_000_000, 16, 100_000_000) == 16, "never fewer than a program call runs"
     assert scenarios_at_a_time(1_000, 16, 10**12) == scenarios_at_a_time(1_000, 16, None) == MOST
 
 
@@ -34,16 +34,16 @@ def test_every_control_group_of_the_process_counts(tmp_path):
     job = groups / "batch" / "job-7"
     job.mkdir(parents=True)
     ours.write_text("0::/batch/job-7\n")
-    assert _group_limits(groups, ours) == [], "no limits are told"
+    assert _group_limits(groups, ours) == [], "no group has a limit"
     (groups / "batch" / "memory.max").write_text("max\n")
     (groups / "batch" / "memory.current").write_text("500\n")
     (job / "memory.max").write_text("1000\n")
     (job / "memory.current").write_text("400\n")
     assert _group_limits(groups, ours) == [(1000, 400)]
-    # Files that are kept in memory only because there is room do not count.
+    # The page cache does not count as used.
     (job / "memory.stat").write_text("anon 290\nactive_file 30\ninactive_file 80\n")
     assert _group_limits(groups, ours) == [(1000, 290)]
-    # The older kind has a folder per controller; in a container the root is the group itself.
+    # Version 1 has a folder per controller; in a container the root is the group itself.
     ours.write_text("4:memory:/elsewhere\n3:cpu:/\n0::/\n")
     (groups / "memory").mkdir()
     (groups / "memory" / "memory.limit_in_bytes").write_text("2000\n")

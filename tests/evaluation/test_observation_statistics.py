@@ -40,11 +40,11 @@ def faulty(bank, context, frames):
 
 
 @record
-class Shy(Memoryless):
+class PositionPlanner(Memoryless):
     """A planner with small actions that depend only on the position of the first agent."""
 
     actions: Any = static(default=Physical())
-    name: str = static(default="shy")
+    name: str = static(default="position")
     replays: bool = static(default=False)
 
     def act(self, carry, bank, state, situation, observation, key):
@@ -66,17 +66,17 @@ def bank():
 
 @pytest.fixture(scope="module")
 def summary(bank):
-    return observation_statistics(Shy(), bank, TASK, permute=True)
+    return observation_statistics(PositionPlanner(), bank, TASK, permute=True)
 
 
 def column(result, group, name):
-    (one,) = [one for one in result.features if (one.group, one.name) == (group, name)]
-    return one
+    (feature,) = [feature for feature in result.features if (feature.group, feature.name) == (group, name)]
+    return feature
 
 
 @pytest.mark.slow
 def test_states_are_sampled_before_and_after_the_collision(bank):
-    samples = sample_states(Simulator(evaluation_task(TASK)), Shy(), bank, every=10)
+    samples = sample_states(Simulator(evaluation_task(TASK)), PositionPlanner(), bank, every=10)
     assert samples.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert samples.has_collided.tolist() == [
@@ -89,21 +89,10 @@ def test_states_are_sampled_before_and_after_the_collision(bank):
 
 @pytest.mark.slow
 def test_statistics_of_a_column_are_of_its_valid_rows(summary):
-    assert (
-        summary.planner,
-        summary.episodes,
-        summary.collisions,
-        summary.states,
-        summary.permuted,
-    ) == (
-        "shy",
-        3,
-        summary.collisions,
-        24,
-        24,
-    )
+    assert (summary.planner, summary.episodes, summary.collisions) == ("position", 3, 1)
+    assert (summary.states, summary.permuted) == (24, 24)
     length = column(summary, "agents", "length")
-    # One other agent, at both steps of every look.
+    # One other agent, at both steps of each of 24 states.
     assert length.count == 48 and length.broken == 0
     np.testing.assert_allclose(
         [length.mean, length.std, length.low, length.high], [0.96, 0, 0.96, 0.96], atol=1e-6
@@ -115,11 +104,13 @@ def test_statistics_of_a_column_are_of_its_valid_rows(summary):
 
 @pytest.mark.slow
 def test_entries_that_are_not_finite_are_counted(summary):
-    one = column(summary, "faulty", "0")
-    assert (one.broken, summary.broken, one.count) == (2, 2, 22)
+    feature = column(summary, "faulty", "0")
+    assert (feature.broken, summary.broken, feature.count) == (2, 2, 22)
     steps = np.array([*range(10, 81, 10)] * 3)[[k for k in range(24) if k not in (1, 4)]] / 100
     np.testing.assert_allclose(
-        [one.mean, one.std, one.low, one.high], [steps.mean(), steps.std(), 0.1, 0.8], rtol=1e-5
+        [feature.mean, feature.std, feature.low, feature.high],
+        [steps.mean(), steps.std(), 0.1, 0.8],
+        rtol=1e-5,
     )
     rows = summary.as_dict()["features"]
     assert [row["broken"] for row in rows if row["group"] == "faulty"] == [2]
@@ -129,7 +120,7 @@ def test_entries_that_are_not_finite_are_counted(summary):
 
 @pytest.mark.slow
 def test_only_features_that_the_planner_uses_are_important(summary):
-    result = {(one.group, one.name): one.importance for one in summary.features}
+    result = {(feature.group, feature.name): feature.importance for feature in summary.features}
     assert result.pop(("agents", "position x")) > 0.5 and summary.groups["agents"] > 0.5
     assert set(result.values()) == {0.0}
     assert {value for name, value in summary.groups.items() if name != "agents"} == {0.0}
@@ -141,9 +132,11 @@ def test_other_agents_move_by_the_traffic_model():
     bank = bank_of(straight_road([car(0, 0, 0, 2), car(-40, 0, 0, 12)]))
     log, idm = (
         column(
-            observation_statistics(Shy(), bank, TASK, permute=False, traffic=one), "agents", "velocity ahead"
+            observation_statistics(PositionPlanner(), bank, TASK, permute=False, traffic=traffic),
+            "agents",
+            "velocity ahead",
         )
-        for one in (None, IdmTraffic())
+        for traffic in (None, IdmTraffic())
     )
     assert log.low == pytest.approx(12 / 15, abs=1e-3) and idm.low < 4 / 15
 
@@ -158,25 +151,25 @@ def test_statistics_of_hand_made_observations():
     rows = np.arange(12.0).reshape(2, 3, 1, 2)
     mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
     rows[0, 1, 0, 1], rows[0, 2, 0, 1], rows[1, 0, 0, 1] = np.nan, np.inf, -np.inf
-    hit, collides = np.array([[False] * 3, [False, False, True]]), np.array([False, True])
-    static = np.linspace(0, 1, 6).reshape(2, 3, 1)
-    seen = {"mine": rows, "mine_mask": mask, "ego_static": static}
-    one, two, static = column_statistics(
-        Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5}
+    has_collided, collides = np.array([[False] * 3, [False, False, True]]), np.array([False, True])
+    widths = np.linspace(0, 1, 6).reshape(2, 3, 1)
+    observation, features = (
+        {"own": rows, "own_mask": mask, "ego_static": widths},
+        Features(ego_static=("width",)),
     )
-    assert (one.group, one.name, static.name) == ("mine", "0", "width")
-    kept = [0.0, 2.0, 6.0, 8.0, 10.0]
-    assert (one.count, one.broken, one.mean, one.low, one.high) == (5, 0, np.mean(kept), 0.0, 10.0)
-    assert one.std == pytest.approx(np.std(kept)) and one.importance == 0.5 and np.isnan(two.importance)
+    first, second, width = column_statistics(features, observation, has_collided, collides, {("own", 0): 0.5})
+    assert (first.group, first.name, width.name) == ("own", "0", "width")
+    valid = [0.0, 2.0, 6.0, 8.0, 10.0]
+    assert (first.count, first.broken, first.mean, first.low, first.high) == (5, 0, np.mean(valid), 0.0, 10.0)
+    assert first.std == pytest.approx(np.std(valid)) and first.importance == 0.5
+    assert np.isnan(second.importance)
     # Infinite in a masked row counts as broken, too.
-    assert (two.count, two.broken, two.low, two.high) == (3, 3, 1.0, 11.0)
-    assert (static.count, static.low, static.high) == (6, 0.0, 1.0)
-    # Of two episodes nothing can be said; of four, r is that of their means before the collision: 1, 7, 1, 7.
-    assert np.isnan(one.collision)
-    twice = {name: np.concatenate([values, values]) for name, values in seen.items()}
-    again = column_statistics(
-        Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {}
-    )
+    assert (second.count, second.broken, second.low, second.high) == (3, 3, 1.0, 11.0)
+    assert (width.count, width.low, width.high) == (6, 0.0, 1.0)
+    # Two episodes are too few; of four, r is that of their means before the collision: 1, 7, 1, 7.
+    assert np.isnan(first.collision)
+    twice = {name: np.concatenate([values, values]) for name, values in observation.items()}
+    again = column_statistics(features, twice, np.tile(has_collided, (2, 1)), np.tile(collides, 2), {})
     assert again[0].collision == pytest.approx(1.0)
 
 
@@ -185,7 +178,7 @@ def test_correlation_equals_scipy_pointbiserialr():
     collides = rng.random(40) < 0.4
     values = rng.normal(size=(40, 6, 3)) + 0.8 * collides[:, None, None]
     valid = rng.random(values.shape) < 0.6
-    valid[3] = False  # no agent is there in the whole episode
+    valid[3] = False  # an episode without agents
     values[7, 2, 1] = np.nan
     means = [values[k][valid[k] & np.isfinite(values[k])].mean() for k in range(40) if k != 3]
     expected = stats.pointbiserialr(np.delete(collides, 3), means).statistic
@@ -199,7 +192,7 @@ def test_importance_of_a_linear_policy_is_known():
     """For a = 3 x + 4 y of independent x, y of variance 1, permuting x changes a by 3 sqrt(2), of its std 5."""
     rng = np.random.default_rng(1)
     count = 4000
-    seen = {
+    observation = {
         "g": rng.normal(size=(count, 3)).astype(np.float32),
         "h": rng.normal(size=(count, 2)).astype(np.float32),
     }
@@ -208,13 +201,13 @@ def test_importance_of_a_linear_policy_is_known():
         x, y = observation["g"][:, 0], observation["h"][:, 1]
         return np.stack([3 * x + 4 * y, np.full(count, 0.25)], axis=-1)
 
-    columns, groups = importances(act, seen)
+    columns, groups = importances(act, observation)
     root2 = np.sqrt(2)
     assert columns[("g", 0)] == pytest.approx(0.6 * root2, rel=0.05) == groups["g"]
     assert columns[("h", 1)] == pytest.approx(0.8 * root2, rel=0.05) == groups["h"]
     assert columns[("g", 1)] == columns[("g", 2)] == columns[("h", 0)] == 0.0
-    still = importances(lambda observation: np.ones((count, 2)), seen)[0]
-    assert all(np.isnan(value) for value in still.values())
+    constant = importances(lambda _: np.ones((count, 2)), observation)[0]
+    assert all(np.isnan(value) for value in constant.values())
 
 
 def test_permutation_keeps_masks_and_moves_only_valid_entries():
@@ -222,20 +215,20 @@ def test_permutation_keeps_masks_and_moves_only_valid_entries():
     mask = rng.random((50, 4)) < 0.5
     mask[:, 0] = True
     values = np.where(mask[..., None], rng.normal(size=(50, 4, 2)), 0.0)
-    asked = []
+    observations = []
 
     def act(observation):
-        asked.append(observation)
+        observations.append(observation)
         return rng.normal(size=(50, 1))
 
     importances(act, {"g": values, "g_mask": mask})
-    _, whole, first, second = asked
+    _, whole, first, second = observations
     order = [int(np.flatnonzero((values == row).all(axis=(1, 2)))[0]) for row in whole["g"]]
     assert sorted(order) == list(range(50)) and order != list(range(50))
     np.testing.assert_array_equal(whole["g_mask"], mask[order])
-    for number, one in enumerate((first, second)):
-        np.testing.assert_array_equal(one["g_mask"], mask)
-        assert not one["g"][~mask].any()
-        np.testing.assert_array_equal(one["g"][..., 1 - number], values[..., 1 - number])
-        np.testing.assert_array_equal(np.sort(one["g"][mask, number]), np.sort(values[mask, number]))
-        assert (one["g"][mask, number] != values[mask, number]).mean() > 0.9
+    for number, permuted in enumerate((first, second)):
+        np.testing.assert_array_equal(permuted["g_mask"], mask)
+        assert not permuted["g"][~mask].any()
+        np.testing.assert_array_equal(permuted["g"][..., 1 - number], values[..., 1 - number])
+        np.testing.assert_array_equal(np.sort(permuted["g"][mask, number]), np.sort(values[mask, number]))
+        assert (permuted["g"][mask, number] != values[mask, number]).mean() > 0.9

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.result_tables import planners_table
 from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
 from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner
@@ -21,10 +22,10 @@ from scenes import SMALL, bank_of, car, straight_road
 @pytest.mark.slow
 def test_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     """Scenario 0: a car stands 30 m ahead of a standing ego. Scenario 1: no other agent, so the metric is undefined."""
-    worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
+    recordings = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
-        for world in worlds:
-            writer.add(assemble(world, SMALL))
+        for recording in recordings:
+            writer.add(assemble(recording, SMALL))
     config = EvaluationConfig("constant_velocity", metrics=("own_terms:nearest_other",))
     results = run_evaluation(
         config, make_planner("constant_velocity"), ScenarioSet.open(tmp_path / "set"), tmp_path / "run"
@@ -41,7 +42,7 @@ def test_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     assert "Smallest distance between centres." in explanations(["nearest_other"], runs)
 
 
-def test_own_metrics_change_no_other_column():
+def test_own_metric_with_the_name_of_a_column_is_refused():
     bank, names = bank_of(straight_road([car()])), [{"dataset": "", "scenario_id": "a", "segment": "a"}]
     with pytest.raises(UsageError, match="the column 'crashed' already exists; rename your metric"):
         evaluate(make_planner("random"), bank, names, task=Task(metrics=("own_terms:crashed",)))

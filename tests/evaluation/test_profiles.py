@@ -34,8 +34,8 @@ def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("profiles") / "set"
     with ScenarioWriter(path, SMALL) as writer:
         for name, cars in (("free", []), ("blocked", [car(x=60.0, speed=0.0)])):
-            drive = straight_road([car(speed=8.0), *cars])
-            writer.add(assemble(replace(drive, scenario_id=name, segment=name), SMALL))
+            recording = straight_road([car(speed=8.0), *cars])
+            writer.add(assemble(replace(recording, scenario_id=name, segment=name), SMALL))
     return ScenarioSet.open(path)
 
 
@@ -89,7 +89,7 @@ def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):
 
 
 def test_simulated_traffic_is_read_from_its_stored_poses(data, tmp_path):
-    """In a set whose banks are smaller than its records, the standing car does not move."""
+    """The set's banks are smaller than its records, and the standing car does not move."""
     table = run_evaluation(
         EvaluationConfig("constant_velocity", traffic="idm"),
         make_planner("constant_velocity"),
@@ -132,7 +132,7 @@ def test_judge_writes_and_prints_both_definitions(data, run, capsys):
     assert main(["judge", str(out), "--overwrite"]) == 0
 
 
-def test_undefined_terms_are_empty_and_differ_from_nothing(tmp_path):
+def test_undefined_terms_are_empty_and_count_as_equal(tmp_path):
     terms = dict.fromkeys(TERMS, 1.0)
     row = ProfileRow("drivax", "a", terms | {"speed": np.nan, "ttc_ok": 0.0}, terms)
     assert row.differing == ("ttc_ok",)

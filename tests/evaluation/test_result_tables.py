@@ -26,13 +26,13 @@ N = 12
 
 def run(name, metrics, *, data="h1", path="sets/test", trained=None, traffic="log", planner=None):
     """An evaluation of twelve scenarios from twelve recordings."""
-    about = {"planner": planner or name, "traffic": traffic, "data": [{"path": path, "hash": data}]}
+    info = {"planner": planner or name, "traffic": traffic, "data": [{"path": path, "hash": data}]}
     if trained:
-        about["trained_on"] = [{"path": where, "hash": key} for where, key in trained]
+        info["trained_on"] = [{"path": set_path, "hash": key} for set_path, key in trained]
     ids = tuple(f"s{number}" for number in range(N))
     keys = {"scenario_id": ids, "segment": ids, "dataset": ("d",) * N}
     return EpisodeTable(
-        Path(name), name, about, keys, {n: np.array(v, np.float64) for n, v in metrics.items()}
+        Path(name), name, info, keys, {n: np.array(v, np.float64) for n, v in metrics.items()}
     )
 
 
@@ -78,13 +78,13 @@ def test_results_and_differences():
         "runs on other scenarios make no pairs"
     )
     low, high = numbers(table, table.rows[1])[0].interval.low, numbers(table, table.rows[1])[0].interval.high
-    assert low == pytest.approx(0.1) == high, "every pair differs by as much"
+    assert low == pytest.approx(0.1) == high, "all pairs differ by 0.1"
 
 
-def test_collision_types_are_shares_of_all_episodes():
+def test_collision_types_are_shares_of_episodes_with_a_known_type():
     kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
     table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
-    assert heads(table) == ("a",), "a run that does not know kinds has no column"
+    assert heads(table) == ("a",), "a run without types has no column"
     assert "share of the episodes with a known type" in table.caption
     whole = collisions_table([run("a", {"collision_type": [*kinds[:10], 0, 2]})])
     assert "share of all episodes" in whole.caption and {
@@ -98,7 +98,7 @@ def test_collision_types_are_shares_of_all_episodes():
     assert result == pytest.approx(wilson(2, 10).as_dict()), "undefined episodes do not count"
 
 
-def test_strata_in_the_order_of_their_words():
+def test_strata_are_in_the_order_of_the_tag_values():
     tags = {("d", f"s{i}"): {"difficulty": "hard" if i < 3 else "easy"} for i in range(N - 1)}
     success = [1, 0, 0] + [1] * 9
     table = strata_table(
@@ -162,16 +162,13 @@ def test_transfer_is_training_by_evaluation():
 
 def test_policies_of_one_name_are_distinguished(tmp_path):
     """Every algorithm has a ``seed-0``; only their names on the command line differ."""
-    runs = []
-    for place, (planner, data) in enumerate(
-        [("runs/bc/seed-0", "A"), ("runs/ppo/seed-0", "A"), ("runs/bc/seed-0", "B")]
-    ):
-        one = run(
-            f"seed-0 ({place})", {"success": [place % 2] * N}, data=data, path=f"x/{data}", planner="seed-0"
-        )
-        (tmp_path / str(place)).mkdir()
-        (tmp_path / str(place) / "config.yaml").write_text(f"planner: {planner}\n")
-        runs.append(replace(one, folder=tmp_path / str(place)))
+    runs, cases = [], [("runs/bc/seed-0", "A"), ("runs/ppo/seed-0", "A"), ("runs/bc/seed-0", "B")]
+    for number, (planner, data) in enumerate(cases):
+        metrics, folder = {"success": [number % 2] * N}, tmp_path / str(number)
+        evaluation = run(f"seed-0 ({number})", metrics, data=data, path=f"x/{data}", planner="seed-0")
+        folder.mkdir()
+        (folder / "config.yaml").write_text(f"planner: {planner}\n")
+        runs.append(replace(evaluation, folder=folder))
     table = transfer_table(runs, "success")
     assert [label for label, *_ in labels(table)] == ["bc/seed-0", "ppo/seed-0"]
     assert means(table) == [[0.0, 0.0], [1.0, None]]

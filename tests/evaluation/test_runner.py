@@ -105,7 +105,7 @@ def test_built_in_planners_do_not_depend_on_batches_order_or_other_scenarios(sce
 
 
 def test_stored_actions_reproduce_the_motion(whole):
-    """The first number of an action is a share of 6 m/s2, applied for a tenth of a second."""
+    """The first dimension of an action is the acceleration over 6 m/s2, applied for 0.1 s."""
     assert whole.trajectories.action.shape == (COUNT, 80, 2) and np.abs(whole.trajectories.action).max() <= 1
     before, after = whole.trajectories.ego[:, :-1, 3], whole.trajectories.ego[:, 1:, 3]
     drives = after > 0.01
@@ -135,26 +135,26 @@ def test_crash_fails_its_episode_and_changes_no_other(scenarios, whole, crashed)
     assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
     np.testing.assert_array_equal(crashed.trajectories.ego[3, :31], whole.trajectories.ego[3, :31])
     assert (crashed.trajectories.ego[3, 31:] == crashed.trajectories.ego[3, 30]).all(), (
-        "nobody drives it any more"
+        "ego's motion repeats after the crash"
     )
     np.testing.assert_array_equal(crashed.trajectories.action[3, :30], whole.trajectories.action[3, :30])
     assert (
         np.isnan(crashed.trajectories.action[3, 30:]).all()
         and np.isfinite(crashed.trajectories.action[4:]).all()
     )
-    row, sound = after[scenarios[3].id][0], before[scenarios[3].id][0]
-    assert row["crashed"] == "1" and sound["crashed"] == "0"
+    row, complete = after[scenarios[3].id][0], before[scenarios[3].id][0]
+    assert row["crashed"] == "1" and complete["crashed"] == "0"
     for name in FAILED:
-        assert row[name] == ("0" if sound[name] != "" else ""), name
-    # The rest is what was measured in the 30 steps until then.
+        assert row[name] == ("0" if complete[name] != "" else ""), name
+    # The other metrics cover the 30 steps before the crash.
     moved = np.hypot(*np.diff(whole.trajectories.ego[3, :31, :2], axis=0).T).sum()
     assert float(row["distance"]) == pytest.approx(moved, abs=0.05) and row["steps"] == "30"
-    assert 0 < float(row["progress_ratio"]) < float(sound["progress_ratio"])
+    assert 0 < float(row["progress_ratio"]) < float(complete["progress_ratio"])
     assert row["vmax_score"] == "0" and row["success"] == "0"
     for name in ("accuracy", "success", "vmax_score"):
         one, other = (results.summary()["metrics"][name] for results in (whole, crashed))
-        assert one["n"] == other["n"] == COUNT, "it stays in the denominator"
-        assert other["mean"] * COUNT == pytest.approx(one["mean"] * COUNT - float(sound[name]))
+        assert one["n"] == other["n"] == COUNT, "the crashed episode stays in the denominator"
+        assert other["mean"] * COUNT == pytest.approx(one["mean"] * COUNT - float(complete[name]))
     assert crashed.summary()["metrics"]["crashed"]["mean"] == pytest.approx(1 / COUNT)
 
 
@@ -171,8 +171,8 @@ def test_crash_has_scenario_step_and_error(scenarios, crashed, whole, tmp_path):
     stored = EpisodeTable.read(tmp_path)
     assert stored.crashes == crashed.crashes and stored.keys == crashed.keys
     assert stored.metrics["crashed"].tolist() == [float(row == 3) for row in range(COUNT)]
-    said = format_crashes(crashed).splitlines()
-    assert said == [
+    lines = format_crashes(crashed).splitlines()
+    assert lines == [
         "fragile crashed in 1 of 9 episodes, which count as failed:",
         f"  {scenarios[3].id}, step 40: action is not finite",
     ]
@@ -198,8 +198,8 @@ def test_summary_has_the_intervals_of_the_tables(whole, tmp_path):
         json.loads((tmp_path / "summary.json").read_text())["metrics"],
     )
     for name in ("success", "offroad", "progress_ratio"):
-        message = summarise(stored, name).as_dict()
-        assert summary[name] == pytest.approx(message, rel=1e-4), name
+        interval = summarise(stored, name).as_dict()
+        assert summary[name] == pytest.approx(interval, rel=1e-4), name
 
 
 def test_fail_crashed_equals_hand_computed_values():

@@ -9,15 +9,15 @@ from drivax.errors import UsageError
 from drivax.evaluation.pairing import assign, strata_of
 
 CLUSTERS = [f"r{number // 2}" for number in range(120)]
-#: A third of the recordings is hard; of the easy ones every fourth has one hard scenario of two.
+#: A third of the recordings is hard; some of the others have one hard scenario of two.
 HARD = ["hard" if (n // 2) % 3 == 0 or n % 8 == 3 else "easy" for n in range(120)]
 
 
 def test_split_assigns_whole_recordings_in_the_ratio():
     result = assign(CLUSTERS, None, 0.25, seed=1)
     arms = {cluster: set() for cluster in CLUSTERS}
-    for cluster, mine in zip(CLUSTERS, result.first, strict=True):
-        arms[cluster].add(bool(mine))
+    for cluster, in_first in zip(CLUSTERS, result.first, strict=True):
+        arms[cluster].add(bool(in_first))
     assert all(len(arm) == 1 for arm in arms.values()) and result.first.sum() == 30
     assert result.strata_count == 1
     np.testing.assert_array_equal(result.first, assign(CLUSTERS, None, 0.25, seed=1).first)
@@ -28,9 +28,9 @@ def test_strata_are_split_in_halves():
     result = assign(CLUSTERS, HARD, 0.5, seed=0)
     assert result.strata_count == 2
     for stratum in range(2):
-        mine = result.first[result.strata == stratum]
-        assert abs(int(mine.sum()) - int((~mine).sum())) <= 2, "two scenarios of a recording"
-    # Recordings of both kinds belong to the first kind by name among equals: easy.
+        in_first = result.first[result.strata == stratum]
+        assert abs(int(in_first.sum()) - int((~in_first).sum())) <= 2, "two scenarios of a recording"
+    # A recording with one scenario of each belongs to the stratum that is first by name: easy.
     sizes = Counter(result.strata.tolist())
     assert sizes == {0: 80, 1: 40}
 

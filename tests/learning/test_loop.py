@@ -66,7 +66,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
     with pytest.raises(UsageError, match=r"contains 3 seeds; name one, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
-    assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
+    assert [training.name for training in trainings] == ["three/seed-4", "three/seed-5", "three/seed-6"]
 
 
 def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path):

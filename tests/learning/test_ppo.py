@@ -189,7 +189,7 @@ def test_networks_are_clipped_by_their_own_norms():
 
 @pytest.mark.parametrize("name", ["environments", "unroll", "epochs", "minibatches"])
 def test_settings_of_zero_are_refused(name):
-    with pytest.raises(ValueError, match="are at least 1"):
+    with pytest.raises(ValueError, match="must be at least 1"):
         PpoConfig(**{name: 0})
 
 

@@ -43,7 +43,7 @@ def test_comfort_equals_limits_on_scipys_signals():
     t = np.arange(120) * 0.1
     speed = 8 + 2.0 * np.sin(0.9 * t) + 0.4 * np.sin(5.1 * t)
     heading = 0.5 * np.sin(0.8 * t) + 0.02 * rng.normal(size=t.size).cumsum()
-    judged = jax.vmap(check_comfort)(jnp.asarray(histories(speed, heading)))
+    result = jax.vmap(check_comfort)(jnp.asarray(histories(speed, heading)))
     a = np.diff(speed) / 0.1
     lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / 0.1
 
@@ -57,12 +57,12 @@ def test_comfort_equals_limits_on_scipys_signals():
     fine &= np.abs(savgol_filter(smooth, 15, 2, deriv=1, delta=0.1)) <= 4.13
     magnitude = np.abs(savgol_filter(smoothed(np.hypot(a, lateral)), 15, 2, deriv=1, delta=0.1))
     fine &= magnitude <= 8.37
-    # The filters of the running version see accelerations from step 1 on, and headings from the same step.
+    # Like accelerations, headings are filtered from step 1 on.
     turn = heading[1:]
     fine &= np.abs(savgol_filter(turn, 5, 2, deriv=1, delta=0.1)) <= 0.95
     fine &= np.abs(savgol_filter(turn, 5, 3, deriv=2, delta=0.1)) <= 1.93
     # A history at step t evaluates step t - 11; the last one evaluates twelve steps at once.
-    running = np.concatenate([np.asarray(judged.comfortable[:-1, 0]), np.asarray(judged.comfortable[-1])])
+    running = np.concatenate([np.asarray(result.comfortable[:-1, 0]), np.asarray(result.comfortable[-1])])
     expected = fine[10:]
     assert 0.2 < expected.mean() < 0.98
     np.testing.assert_array_equal(running, expected)
@@ -75,15 +75,15 @@ def test_comfort_equals_limits_on_scipys_signals():
 def test_lateral_acceleration_alone_fails_comfort():
     # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
     heading = np.arange(23) * 0.05
-    judged = check_comfort(jnp.asarray(histories(np.full(23, 10.0), heading)[0]))
-    assert not bool(judged.comfortable.any())
-    np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
+    result = check_comfort(jnp.asarray(histories(np.full(23, 10.0), heading)[0]))
+    assert not bool(result.comfortable.any())
+    np.testing.assert_allclose(result.lateral_mps2, 5.0, rtol=1e-3)
 
 
 def test_wrapping_heading_is_comfortable():
     heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 23) + np.pi) % (2 * np.pi) - np.pi
-    judged = check_comfort(jnp.asarray(histories(np.full(23, 5.0), heading)[0]))
-    assert bool(judged.comfortable.all())
+    result = check_comfort(jnp.asarray(histories(np.full(23, 5.0), heading)[0]))
+    assert bool(result.comfortable.all())
 
 
 def test_steering_weave_of_1_hz_is_uncomfortable():

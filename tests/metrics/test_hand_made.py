@@ -15,8 +15,8 @@ SCENES = scenes()
 
 
 def differences(scene, result):
-    """Differences from expected values: name, expected, computed."""
-    wrong = []
+    """Return name, expected and computed value of each metric that differs from its expected value."""
+    mismatches = []
     for name, value in scene.expected.items():
         actual = result[name]
         same = (
@@ -25,8 +25,8 @@ def differences(scene, result):
             else value is not None and actual == pytest.approx(value, rel=2e-3, abs=6e-3)
         )
         if not same:
-            wrong.append((name, value, actual))
-    return wrong
+            mismatches.append((name, value, actual))
+    return mismatches
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,6 @@ def test_irrelevant_changes_keep_every_metric(metrics_by_scene, change, every):
 
 
 def test_step_values_accumulate_to_episode_metrics(metrics_by_scene):
-    """Accumulating step values gives the episode metrics."""
     for name, result in metrics_by_scene.items():
         series = result["series"]
         assert all(len(values) == 80 for values in series.values()), name

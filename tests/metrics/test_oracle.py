@@ -27,7 +27,7 @@ def random_car(rng):
     x, y, speed = rng.uniform([-20, -3, 0.0], [70, 8, 12.0])
     first, last = np.sort(rng.integers(0, 91, 2)) if rng.random() < 0.3 else (0, 91)
     speed *= rng.random() > 0.25
-    # Who never gets 0.3 m from its middle is stored as parked, at one pose: it must really stand.
+    # A car that never gets 0.3 m from its median position is stored as parked, at one pose: let it stand.
     speed *= speed * 0.1 * (last - first) / 2 > 0.35
     return car(x, y, heading, speed, length, width, kind, range(first, last))
 
@@ -85,7 +85,7 @@ def same(value, actual):
 
 
 def compare(seed):
-    """Evaluate ``BATCH`` random scenes twice, and return how many are compared; the others are near a threshold."""
+    """Compare ``BATCH`` random scenes with the oracle, except those near a threshold; return how many."""
     rng = np.random.default_rng(seed)
     cases = [random_scene(rng) for _ in range(BATCH)]
     result = judge([road for road, _, _ in cases], [drive for _, drive, _ in cases])
@@ -93,7 +93,7 @@ def compare(seed):
     for number, ((road, drive, two_way), actual) in enumerate(zip(cases, result, strict=True)):
         ego = road.tracks
         log = np.column_stack([ego.xy[0], ego.heading[0], np.hypot(*ego.velocity[0].T)])
-        # What the package was given: the same motion in float32.
+        # The oracle reads the same motion as the package, in float32.
         oracle = Judge(road, drive(log).astype(np.float32).astype(np.float64), two_way)
         expected, ttc = oracle.episode(actual["series"]["ttc"])
         if oracle.ambiguous:

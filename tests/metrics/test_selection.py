@@ -59,17 +59,17 @@ def traced():
     with pytest.MonkeyPatch.context() as patch:
         called = set()
 
-        def listen(module, name):
-            plain = getattr(module, name)
+        def record_calls(module, name):
+            function = getattr(module, name)
 
-            def heard(*arguments):
+            def recorded(*arguments):
                 called.add(name)
-                return plain(*arguments)
+                return function(*arguments)
 
-            patch.setattr(module, name, heard)
+            patch.setattr(module, name, recorded)
 
         for name in COSTLY:
-            listen({"check_comfort": steps, "check_lights": situation}.get(name, contact), name)
+            record_calls({"check_comfort": steps, "check_lights": situation}.get(name, contact), name)
         for reference in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
             simulator = Simulator(Task(metrics=reference))
@@ -245,7 +245,7 @@ def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
         assert select_metrics(evaluation_task(Task(metrics=metrics)).metrics).names == tuple(METRICS)
 
 
-def test_no_metric_is_defined_before_the_first_step(traced):
+def test_only_step_counts_are_defined_before_the_first_step(traced):
     state = replace(zeros(traced["full"].state), episode=episode_start("full"))
     result = jax.jit(episode_metrics)(BANK, state)
     assert {name for name, value in result.items() if bool(value.defined)} == {"steps", "last_step"}

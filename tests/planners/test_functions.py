@@ -7,10 +7,13 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import drive, episode_keys
-from drivax.planners.catalogue import make_planner
+from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import collect_errors, python_actions, python_planner
+from drivax.planners.pdm.brake import EmergencyBrake
 from drivax.planners.planner import Planner
+from drivax.planners.simple import IdmPlanner
 from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import Published
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from own_drivers import slow_jax, slow_python
@@ -51,6 +54,13 @@ def actions(planner, bank, moments, batched=True):
 
 
 @pytest.mark.slow
+def test_action_space_of_a_wrapper_is_that_of_the_wrapped_planner(monkeypatch):
+    monkeypatch.setitem(PLANNERS, "braking", lambda: EmergencyBrake(IdmPlanner()))
+    planner = make_planner("braking", Published())
+    assert planner == EmergencyBrake(IdmPlanner(actions=Published()), actions=Published())
+    assert make_planner("braking") == EmergencyBrake(IdmPlanner())
+
+
 def test_python_and_jax_planners_agree_batched_or_alone(bank, moments):
     with collect_errors() as errors:
         python, in_jax = (actions(planner, bank, moments) for planner in (slow_python, slow_jax))

@@ -67,8 +67,8 @@ def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
     [
         ({"names": ["log_3"]}, DataError, "sets/made: 'log_3' is not in the set; did you mean 'log-3'?"),
         ({"names": ["x", "log-1", "y", "z", "w"]}, DataError, "'x', 'y', 'z' and 1 more are not in the set"),
-        ({"names": ["two\tlog-0"]}, DataError, "'log-0' is not in the set"),
-        ({"names": ["ids.txt"]}, DataError, "ids.txt: line 2 names 'log-7', which is not in the set sets/made"),
+        ({"names": ["two\tlog-0"]}, DataError, "'two / log-0' is not in the set; the set has this id in data set one"),
+        ({"names": ["ids.txt"]}, DataError, "ids.txt: 'log-7' (line 2) is not in the set sets/made"),
         ({"names": [Path("none.txt")]}, DataError, "none.txt: file not found"),
         ({"filters": ["typ=turn_left"]}, UsageError, "did you mean 'type'?"),
         ({"filters": ["type=turn_lef"]}, UsageError, "did you mean 'turn_left'?"),

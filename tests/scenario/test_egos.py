@@ -122,6 +122,13 @@ def test_first_egos_of_a_set_keep_their_bank(recordings, scenarios):
     np.testing.assert_array_equal(bank.agents, alone.agents)
 
 
+def test_a_long_further_ego_is_marked():
+    cars = [car(0, 0, 0, 10), car(40, 0, 0, 10, length=11.0, width=2.5)]
+    bank = ScenarioBank.from_scenarios([assemble(straight_road(cars), SMALL.with_egos(2))])
+    assert bank.long_ego
+    assert not ScenarioBank.from_scenarios([assemble(straight_road(cars), SMALL)]).long_ego
+
+
 def test_egos_are_moving_vehicles_near_ego_with_an_unbroken_log():
     steps, upto = range(91), {step: [*range(step + 1)] for step in (29, 30, 50)}
     cars = [

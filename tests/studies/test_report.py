@@ -94,6 +94,24 @@ def test_report_shows_the_results(page):
     assert "Common scenarios" not in text  # there are none in these results
 
 
+def test_latest_of_equal_validation_scores_counts():
+    results = RESULTS | {"validations": [{"rule": [1.0, 0.0], "score": [0.5, 0.5]}]}
+    *_, row = validations_table(results, "mean_q").rows
+    assert [cell.text for cell in row] == ["seeds with their highest score", "0", "1"]
+
+
+def test_rule_may_be_undefined_at_a_validation():
+    """A seed without the value at a validation; the others keep their columns."""
+    seeds = [
+        {"rule": [None, 2.0, 1.0], "score": [0.2, 0.3, 0.5]},
+        {"rule": [3.0, 2.0, 4.0], "score": [0.5, 0.3, 0.6]},
+    ]
+    rows = validations_table(RESULTS | {"validations": seeds}, "mean_q").rows
+    assert [[cell.text for cell in row] for row in rows[::2]] == [
+        ["mean_q, mean over seeds", "–", "2.000", "2.500"], ["seeds with their highest mean_q", "0", "1", "1"]
+    ]  # fmt: skip
+
+
 @needs_browser
 def test_it_fits_a_phone(page, tmp_path):
     path, _ = page

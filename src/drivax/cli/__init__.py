@@ -55,7 +55,9 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of tables and help that are not printed to a terminal, and the largest width of tables that are.
 _COLUMNS = 100
 #: Ends of the paths of Python files whose functions no exception may interrupt.
-_BAD_MOMENTS = ("<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py")
+_BAD_MOMENTS = (
+    "<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py", "orbax/checkpoint/_src/asyncio_utils.py",
+)  # fmt: skip
 #: Delay until a signal that came at a bad moment is sent again, and time after which it is obeyed at any moment, s.
 _RESEND_S, _PATIENCE_S = 0.01, 10.0
 COMMANDS = {
@@ -164,7 +166,8 @@ class _SignalHandler:
     """Raises :class:`Stopped`, or KeyboardInterrupt at Ctrl-C, when an exception does no harm.
 
     A signal waits until an import is done, because modules of C++ crash when an exception interrupts their
-    initialisation, and until a worker process has its arguments; but not longer than 10 s.
+    initialisation, until a worker process has its arguments, and until Orbax has closed an event loop, which would
+    print errors of its own; but not longer than 10 s.
     """
 
     def __init__(self, signals: Sequence[signal.Signals]) -> None:
@@ -220,7 +223,7 @@ class _SignalHandler:
 
 
 def _is_bad_moment(frame: FrameType | None) -> bool:
-    """Return whether the command imports a module or starts a worker process, directly or not."""
+    """Return whether a function that no exception may interrupt is running."""
     while frame is not None and frame.f_code is not main.__code__:
         if frame.f_code.co_filename.endswith(_BAD_MOMENTS):
             return True

@@ -70,7 +70,7 @@ def run(args: Report) -> int:
         with Progress("drawing", "videos") as bar:
             files = write_videos(
                 args.runs, out, episodes, args.side_by_side is not None, args.data, args.theme, args.overwrite,
-                progress=lambda done, _: bar.update(done),
+                progress=lambda done, total: bar.update(done, total=total),
             )  # fmt: skip
         show(f"{out} ({len(files)} videos)")
         return 0

@@ -118,7 +118,7 @@ class Predictions:
     ) -> Float[Numbers, "N T"]:
         """Return the squared error relative to the variance of the expert's actions, summed over the dimensions.
 
-        The prediction is that of member ``fold``, which excluded the scenario, or the mean of all members (fold -1).
+        The prediction is that of member ``fold``, which excluded the scenario, or the mean of all members (-1 or None).
         """
         members = np.full(len(self.action), -1) if fold is None else fold
         errors = []
@@ -205,7 +205,7 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
 
 
 def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
-    """Return the sorted scenarios of random whole recordings, at least ``count`` in total; None: all scenarios."""
+    """Return sorted scenarios of random whole recordings, at least ``count`` if there are as many; None: all."""
     if count is None:
         return np.arange(len(clusters))
     names, recording = np.unique(clusters, return_inverse=True)
@@ -268,8 +268,8 @@ def fit(
     """Return the trained parameters of all members, along a leading axis.
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
-    results. By default this is used on all devices except CPUs, where batched products of small matrices take three
-    times as long.
+    results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
+    take three times as long.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:

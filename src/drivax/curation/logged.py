@@ -31,13 +31,13 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """Log of one scenario; while ego is not observed, its last motion is repeated.
+    """Log of one scenario; while ego is not observed, its last (at the start its first) motion is repeated.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
         motion, velocity: x, y (m), heading (rad) and speed (m/s) of ego, and its logged velocity (m/s).
         valid: Whether ego is observed.
-        ignored: Agents that overlap ego from their first step until they separate, which metrics ignore, too.
+        ignored: Agents that overlap ego when they appear, until they separate; metrics ignore them, too.
         along_m, ground_m: Arc length of ego along the logged route, and height of the ground under ego.
     """
 

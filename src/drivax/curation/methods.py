@@ -28,7 +28,7 @@ from drivax.stats.ranking import rank_correlation
 from drivax.synthetic.events import EventKind
 
 #: Weights of the kinematic heuristic, chosen on the validation set of the built-in world's benchmark
-#: (docs/results/curation.md). A scenario is scored by its most critical second.
+#: (docs/results/curation.md). A scenario is scored by its ten most critical steps.
 KINEMATIC = Combination(
     {"urgency": 0.35, "braking": 0.20, "volatility": 0.30, "lane_deviation": 0.10, "off_road": 0.05}, "top10"
 )
@@ -69,8 +69,8 @@ class Request:
 class Method:
     """A registered method; ``config`` are its default settings, None for a method without settings.
 
-    ``score`` takes the name of the method and a request. From settings, ``combination`` returns the combination of
-    components, and ``extra_components`` the names of those without a weight.
+    ``score`` takes the name of the method and a request. ``combination`` and ``extra_components`` take settings, and
+    return the combination of the components and the names of further components, which have no weight.
     """
 
     name: str
@@ -168,8 +168,8 @@ def ensemble_table(
     The component ``disagreement`` is ``d / (d + scale)``, which is monotonic in d; ``action_0`` and ``action_1`` are
     the same for each dimension of the action. An ensemble trained by likelihood has ``information`` instead, the
     mutual information relative to its maximum. ``error_rank_correlation`` in the table's configuration is the rank
-    correlation of scores and squared errors over steps: on the training set, of the member that excluded the scenario;
-    if the ensemble was trained on a part of the set, of the members' mean on the rest.
+    correlation of scores and squared errors over steps. If the ensemble was trained on all scenarios of the set, errors
+    are those of the member that excluded the scenario, otherwise of the members' mean on the scenarios not trained on.
 
     Args:
         ensemble: The ensemble.
@@ -214,7 +214,7 @@ def _disagreement_components(
 
 
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
-    """Score a scenario by the second with the largest disagreement."""
+    """Score a scenario by the ten steps with the largest disagreement."""
     name = "information" if config.cloning.loss == "likelihood" else "disagreement"
     return Combination({name: 1.0}, "top10")
 

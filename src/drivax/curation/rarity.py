@@ -37,7 +37,7 @@ class ExpertActions:
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Array]:
         """Return the clipped ``action [T, 2]``, and ``known [T]``: ego is observed at the step and the next two.
 
-        The curvature depends on the second next step.
+        The curvature depends on the logged position two steps later.
         """
         action = jax.vmap(lambda context: expert_action(bank, context, _SPACE))(log.context)
         later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
@@ -52,7 +52,7 @@ class KernelRarity:
     The density (Rosenblatt, 1956; Parzen, 1962) is computed on a grid. Counts per cell are convolved with the kernel
     and mirrored at the bounds, so that the density integrates to 1 over the action space; it is interpolated linearly
     between cell centres. The score at density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median``
-    is the median density over steps: common actions score 1 / most, very rare ones 1.
+    is the median density over steps: actions of median density score 1 / most, more common ones less, very rare ones 1.
 
     Attributes:
         bandwidth: Standard deviation of the kernel, in units of the action space.
@@ -97,9 +97,9 @@ class PublishedRarity:
     """Inverse frequency in the published histogram of acceleration (m/s2) and curvature (1/m).
 
     A cell with h actions has the weight ``1 / (h + 1)``, divided by the mean over all cells (including empty cells and
-    those of zero width). The score is ``min(weight, most) / most + 0.01``, at most 1; the constant dominates it. The
-    bins cover the action space. The published code counts an action on the edge of two bins in the upper bin but looks
-    it up in the lower one, which affects standing still. Here both use the upper bin.
+    those of zero width). The score is ``min(weight, most) / most + 0.01``, at most 1; in a large set the constant
+    dominates it. The bins cover the action space. The published code counts an action on the edge of two bins in the
+    upper bin but looks it up in the lower one, which affects standing still. Here both use the upper bin.
 
     Attributes:
         most: Weight at which scores are clipped; no cell reaches it.

@@ -1,4 +1,4 @@
-"""Score tables: criticality of steps and scenarios, in a file that also identifies data and method."""
+"""Score tables: combine components into scores of steps and scenarios, and store them with set and method."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Combination:
         Invalid steps score 0 and are ignored in scenario scores.
 
         Raises:
-            UsageError: A component with a weight is missing.
+            UsageError: A component with a weight or an aggregator is missing.
         """
         self.check_components(components)
         shares = {name: weight / sum(self.weights.values()) for name, weight in self.weights.items()}

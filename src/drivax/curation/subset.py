@@ -21,7 +21,8 @@ def check_top(
     """Check, before any work, that a subset can be written.
 
     Raises:
-        UsageError: The set has fewer recordings (with ``all_windows``: scenarios), or ``out`` exists or is the set.
+        UsageError: ``count`` is below 1, the set has fewer recordings (with ``all_windows``: scenarios), or ``out``
+            exists or is the set.
     """
     total, recordings = len(data), len(set(recordings_of(data.entries)))
     if not all_windows and recordings < total and not 1 <= count <= recordings:
@@ -35,7 +36,7 @@ def check_top(
 
 
 def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = None) -> list[int]:
-    """Return the indices of the ``count`` most critical scenarios, in the order of ``ScoreTable.order``.
+    """Return the indices of the ``count`` most critical scenarios, or all if fewer, by ``ScoreTable.order``.
 
     Given the recording of every scenario, only the most critical scenario of each recording is considered.
     """
@@ -74,7 +75,7 @@ def write_top(
     with (scenarios done, scenarios).
 
     Raises:
-        UsageError: The set has fewer scenarios or recordings, or ``out`` exists.
+        UsageError: See :func:`check_top`.
     """
     check_top(data, out, count, overwrite, all_windows)
     indices = top_rows(table, count, None if all_windows else recordings_of(data.entries))

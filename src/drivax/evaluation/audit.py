@@ -31,7 +31,7 @@ REVERSE_M, MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE = 20.0, 5.0, 0.9
 #: Slower motion is jitter.
 CREEP_MPS = 0.5
 _DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
-#: Largest distance of the log's end from the goal of a route that leads there, m (as for ``reached_goal``).
+#: A route leads to the log's end if its goal is at most as far from it, m (as for ``reached_goal``).
 GOAL_M = 3.0
 _FACTS = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
@@ -161,7 +161,7 @@ def _replay_batch(scenarios: Sequence[Scenario]) -> list[Findings]:
 
 
 def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Findings:
-    """Return the findings of one replay; entry 0, the current step, counts only for ``first_*_step``."""
+    """Return the findings of one replay; entry 0, the current step, counts for ``first_onroad_step`` and overlaps."""
     flags, in_log = scenario.has, series["logged"]
     evaluated = in_log.copy()
     evaluated[0] = False
@@ -208,7 +208,7 @@ def _reverse_and_forward_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
 
 
 def _clipped_share(is_clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
-    """Return the share of clipped actions among those from an evaluated or the current step."""
+    """Return the share of clipped actions among those into an evaluated step from an evaluated or the current one."""
     counts = evaluated.copy()
     counts[2:] &= evaluated[1:-1]
     return _round(is_clipped[counts].mean(), 4) if counts.any() else None

@@ -52,11 +52,12 @@ class Comparison:
     """Result of a comparison.
 
     Attributes:
-        names, folders: Names and run folders of A and B.
+        names, folders: Different names, and run folders of A and B.
         traffic: Traffic model of both.
         scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
         strata: Number of strata of the split; 1 without strata.
-        sensitivity: Sensitivity of the primary metric; None if the metric does not vary.
+        sensitivity: Sensitivity of the primary metric; None if the metric does not vary, or if too few scenarios or
+            recordings define it.
         seeds: Spread over seeds of A and B; None for a single seed.
     """
 
@@ -172,7 +173,7 @@ class _Contrast:
         )
 
     def _test(self, metric: str, x: Values, y: Values) -> tuple[Interval, SignificanceResult]:
-        """Return the difference of the means, and its significance test."""
+        """Return the difference of the means, and its significance test: with several seeds a t test."""
         plan, split, clusters = self.plan, self.split, self.clusters
         resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
         if split is not None:
@@ -203,7 +204,7 @@ class _Contrast:
         return test(x, y, self.clusters, self.plan.resamples, seed=self.plan.seed)
 
     def sensitivity(self) -> Sensitivity | None:
-        """Return the sensitivity in the primary metric; None if the metric does not vary."""
+        """Return the sensitivity in the primary metric (:class:`Comparison`)."""
         plan, split = self.plan, self.split
         x, y = self.a.values(plan.primary), self.b.values(plan.primary)
         if split is None:
@@ -299,6 +300,7 @@ def compare(
 
 
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
+    """Return the names of A and B; equal ones with the shortest different ends of their folders."""
     if a.name != b.name:
         return a.name, b.name
     if a.folder is None or b.folder is None:

@@ -188,11 +188,11 @@ class Collision:
 
 @dataclass(frozen=True)
 class Comfort:
-    """Filtered series of an episode: ``lon``, ``lat``, ``lonjerk``, ``jerk``, ``yaw``, ``yawacc``.
+    """Six filtered series of an episode by name: ``lon``, ``lat``, ``lonjerk``, ``jerk``, ``yaw``, ``yawacc``.
 
     Attributes:
         series: Values of each sample.
-        within: Whether all samples are within the limits.
+        within: Whether all samples of a series are within its limits.
     """
 
     series: Mapping[str, Float64[np.ndarray, " t"]]
@@ -205,19 +205,19 @@ class DevkitVerdict:
 
     Attributes:
         score: The closed-loop score.
-        fault_score: 1 without at-fault collisions, 0.5 after one collision with a static object, else 0.
-        drivable: 1 if no corner is 0.3 m or more outside the drivable area.
+        fault_score: 1 without at-fault collisions, 0.5 after a single one with a static object, else 0.
+        drivable: 1 if no corner is 0.3 m or more outside the drivable area and ego's lanes.
         direction: 1, 0.5 or 0: less than 2 m, less than 6 m, or more against traffic within a second.
         making_progress: 1 if the progress ratio is at least 0.2.
         ttc_ok: 1 if the time to collision is always at least 0.95 s.
-        progress: Progress ratio along the expert's route.
+        progress: Progress ratio along the expert's route; 1 without a route.
         speed: Speed-limit compliance.
         comfortable: 1 if all six comfort series are within their limits.
         collisions: First contacts.
-        ttc_s: Time to collision of each sample, inf if there is none within 3 s.
+        ttc_s: Time to collision of each sample, 0 to 2.9 s; inf if there is none.
         in_lane: Whether all corners are in one lane or in connected lanes, per sample.
         backward_m: Largest distance against traffic within a second, at most 0.
-        progress_m: Progress of the expert and of ego.
+        progress_m: Progress of the expert and of ego; 0 without a route.
         comfort: Comfort series.
     """
 
@@ -572,10 +572,10 @@ def _progress_ratio(expert_m: float, ego_m: float) -> float:
 
 
 def _speed_compliance(road: Road, route: Sequence[Sequence[int]], speed: Float64[np.ndarray, " t"]) -> float:
-    """Return 1 minus the mean speeding over 2.23 m/s, at least 0 (``speed_limit_compliance``).
+    """Return ``1 - mean speeding / 2.23 m/s``, at least 0 (``speed_limit_compliance``).
 
-    The limit of a connector is the highest limit of the lanes that it joins. Speeding is 0 in samples without a lane or
-    with an unknown limit.
+    The mean is the sum over the samples divided by the number of steps between them. The limit of a connector is the
+    highest limit of the lanes that it joins. Speeding is 0 in samples without a lane or with an unknown limit.
     """
     speeding = np.zeros(len(speed))
     for sample, objects in enumerate(route):

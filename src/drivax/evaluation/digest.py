@@ -3,7 +3,7 @@
 Rule-based planners drive 64 scenarios of the built-in world. The digest covers truths, counts, which of them are
 defined, and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would
 differ between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its
-unit that is farthest from all 64 values (docs/guide/reproducibility.md has distance and noise).
+unit that is farthest from all 64 values (docs/guide/reproducibility.md has distances).
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def episode_digest(table: EpisodeTable) -> str:
 def grid_cells(
     values: Float[np.ndarray, " n"], unit: float
 ) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " start"]]:
-    """Return the cell of each value, and the distance from each start of the grid to the nearest edge.
+    """Return the cell of each value, and for each start of the grid the least distance of a value from an edge.
 
-    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the largest negative
-    number. Distances are shares of the unit.
+    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the smallest int64.
+    Distances are shares of the unit.
     """
     defined = np.isfinite(values)
     starts = np.arange(_STARTS) / _STARTS

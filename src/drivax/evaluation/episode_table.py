@@ -34,20 +34,20 @@ _ACTION_JERK = "standard deviation of the change of the action from step to step
 ADDED = {
     "crashed": Column("-", "low", _CRASHED, kind="rate"), "action_jerk": Column("-", "low", _ACTION_JERK)
 }  # fmt: skip
-#: All columns of an evaluation but user-defined metrics.
+#: All columns after the keys, except user-defined metrics.
 COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
 #: Columns of zeros and ones, which have Wilson intervals.
 RATES = names_of(COLUMNS, "rate")
-#: Columns with values between 0 and 1.
+#: Columns whose intervals are kept within 0 and 1.
 SHARES = names_of(COLUMNS, "rate", "score")
-#: Columns without a mean.
+#: Codes and counts, whose means are not reported.
 NOT_SUMMARISED = tuple(name for name, column in COLUMNS.items() if not column.summarised)
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
-#: Largest table: bytes of a row, of which most have 300, and of all.
+#: Largest table: bytes per row (most rows have 300), and in all.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
-#: Largest trajectories: bytes of all, and more per episode than any capacity takes.
+#: Largest trajectories: bytes in addition to the episodes, and bytes per episode (more than any capacity takes).
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
@@ -212,9 +212,9 @@ class EpisodeTable:
         return {key: float(np.mean(values)) if values else math.nan for key, values in defined_values.items()}
 
     def summary(self) -> dict[str, Any]:
-        """Return mean and 95 % interval of every metric (:func:`interval_of`), the content of ``summary.json``.
+        """Return the content of ``summary.json``: mean and 95 % interval (:func:`interval_of`) by metric.
 
-        A metric without defined values has mean null and n 0.
+        Codes and counts (:data:`NOT_SUMMARISED`) are left out. A metric without defined values has mean null and n 0.
         """
         clusters = np.array(self.clusters)
         columns = {name: values for name, values in self.metrics.items() if name not in NOT_SUMMARISED}

@@ -14,7 +14,7 @@ import jax
 from drivax.errors import DrivaxError
 from drivax.files import format_bytes
 
-#: Maximum number of scenarios loaded at a time; their bank takes about 6 GB.
+#: Maximum number of scenarios loaded at a time; those of the built-in world take 4 GB, in ``idm`` traffic 7 GB.
 MOST = 10_000
 #: Bytes reserved per scenario of a program call; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
@@ -52,8 +52,8 @@ def free_memory(device: Any) -> int | None:
 def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:
     """Return the number of scenarios to load at a time: as many as fit in half of the free memory.
 
-    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`. A scenario exists twice
-    while its bank is built. ``free`` is in bytes, or None if unknown, for :data:`MOST` scenarios.
+    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`, which is returned if
+    ``free`` (bytes) is None. A scenario exists twice while its bank is built.
     """
     if free is None:
         return MOST

@@ -1,8 +1,8 @@
 """Statistics of observation features, their correlation with collisions, and their importance to a policy.
 
-States of closed-loop episodes are sampled ``every`` steps. The statistics of a column are its mean, standard deviation
-and extremes over all valid rows, its non-finite entries, its correlation with collisions, and its importance to the
-planner.
+States of closed-loop episodes are sampled at regular steps. The statistics of a column are its mean, standard
+deviation and extremes over all valid rows, the number of its non-finite entries, its correlation with collisions, and
+its importance to the planner.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
-#: Steps between sampled states, scenarios per program call, and states whose features are permuted.
+#: Steps between sampled states, scenarios per program call, and most states whose features are permuted.
 EVERY, BATCH, PERMUTED = 10, 64, 512
 Values = np.ndarray[Any, Any]
 
@@ -39,7 +39,7 @@ Values = np.ndarray[Any, Any]
 class SampledStates:
     """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
-    ``has_collided`` marks states after ego's first collision, ``collides`` episodes with a collision, ``[episode]``.
+    ``has_collided`` marks states from ego's first collision on, ``collides`` episodes with a collision, ``[episode]``.
     The last state of a short log is repeated after its end.
     """
 
@@ -279,8 +279,8 @@ def collision_correlation(values: Values, valid: Values, collides: Values) -> fl
     """Return the point-biserial correlation of a column with collisions, over episodes (Tate 1954).
 
     It is Pearson's r between the column's mean over its valid entries ``[episode, sample, ...]`` and the collision
-    indicator of the episode. Episodes without valid entries are excluded. The result is NaN if all episodes have the
-    same outcome or the same mean.
+    indicator of the episode. Episodes without valid entries are excluded. The result is NaN if fewer than three remain,
+    or if all have the same outcome or the same mean.
     """
     included = (valid & np.isfinite(values)).reshape(len(values), -1)
     total = np.where(included, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)

@@ -46,7 +46,7 @@ class Pairs:
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     """Return problem and cure if the episodes of two runs cannot be paired, else None.
 
-    Paired episodes need the same scenario set, traffic and start.
+    Paired episodes need the same scenario set, traffic and start. The seed of noisy starts may differ.
     """
     hashes = [str(run.data.get("hash") or "") for run in (a, b)]
     if all(hashes) and hashes[0] != hashes[1]:
@@ -112,7 +112,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
 
 
 def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
-    """Return the error for a primary metric that is undefined in every pair."""
+    """Return the error for a primary metric that is undefined in every pair, or throughout an arm of a split."""
     partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
     if any(not np.isnan(values).all() for values in partial):
         problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"

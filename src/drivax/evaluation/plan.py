@@ -31,7 +31,7 @@ class ComparisonPlan:
         confidence: Level of intervals; tests reject at 1 - confidence.
         power: Probability of detecting the smallest difference that matters, required for "no difference".
         smallest_difference: The smallest difference that matters, in the unit of the primary metric; null: a tenth of
-            the standard deviation.
+            ``Sensitivity.deviation``.
         test: Test of means in pairs: ``permutation``, or ``bootstrap`` if differences are far from symmetric.
         resamples: Number of bootstrap samples and permutations.
         seed: Seed of the split and of all resampling.
@@ -82,7 +82,7 @@ class Sensitivity:
         design_effect: Factor by which clustering in recordings increases the required number of scenarios.
         smallest: The smallest difference that matters.
         power: Probability of detecting it with these scenarios.
-        detectable: The smallest difference that is detected with the plan's power.
+        detectable: The smallest difference that is detected with the plan's power; None if there is none.
         needed: Number of scenarios that detect ``smallest`` with the plan's power; None if seeds vary too much for any
             number.
     """
@@ -157,9 +157,9 @@ def decide(
     """Decide by the rule: enough scenarios, then the test, then the power to conclude "no difference".
 
     With fewer scenarios than the plan's minimum, there is no decision. A test that rejects recommends the better
-    planner. Otherwise the result is "no difference" if the comparison had the plan's power to detect the smallest
-    difference that matters. If it had not, there are not enough scenarios, or not enough seeds if no number of
-    scenarios suffices.
+    planner. Otherwise the result is "no difference" if both planners have the same values, or if the comparison had
+    the plan's power to detect the smallest difference that matters. If it had not, there are not enough scenarios, or
+    not enough seeds if no number of scenarios suffices.
     """
     n = primary.difference.n
     needed = max(plan.minimum_scenarios, 0 if sensitivity is None else sensitivity.needed or 0)

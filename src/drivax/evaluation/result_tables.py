@@ -37,8 +37,6 @@ COLLISION_KINDS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
         CollisionType.STOPPED_OBJECT: ("standing object", "hit a standing agent: braking in time for a queue"),
     }
 )  # fmt: skip
-#: Codes and counts, which have no mean.
-CODES = frozenset(NOT_SUMMARISED)
 _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 
@@ -92,9 +90,10 @@ def headline_names(names: Sequence[str]) -> list[str]:
 
 
 def sort_metrics(names: Sequence[str]) -> list[str]:
-    """Sort metrics in the order of their definition, with unknown ones last, and drop codes."""
+    """Sort metrics in the order of their definition, with unknown ones last, and drop codes and counts."""
     rank = {name: index for index, name in enumerate(COLUMNS)}
-    return sorted((name for name in names if name not in CODES), key=lambda name: rank.get(name, len(rank)))
+    means = (name for name in names if name not in NOT_SUMMARISED)
+    return sorted(means, key=lambda name: rank.get(name, len(rank)))
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:

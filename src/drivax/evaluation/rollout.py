@@ -85,7 +85,7 @@ def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Arra
 
 
 def evaluation_task(task: Task) -> Task:
-    """Return the task for evaluation: all metrics, no draws, and episodes that last to the end of the log."""
+    """Return the task for evaluation: all metrics, fixed conditions, and episodes that last to the end of the log."""
     own = task.metrics if isinstance(task.metrics, tuple) else ()
     conditions = fix_conditions(task.conditions)
     return replace(task, to_the_end=True, metrics=("full", *own), conditions=conditions)
@@ -196,7 +196,7 @@ def advance(
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
-    """Pack positions and headings of bank agents; agents further than 650 m from the origin are stored as absent."""
+    """Pack positions and headings of bank agents; agents with abs(x) or abs(y) of 650 m or more become absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
     poses = jnp.concatenate([xy / _POSITION_UNIT_M, heading[..., None] / _HEADING_UNIT_RAD], axis=-1)

@@ -2,7 +2,8 @@
 
 An episode depends only on planner, task, traffic, start, seed and scenario, bit for bit: not on the order of the
 scenarios or the batch size. Random keys derive from the scenario's identity (``bank.identity``). Every program call
-runs a fixed number of scenarios (short batches are padded) in banks of fixed sizes.
+runs a fixed number of scenarios (short batches are padded) in banks of equal sizes. A subset has the bits of the whole
+set if it is evaluated with the ``sizes`` of the whole set, as :func:`run_evaluation` does.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def with_metrics(task: Task, extra: tuple[str, ...]) -> Task:
 
 
 def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Format headline metrics of planners as a table of at most 100 columns; undefined means are empty cells."""
+    """Format headline metrics of planners as a table; undefined means are empty cells."""
     rows = []
     for summary in summaries:
         means = (summary["metrics"][name]["mean"] for name in HEADLINE)
@@ -197,7 +198,7 @@ class Options(TypedDict, total=False):
     ``start_step`` defaults to the current step, and ``seed`` to 0. ``batch`` is the number of stored scenarios loaded
     at a time, by default as many as fit in memory; results do not depend on it. ``sizes`` of the banks default to what
     the scenarios use; subsets with the sizes of the whole set share its compiled program. ``progress`` is called with
-    (done, total) after every batch.
+    (done, total) after every program call.
     """
 
     start_step: int
@@ -223,7 +224,8 @@ def evaluate(
         options: See :class:`Options`.
 
     Raises:
-        UsageError: Planner, task, start and scenarios are incompatible, or ``sizes`` are too small.
+        UsageError: Planner, task, start and scenarios are incompatible, or an option is invalid (``batch`` below 1,
+            ``sizes`` too small).
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """

@@ -1,8 +1,8 @@
 """Replay buffer: a ring of transitions, stored as states that are observed when they are sampled.
 
 A state takes 0.4 kB in log traffic, an observation in bfloat16 1.2 kB (preset ``sac``) to 44 kB (``published/sac``);
-but states are observed when they are sampled, twice per step, and those of reactive traffic grow with the vehicles
-(2.3 kB in the built-in world).
+but states are observed when they are sampled, twice per step, and those of reactive traffic grow with the vehicles (2
+to 4 kB in the built-in world).
 
 A row holds one step of all environments. What row t led to is in the next row, the final state of an episode in the
 row that resets it. The newest row has no next row yet and is not sampled.

@@ -17,9 +17,10 @@ from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import TTC_HORIZON_S
 
-#: How the step values of an episode are reduced: ``worst_second`` is the largest sum over ten consecutive steps.
+#: How the step values of an episode are reduced: ``any`` and ``first`` look for values above 0, ``worst_second`` is the
+#: largest sum over ten consecutive steps.
 Operator = Literal["any", "sum", "mean", "min", "max", "last", "first", "worst_second"]
-#: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: from 0 to 1; ``code``: has no mean.
+#: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: its interval is kept within 0 and 1; ``code``: no mean.
 Kind = Literal["rate", "score", "quantity", "code"]
 Direction = Literal["low", "high", "-"]
 
@@ -32,7 +33,7 @@ class Column:
         unit: Unit, ``-`` for shares and booleans.
         better: ``low``, ``high``, or ``-`` for neither.
         definition: One line for tables and reports.
-        label: Heading; by default the name of the metric.
+        label: Heading; by default the name of the metric with spaces for underscores.
         kind: Scale of the values.
         headline: Position in the first table of a report; None if it is not in that table.
         summarised: Whether the mean over episodes is reported.
@@ -333,7 +334,7 @@ METRICS: dict[str, Metric] = {
         label="mean lead on the log", needs=_ROUTE, compute=_log_lead),
 }
 # fmt: on
-#: Metrics without a mean.
+#: Metrics whose values are codes.
 CODES = ("collision_type",)
 #: Metrics whose first step is stored.
 EVENTS = ("collision", "offroad", "red_light")

@@ -48,7 +48,7 @@ def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.
 
     The filter fits a polynomial of ``order`` to ``window`` samples by least squares, and differentiates it
     ``derivative`` times per sample (Savitzky and Golay 1964). Rows near an end evaluate the polynomial of the first or
-    last window. As in SciPy, interior values of an even window are half a sample late.
+    last window. As in SciPy, interior row i of an even window gives the value at i + 0.5.
     """
     half = window // 2
     rows = np.zeros((samples, samples))
@@ -83,7 +83,7 @@ class ComfortSteps:
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
     """Evaluate a trip (x, y, heading, speed; at least 23 rows) from row 11 on, the first row with centred windows.
 
-    For plots and tables. An episode evaluates the same steps one by one.
+    For plots and tables: an episode evaluates the same steps one by one, from its first step on.
     """
     windows = jnp.arange(len(motion) - _SAMPLES + 1)[:, None] + jnp.arange(_SAMPLES)
     steps = jax.vmap(check_comfort)(motion[windows])

@@ -31,9 +31,9 @@ class Episode:
 
     Attributes:
         total, count: Sum of the defined values, and their number.
-        low, high, last, first: Minimum, maximum, last value, and first value above zero (0 until there is one); NaN or
-            infinite before the first defined value.
-        event_step: Step of the first collision, off-road step and red light.
+        low, high, last, first: Minimum, maximum, last value, and first value above zero (the last value until there is
+            one); NaN or infinite before the first defined value.
+        event_step: Step of the first collision, off-road step and red light, as far as selected; 32767 before.
         second, worst: The last ten values, and the largest sum over ten consecutive steps.
         selection: The accumulated metrics.
     """
@@ -182,7 +182,7 @@ def _accumulated_value(episode: Episode, metric: Metric) -> Value:
 
 
 def event_steps(episode: Episode) -> dict[str, Int[Array, ""]]:
-    """Return the steps of the first selected events (collision, off-road, red light); -1 for none."""
+    """Return the first step of each selected event (collision, off-road, red light); -1 for none."""
     return {
         name: jnp.where(episode.event_step[row] == _NEVER, -1, episode.event_step[row])
         for row, name in enumerate(episode.selection.events)

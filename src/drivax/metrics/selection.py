@@ -32,7 +32,7 @@ class MetricSelection:
     reads: frozenset[str]
 
     def step_values(self, *operators: Operator) -> tuple[StepValue, ...]:
-        """Return the step values that one of the operators (default: any) accumulates, without duplicates."""
+        """Return the step values that the operators (all by default) accumulate, without duplicates."""
         metrics = [metric for _, metric in self.metrics if not operators or metric.operator in operators]
         return tuple(dict.fromkeys(metric.step_value for metric in metrics if metric.step_value is not None))
 
@@ -46,7 +46,8 @@ class MetricSelection:
 def select_metrics(names: MetricNames) -> MetricSelection:
     """Return the metrics that a configuration names: a set, or a tuple of sets, metrics and dotted names.
 
-    The last word of a dotted name (``package.module:name``) is the name of a user-defined metric.
+    The last word of a dotted name (``package.module:name``) is the name of a user-defined metric. Its inputs are
+    catalogue metrics, or user-defined metrics before it in the tuple.
 
     Raises:
         UsageError: A set, metric or input is unknown, a dotted name is no metric, or two metrics have the same name.

@@ -48,7 +48,7 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and a mask of final values after the start: the oldest, at the end all."""
+        """Comfort of the last twelve steps, and which of them count: the oldest, at the end all, if after the start."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
@@ -133,7 +133,8 @@ def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None
     """Return step values of a situation, for tables and plots; by default all that are not delayed.
 
     The situation must contain the facts that the values read (with ``metrics: full`` it contains all facts). Comfort
-    needs the eleven following steps; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
+    needs the eleven following steps and is undefined here; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates
+    a whole trip.
     """
     if values is None:
         values = [value for value in STEP_VALUES.values() if not value.delayed]

@@ -1,4 +1,7 @@
-"""Encoders, action distributions, and the policies, values and critics made of them (flax nnx)."""
+"""Encoders, action distributions, and the policies, values and critics made of them (flax nnx).
+
+``encoders.NormalisedEncoder`` normalises observations by statistics, which only offline algorithms set.
+"""
 
 import lazy_loader
 

@@ -30,14 +30,23 @@ def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
     """Make a planner by its name in :data:`PLANNERS` or its dotted name ``package.module:name``.
 
     A dotted name leads to a planner, or to a class or function that returns one without arguments. ``actions`` replaces
-    the planner's own action space, if it has one.
+    the action space of the planner, and of a planner that it wraps, where it is a field.
 
     Raises:
         KeyError: Unknown name.
         UsageError: The dotted name leads to no planner.
     """
     planner = as_planner(find_named(name), name) if is_dotted(name) else PLANNERS[name]()
-    return replace(planner, actions=actions) if actions and hasattr(planner, "actions") else planner  # type: ignore
+    return planner if actions is None else _with_actions(planner, actions)
+
+
+def _with_actions(planner: Any, actions: ActionSpace) -> Any:
+    """Return a planner, and the planner in its field ``planner``, with another action space."""
+    names = getattr(planner, "__dataclass_fields__", {})
+    changes: dict[str, Any] = {"actions": actions} if "actions" in names else {}
+    if "planner" in names:
+        changes["planner"] = _with_actions(planner.planner, actions)
+    return replace(planner, **changes) if changes else planner
 
 
 def default_task(planner: Planner) -> Task:

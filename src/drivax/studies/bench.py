@@ -120,7 +120,8 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
 
     Returns:
         The object of ``drivax bench --metrics --json``: ``rows`` of ``metrics``, ``batch``, ``best`` (fastest size),
-        ``steps_per_second`` and ``relative``. A larger size has a row only if it is the fastest.
+        ``steps_per_second`` and ``relative``, number of ``scenarios``, and ``versions``. A batch larger than
+        :data:`BATCHES` has a row only if it is the fastest.
     """
     config = config or BenchConfig()
 

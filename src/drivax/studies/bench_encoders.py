@@ -91,7 +91,7 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
         The object of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
         and ``rows`` of ``encoder``, ``dtype``, ``parameters``, ``width`` (of the embedding) and, in microseconds per
         observation, ``forward_us`` by batch and ``gradient_us``, a forward and a backward pass for all parameters at
-        the last batch.
+        the last batch; and ``versions``.
     """
     config = config or EncoderBench()
     spec = observation_shapes(config.observation)

@@ -136,7 +136,7 @@ def run_demo(
     held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
     stages.start("training", "training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
-    # On all scenarios: the held-out set is the test.
+    # No scenarios are set aside for validation: the held-out set is the test.
     run = train(training_config, training, out / "training" / "policy", validation=None, overwrite=True).path
     stages.start("evaluation", "evaluating on the held-out scenarios")
     runs, results = [], {}

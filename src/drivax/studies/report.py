@@ -17,7 +17,7 @@ from drivax.report.charts import histogram
 from drivax.report.pages.page import page
 from drivax.studies.definition import Stratum, StudyDefinition
 from drivax.studies.verdicts import RELATED, UNRELATED, best_validation
-from drivax.table import Cell, Column, Table
+from drivax.table import MISSING, Cell, Column, Table
 
 _STRATA: Mapping[Stratum, str] = {
     "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
@@ -190,19 +190,23 @@ def rule_cost_table(results: Results, rule: str) -> Table:
 
 
 def validations_table(results: Results, rule: str) -> Table:
-    """Return the first baseline's ``rule`` and score at each validation, and the number of seeds that peak there."""
+    """Return the first baseline's ``rule`` and score at each validation, and the seeds whose checkpoint they choose."""
     curves = {
-        name: np.array([seed[key] for seed in results["validations"]])
+        name: np.array([seed[key] for seed in results["validations"]], np.float64)
         for name, key in ((rule, "rule"), ("score", "score"))
     }
     validations = range(curves["score"].shape[1])
     rows = [
-        (f"{name}, mean over seeds", *(f"{value:.3f}" for value in values.mean(axis=0)))
+        (f"{name}, mean over seeds", *(MISSING if np.isnan(x) else f"{x:.3f}" for x in values.mean(axis=0)))
         for name, values in curves.items()
     ]
+    best = {
+        rule: np.nanargmax(curves[rule], axis=1),
+        "score": np.array([best_validation(scores) for scores in curves["score"]]),
+    }
     rows += [
-        (f"seeds with their highest {name}", *(str((values.argmax(axis=1) == k).sum()) for k in validations))
-        for name, values in curves.items()
+        (f"seeds with their highest {name}", *(str((best_of_seed == k).sum()) for k in validations))
+        for name, best_of_seed in best.items()
     ]
     return _table("dense", ("validation", *(str(k + 1) for k in validations)), rows)
 
@@ -254,7 +258,8 @@ def _rankings(results: Results) -> str:
 
 def _rule_cost(results: Results, rule: str) -> str:
     seeds = results["validations"]
-    agreements = sum(int(np.argmax(seed["rule"])) == best_validation(seed["score"]) for seed in seeds)
+    best = [int(np.nanargmax(np.array(seed["rule"], np.float64))) for seed in seeds]
+    agreements = sum(k == best_validation(seed["score"]) for k, seed in zip(best, seeds, strict=True))
     return (
         f"{rule_cost_table(results, rule).html()}<p><small>Test results of the baseline's checkpoints with the highest "
         f"{escape(rule)} on held-out steps, minus those of the checkpoints with the best validation score, paired by "

@@ -43,9 +43,9 @@ from drivax.stats.clusters import recordings_of
 from drivax.studies.definition import Study, StudyConfig
 from drivax.studies.report import write_report
 from drivax.studies.verdicts import (
-    Condition,
     Episodes,
     Strata,
+    ValidationCheck,
     compare_rankings,
     decide_claims,
     detectable_differences,
@@ -118,7 +118,7 @@ def run_study(
     smallest = _check_baselines(study, strata, anyway, log)
     _train_and_evaluate(jobs, cores, log)
     results = _results(study, test, strata, tables, usable) | {
-        "conditions": [asdict(condition) for condition in _conditions(study, config.arms)],
+        "conditions": [asdict(check) for check in _validation_checks(study, config.arms)],
         "detectable": smallest,
         "edited": edited_files(),
     }
@@ -130,16 +130,16 @@ def run_study(
 
 
 def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> dict[str, float]:
-    """Check the conditions of the baselines, unless ``anyway``; return the smallest detectable differences."""
-    definition, conditions = study.definition, _conditions(study, study.definition.baselines)
+    """Log the checks of the baselines, which must be met unless ``anyway``; return smallest detectable differences."""
+    definition, checks = study.definition, _validation_checks(study, study.definition.baselines)
     first_group = next(iter(definition.groups))
     claim_count = sum(claim.group == first_group for claim in study.claims)
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
     smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
-    for condition in conditions:
-        log(str(condition))
+    for check in checks:
+        log(str(check))
     log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
-    if not all(condition.met for condition in conditions) and not anyway:
+    if not all(check.met for check in checks) and not anyway:
         raise UsageError(
             "the baseline does not drive well enough for a comparison",
             file=study.folder,
@@ -180,7 +180,7 @@ def _open_folder(study: Study) -> None:
     other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
     if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
         raise UsageError(
-            "has no labelled events, which the oracle and its control need",
+            "has no labelled events, which the oracle arms need",
             file=sets.train,
             cure=f"pass --arms [{','.join(other_arms)}]",
         )
@@ -220,7 +220,7 @@ def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
 
 
 def _test_set(study: Study) -> ScenarioSet:
-    """Return the test scenarios as one set, half of them with an event if events are labelled."""
+    """Return the test scenarios as one set; if only some have a labelled event, equally many with and without."""
     if not study.test.is_dir():
         test_sets = [ScenarioSet.open(path) for path in study.sets.test]
         rows = [(scenarios, row) for scenarios in test_sets for row in range(len(scenarios))]
@@ -360,14 +360,14 @@ def _best_step(job: Job) -> int:
     return int(max(rows, key=lambda row: row[metric])["step"])
 
 
-def _conditions(study: Study, arms: Sequence[str]) -> list[Condition]:
-    """Return the validation results of trained arms."""
+def _validation_checks(study: Study, arms: Sequence[str]) -> list[ValidationCheck]:
+    """Return the validation checks of trained arms."""
     config = study.config
-    return [Condition.of(arm, _validations(study, arm), config.progress, config.flat) for arm in arms]
+    return [ValidationCheck.of(arm, _validations(study, arm), config.progress, config.flat) for arm in arms]
 
 
-def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
-    """Return ``score``, ``progress`` and the logged ``rule`` (``checkpoints_by``) at each seed's validations."""
+def _validations(study: Study, arm: str) -> list[dict[str, list[Any]]]:
+    """Return ``score``, ``progress`` and ``rule`` (``checkpoints_by``; None if missing) at each seed's validations."""
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
         run = RunFolder(study.run(arm, seed), {})
@@ -376,7 +376,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[float]]]:
             {
                 "score": [_validation_score(row) for row in rows],
                 "progress": [row[_PROGRESS] for row in rows],
-                "rule": [row[metric] for row in rows if row.get(metric) is not None],
+                "rule": [row.get(metric) for row in rows],
             }
         )
     return curves

@@ -26,7 +26,7 @@ UNRELATED, RELATED = 0.1, 0.3
 _TOP = 0.05
 #: Significance level.
 _LEVEL = 0.05
-#: Metrics that lie between 0 and 1.
+#: Metrics whose intervals are kept within 0 and 1.
 _SHARES = (*SHARES, "progress_ratio")
 
 Values = Float[np.ndarray, "seed scenario"]
@@ -70,15 +70,17 @@ class Strata:
 
 
 @dataclass(frozen=True)
-class Condition:
-    """Result of an arm on the validation set; those of the baselines decide whether arms are compared.
+class ValidationCheck:
+    """Check of an arm on the validation set; those of the baselines decide whether arms are compared.
+
+    ``results.json`` stores the fields by name.
 
     Attributes:
         arm: Name of the arm.
         progress: Share of the expert's progress on the validation set at the best checkpoints, mean over seeds.
         least: Progress of the worst seed.
         change: Change of the validation score from the third to the last quarter of the validations, mean over seeds.
-        moved: Absolute value of that change, mean over seeds.
+        moved: Mean over seeds of the absolute value of that change.
         met: Whether every seed makes enough progress, and scores have converged.
     """
 
@@ -92,8 +94,8 @@ class Condition:
     @classmethod
     def of(
         cls, arm: str, curves: Sequence[Mapping[str, Sequence[float]]], min_progress: float, max_change: float
-    ) -> Condition:
-        """Return the condition of an arm from ``score`` and ``progress`` at the validations of every seed."""
+    ) -> ValidationCheck:
+        """Return the check of an arm from ``score`` and ``progress`` at the validations of every seed."""
         progress, changes = [], []
         for curve in curves:
             scores = np.asarray(curve["score"])
@@ -123,8 +125,8 @@ class ClaimResult:
     Attributes:
         claim: The claim.
         effect: The effect to test against 0: the difference, or for a claimed size the log ratio minus its claimed
-            value. None if the stratum is empty, or the ratio undefined.
-        difference: Arm minus reference.
+            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is 0).
+        difference: Arm minus reference; None if fewer than two recordings define the metric.
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
@@ -274,9 +276,10 @@ def rule_cost(
 
 
 def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
-    """Compare the methods' rankings of scenarios: rank correlation, overlap of the top 5 %, and a verdict.
+    """Compare rankings of scenarios by two methods: rank correlation, overlap of the top 5 %, and a verdict.
 
-    ``recordings`` has the recording of every scenario; the interval resamples recordings.
+    Leaves out ``uniform`` and ``oracle``. ``recordings`` has the recording of every scenario; the interval resamples
+    recordings.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):

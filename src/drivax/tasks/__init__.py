@@ -1,4 +1,7 @@
-"""Driving tasks: action spaces, observations, rewards and termination."""
+"""Driving tasks: action spaces, observations, rewards and termination.
+
+``observations`` scales features by constants; ``drivax.networks.encoders`` normalises them by statistics.
+"""
 
 import lazy_loader
 

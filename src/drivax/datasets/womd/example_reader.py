@@ -28,7 +28,7 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate
 from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, Flag, LightState, RoadKind
 
-#: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
+#: Floats hold every whole number below; from here on, ids stored as floats may have been rounded.
 _EXACT = 2**24
 #: Larger median spacings of map points are those of v1.2 and later (1 m instead of 0.5 m), m.
 _COARSE_M = 0.75
@@ -52,10 +52,9 @@ class WomdExample(womd.TfRecordReader):
     def describe(self, path: Path) -> Description:
         """Describe the first record: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
-        notes = [
-            *womd.notes_of(recording),
-            "no lane graph and no speed limits: lanes are chained by geometry",
-        ]
+        has_limits = any(feature.limit_mps is not None for feature in recording.features)
+        limits = "" if has_limits else " and no speed limits"
+        notes = [*womd.notes_of(recording), f"no lane graph{limits}: lanes are chained by geometry"]
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append(
                 "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
@@ -152,7 +151,7 @@ def _recording(
 def _track_ids(features: ExampleFeatures, rows: Array) -> Array:
     """Return ids of the rows, which are stored as floats; refuse those that may have been rounded."""
     ids = features.numbers("state/id")[rows]
-    if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
+    if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) >= _EXACT).any():
         raise DataError("state/id contains numbers that are not exact integers", cure=SKIP)
     if (ids < 0).any() or len(np.unique(ids)) < len(ids):
         raise DataError("state/id names a track twice, or negatively", cure=SKIP)
@@ -254,7 +253,7 @@ def _groups(ids: Array, keep: Array) -> list[Array]:
 
 
 def _limits(features: ExampleFeatures, count: int) -> Array:
-    """Return speed limits of map points in mph, 0 if unknown: only ScenarioMax writes them."""
+    """Return speed limits of map points in mph, 0 if unknown: Waymo's files have none."""
     name = "roadgraph_samples/speed_limit"
     if not features.has(name):
         return np.zeros(count)

@@ -72,7 +72,7 @@ class Cloning:
 
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
-            raise ValueError("batch and updates are at least 1")
+            raise ValueError("batch and updates must be at least 1")
         check_decay_share(self.falling)
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:

@@ -82,10 +82,10 @@ class PpoConfig:
 
     def __post_init__(self) -> None:
         if min((self.multiplier_rate, *self.constraints.values())) < 0.0:
-            raise ValueError("limits of constraints and multiplier_rate are at least 0")
+            raise ValueError("limits of constraints and multiplier_rate must be at least 0")
         check_average(self.average)
         if min(self.environments, self.unroll, self.epochs, self.minibatches) < 1:
-            raise ValueError("environments, unroll, epochs and minibatches are at least 1")
+            raise ValueError("environments, unroll, epochs and minibatches must be at least 1")
         steps, minibatches = self.steps_per_iteration, self.minibatches
         if steps % minibatches:
             raise ValueError(

@@ -98,7 +98,9 @@ class SacConfig:
     def __post_init__(self) -> None:
         check_average(self.average)
         if min(self.environments, self.unroll, self.updates_per_step, self.batch, self.steps) < 1:
-            raise ValueError("environments, unroll, updates_per_step, batch and steps are at least 1")
+            raise ValueError("environments, unroll, updates_per_step, batch and steps must be at least 1")
+        if self.temperature <= 0.0:
+            raise UsageError(f"temperature is {self.temperature}", cure="use more than 0")
         if not 0.0 <= self.demonstrations < 1.0:
             raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
         if self.demonstrations and not 0 < self.logged_batch < self.batch:

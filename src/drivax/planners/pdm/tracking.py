@@ -106,7 +106,7 @@ def track(
         speeds = speeds if about_axle else jnp.maximum(speeds, 0.0)
         errors = (lateral_error, heading_error, car.steering)
         rate = steering_rate(errors, speeds, curvatures, wheelbase, config)
-        # XLA vectorises the regulator apart from the car.
+        # Without the barrier XLA fuses the regulator with the motion of the car, and does not vectorise it.
         rate = jax.lax.optimization_barrier(jnp.where(is_stopping, 0.0, rate))
         car = step_car(car, acceleration, rate, wheelbase, config, about_axle)
         return car, car

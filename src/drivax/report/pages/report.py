@@ -13,7 +13,7 @@ import numpy as np
 
 from drivax.errors import UsageError
 from drivax.evaluation import result_tables
-from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey, Tags
+from drivax.evaluation.episode_table import NOT_SUMMARISED, RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.files import check_output, write_text
 from drivax.report.charts import curve_sections, distribution_charts
@@ -306,7 +306,7 @@ def episode_data(runs: Sequence[EpisodeTable], tags: Tags, playable: Mapping[Sce
     - ``tags``: words of each tag, and their indices for each scenario.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
-    names += [name for name in result_tables.metric_names(runs) if name in result_tables.CODES]
+    names += [name for name in result_tables.metric_names(runs) if name in NOT_SUMMARISED]
     keys = list(dict.fromkeys(key for run in runs for key in run.scenarios))
     index_of = {key: number for number, key in enumerate(keys)}
     return data_element(

@@ -78,7 +78,7 @@ class Sizes:
         edges, lanes, road: Segments of road edges and of car lanes, and pieces of road to observe.
         edge_run, lane_run: Longest run of a row of three grid cells.
         graphs: Lanes of the graph.
-        long_ego: Whether some recorded ego is too long for a single grid query.
+        long_ego: Whether some ego is too long for a single grid query.
     """
 
     agents: int
@@ -126,7 +126,11 @@ def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
     moving = max(1, _round_up(int(agents.max()), capacity.agents))
     slots = _round_up(int((agents + parked).max()), capacity.agents + capacity.parked)
     _, edge_end, lane_end, _ = stack_field(records, "segment_blocks").T
-    half_diagonal_m = np.hypot(*stack_field(records, "agent_size", 0).T[:2]).astype(np.float64) / 2
+    egos = np.zeros((len(records), 1), int)
+    if capacity.egos > 1:
+        egos = np.hstack([egos, np.maximum(stack_field(records, "ego_slot"), 0)])
+    ego_size_m = np.take_along_axis(stack_field(records, "agent_size"), egos[..., None], axis=1)
+    half_diagonal_m = np.hypot(*ego_size_m.T[:2]).astype(np.float64) / 2
     return Sizes(
         agents=moving,
         slots=max(slots, moving),
@@ -187,7 +191,7 @@ class ScenarioBank:
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
-        long_ego: Whether some recorded ego is too long for a single grid query.
+        long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.
     """
 

@@ -1,4 +1,8 @@
-"""Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid."""
+"""Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid.
+
+``assemble`` runs them. ``lane_paths.LaneSearch`` is the route search; ``routes``, with the published
+search, selects and samples paths.
+"""
 
 import lazy_loader
 

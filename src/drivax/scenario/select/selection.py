@@ -221,8 +221,8 @@ class _Name:
 
     @property
     def label(self) -> str:
-        """The id for messages."""
-        return repr(self.text.rpartition("\t")[2])
+        """The id for messages, after its data set if one was given."""
+        return repr(self.text.replace("\t", " / "))
 
 
 def select_scenarios(
@@ -272,15 +272,20 @@ def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
 def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
     """Return the error for one or more names that are not in the set; it lists the first three."""
     first, others = missing[0], missing[1:]
-    ids = [str(entry["scenario_id"]) for entry in data.entries]
-    near = difflib.get_close_matches(first.text.rpartition("\t")[2], ids, n=1)
-    cure = f"did you mean {near[0]!r}?" if near and not others else "use ids that drivax inspect --json lists"
+    wanted = first.text.rpartition("\t")[2]
+    datasets = sorted({str(entry["dataset"]) for entry in data.entries if entry["scenario_id"] == wanted})
+    near = difflib.get_close_matches(wanted, [str(entry["scenario_id"]) for entry in data.entries], n=1)
+    cure = "use ids that drivax inspect --json lists"
+    if datasets and not others:
+        cure = f"the set has this id in data set {', '.join(datasets)}"
+    elif near and not others:
+        cure = f"did you mean {near[0]!r}?"
     more = "".join(f", {name.label}" for name in others[: _MOST_NAMES - 1])
     more += f" and {len(others) - _MOST_NAMES + 1} more" if len(others) >= _MOST_NAMES else ""
     which = "are" if others else "is"
     if first.file is None:
         return DataError(f"{first.label}{more} {which} not in the set", file=data.path, cure=cure)
-    problem = f"line {first.line} names {first.label}{more}, which {which} not in the set {data.path}"
+    problem = f"{first.label} (line {first.line}){more} {which} not in the set {data.path}"
     return DataError(problem, file=first.file, cure=cure)
 
 

@@ -2,6 +2,7 @@
 
 A script reads the scenario without the event (``ego_view``) and proposes when an actor does what, so that an ego at
 constant speed would collide; ``adversary`` computes what this requires of ego, ``choosing`` checks the proposals.
+The scripts are registered in ``choosing.SCRIPTS``.
 """
 
 import lazy_loader

@@ -1,4 +1,7 @@
-"""Random road networks of the procedural world: curves, lanes, rules, lights and families."""
+"""Random road networks of the built-in world: curves, lanes, rules, lights and families.
+
+``families.junctions.set_lights`` assigns the phases of traffic lights; ``signals`` computes their colours over time.
+"""
 
 import lazy_loader
 
