@@ -1,7 +1,7 @@
 """Kernels of the simulator's step against XLA: contacts, the look ahead along the route, frames and lights."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ READS = frozenset({"ttc_s", "collision", "at_fault", "collision_type"})
 BATCH = 192
 
 
+@cache
 def jitted(function, axes):
     """The function of a batch, by kernels and by XLA."""
     batch = jax.jit(jax.vmap(function, axes))
@@ -68,6 +69,11 @@ def assert_same(function, axes, arguments, rare=0.01):
     return expected
 
 
+@cache
+def jitted_in_float64(function, axes):
+    return jax.jit(jax.vmap(function, axes))
+
+
 def results_nearby(function, axes, arguments, sample, count=100):
     """Results in float64 of a sample whose numbers change by the rounding of float32."""
     rng = np.random.default_rng(0)
@@ -84,7 +90,7 @@ def results_nearby(function, axes, arguments, sample, count=100):
             jax.tree.map(spread if axis == 0 else widen, argument)
             for argument, axis in zip(arguments, axes, strict=True)
         ]
-        return jax.device_get(jax.jit(jax.vmap(function, axes))(*spreads))
+        return jax.device_get(jitted_in_float64(function, axes)(*spreads))
 
 
 def random_frames(rng, slots, batch=BATCH, share=0.7, spread_m=12.0):
