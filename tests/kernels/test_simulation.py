@@ -9,15 +9,19 @@ import numpy as np
 import pytest
 
 from drivax import kernels
-from drivax.scenario.bank.columns import NEVER_M, LightRow
+from drivax.evaluation.rollout import evaluation_task
+from drivax.scenario.bank.columns import NEVER_M, AgentColumn, LightRow
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator.ahead import ahead
 from drivax.simulator.contact import Contact
+from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import _measure_contacts
 from drivax.simulator.types import HISTORY, AgentContext, Frame
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.task import Task
 from kernels.compare import TARGETS, needs_kernels, run_on_target
-from scenes import RED, SMALL, car, straight_road
+from scenes import GLIMPSE, RED, SMALL, car, straight_road
 
 pytestmark = needs_kernels
 
@@ -222,6 +226,110 @@ def test_look_ahead_equals_that_of_xla(bank, slots):
         problem = following_problem(bank, seed + 100 * slots, slots)
         leaders += (assert_same(look_ahead, (None, 0, 0), problem).gap < 90).sum()
     assert leaders > 50
+
+
+def random_log(rng, bank, moving, slots):
+    """The bank with random moving agents in the first slots, parked ones in the others, and states of lights."""
+    count, steps, words = len(bank), bank.steps, bank.parked_when.shape[1]
+    rows = rng.normal(0, 50, (count, steps, moving, 8)).astype(np.float32)
+    rows[..., AgentColumn.VALID] = rng.random(rows.shape[:3]) < 0.7
+    parked = rng.normal(0, 50, (count, slots, 8)).astype(np.float32)
+    parked[..., AgentColumn.VALID] = 1.0
+    when = rng.integers(0, 2**32, (count, words, slots), np.uint32)
+    when[:, :, :moving] = 0
+    size = rng.integers(0, 6, (count, slots, 4)).astype(np.float32)
+    state = rng.integers(-1, 9, bank.light_state.shape).astype(np.int8)
+    extension = np.zeros((count, moving, *bank.extension.shape[2:]), np.float32)
+    arrays = {"agents": rows, "agent_box": size, "parked": parked, "parked_when": when, "light_state": state}
+    arrays["extension"] = extension
+    return replace(bank, **{name: jnp.asarray(array) for name, array in arrays.items()})
+
+
+simulator = Simulator(Task(observation=GLIMPSE))
+
+
+@pytest.mark.parametrize(("moving", "slots"), [(1, 1), (3, 3), (5, 9), (16, 40)])
+def test_frames_equal_those_of_xla(bank, moving, slots):
+    rng = np.random.default_rng(slots)
+    logs = random_log(rng, bank, moving, slots)
+    context = random_context(rng, rng.integers(0, slots + 1, BATCH, np.int32))
+    history = rng.normal(0, 20, (BATCH, HISTORY, 4))
+    context = replace(
+        context,
+        index=jnp.asarray(rng.integers(0, len(bank), BATCH, np.int32)),
+        step=jnp.asarray(rng.integers(-3, bank.steps + 2, BATCH, np.int32)),
+        history=jnp.asarray(history, jnp.float32),
+        z=jnp.asarray(rng.normal(0, 3, BATCH), jnp.float32),
+    )
+    frame = assert_same(simulator.now, (None, 0), (logs, context), rare=0)
+    assert frame.valid.any()
+
+
+@pytest.fixture(scope="module")
+def generated():
+    """Generated scenarios, the steps of a batch of their egos, and their states after the first."""
+    scenarios = ScenarioBank.from_scenarios([assemble(generate_recording(5, i)) for i in range(4)])
+    return scenarios, jnp.arange(12, dtype=jnp.int32) % 4
+
+
+def drive(bank, index, steps=25):
+    """The facts of an episode, and what a car-following driver sees, at each step; the agent leaves its log."""
+    state = simulator_full.reset(bank, index)
+
+    def step(state, number):
+        action = jnp.stack([jnp.where(number < 8, 0.3, -0.2), 0.1 * jnp.sin(number * index)])
+        state = simulator_full.step(bank, state, action)[0]
+        frame = simulator_full.now(bank, state.context)
+        return state, (state.facts, state.contacts, ahead(bank, state.context, frame, 2.0))
+
+    return jax.lax.scan(step, state, jnp.arange(steps))[1]
+
+
+simulator_full = Simulator(replace(evaluation_task(Task()), observation=GLIMPSE))
+
+
+def test_episodes_of_generated_scenarios_equal_those_of_xla(generated):
+    facts, contacts, _ = assert_same(drive, (None, 0), generated, rare=0)
+    assert (contacts == Contact.APART).any()
+    assert (facts.ttc_s < 5).any()
+
+
+def test_batches_of_batches_and_of_banks_equal_single_calls(generated):
+    bank, index = generated
+    single = jax.jit(drive)
+    expected = [jax.device_get(single(bank, i)) for i in index[:4]]
+    nested = jax.jit(jax.vmap(jax.vmap(drive, (None, 0)), (None, 0)))(bank, index[:4].reshape(2, 2))
+    banks = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), bank)
+    of_banks = jax.jit(jax.vmap(drive, (0, None)))(banks, index[1])
+    for number, result in enumerate(expected):
+        a, b = divmod(number, 2)
+        jax.tree.map(lambda x, y, a=a, b=b: np.testing.assert_array_equal(x[a, b], y), nested, result)
+    for number in range(2):
+        jax.tree.map(
+            lambda x, y, n=number: np.testing.assert_array_equal(x[n], y), of_banks, expected[1]
+        )
+
+
+def test_derivatives_are_those_of_xla(generated):
+    bank, index = generated
+
+    def time_and_gap(speed, index):
+        context = simulator.context(bank, index)
+        context = replace(context, history=context.history.at[-1, 3].add(speed))
+        frame = simulator.now(bank, context)
+        before = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
+        arguments = (context, frame, frame, before, jnp.zeros((), bool))
+        obstacles = ahead(bank, context, frame, 2.0)
+        return measure(*arguments)[3] + obstacles.desired + 0.01 * obstacles.gap
+
+    derivative = jax.vmap(jax.grad(time_and_gap), (None, 0))
+    speed = jnp.float32(1.0)
+    actual = jax.jit(derivative)(speed, index)
+    with kernels.without_kernels():
+        expected = jax.jit(lambda *arguments: derivative(*arguments))(speed, index)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5)
+    assert np.isfinite(actual).all()
+    assert (actual != 0).any()
 
 
 @pytest.mark.parametrize("target", TARGETS)
