@@ -53,10 +53,8 @@ def equal_samples(actual, expected):
     same = True
     for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         a, b = (np.asarray(leaf).reshape(len(leaf), -1) for leaf in (a, b))
-        if b.dtype.kind == "f":
-            near = np.isclose(a, b, rtol=1e-5, atol=1e-5, equal_nan=True)
-        else:
-            near = a == b
+        is_float = b.dtype.kind == "f"
+        near = np.isclose(a, b, rtol=1e-5, atol=1e-5, equal_nan=True) if is_float else a == b
         same &= near.all(axis=1)
     return same
 

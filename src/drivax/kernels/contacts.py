@@ -18,8 +18,13 @@ def measure_contacts(
     """Return new contact codes, whether a contact that begins is at fault, its type, and time to collision.
 
     Args:
-        box, velocity, z, valid, kind: All agents (``simulator.types.Frame``).
-        previous_velocity, previous_valid: All agents one step before.
+        box: All agents: x, y, cosine, sine, length, width.
+        velocity: m/s.
+        z: Height of the box centre, m.
+        valid: Whether the slot has an agent.
+        kind: ``scenario.schema.AgentKind``.
+        previous_velocity: One step before.
+        previous_valid: One step before.
         slot: Slot of the driven agent.
         speed: Its larger one of before and after the step, m/s.
         unlawful: Whether it is at fault in a lateral hit.

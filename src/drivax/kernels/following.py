@@ -25,9 +25,12 @@ def look_ahead(
         maps: Routes, numbers of their points, and stop lines of all scenarios.
         agents: Boxes, velocities, heights and mask of all agents.
         lights: States.
-        slot, index, row: Slot of the driven agent, its scenario, and its route.
+        slot: Slot of the driven agent.
+        index: Its scenario.
+        row: Its route.
         arc: Row of the arc lengths of stop lines on that route.
-        route_m, speed: Arc length of the agent along it, m; speed, m/s.
+        route_m: Arc length of the agent along it, m.
+        speed: Of the agent, m/s.
         min_gap_m: Gap that the driver keeps behind a standing leader.
         rules: ``FollowingRules`` in ``native/following.cc``.
     """

@@ -30,7 +30,9 @@ def read_frame(
 
     Args:
         logs: Arrays of all scenarios.
-        index, step, slot: Scenario, step, and slot of the driven agent; slots beyond the moving agents drive none.
+        index: Scenario.
+        step: Of the log.
+        slot: That of the driven agent; slots beyond the moving agents drive none.
         motion: Its x, y, heading and speed.
         direction: Cosine and sine of its heading.
     """

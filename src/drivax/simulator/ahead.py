@@ -85,7 +85,8 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
 def _ahead_natively(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: Scalar) -> Ahead:
     """Return the values of :func:`ahead`."""
-    maps, agents = (bank.routes, bank.route_points, bank.light_line), (frame.box, frame.velocity, frame.z, frame.valid)
+    maps = (bank.routes, bank.route_points, bank.light_line)
+    agents = (frame.box, frame.velocity, frame.z, frame.valid)
     arc = jnp.asarray(LightRow.ARC + bank.ego_number(context.row), jnp.int32)
     speed = context.history[-1, MOTION_SPEED]
     places = (context.slot, context.index, context.row, arc)

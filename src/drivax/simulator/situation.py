@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, root, wrap
-from drivax import kernels
 from drivax.kernels.contacts import measure_contacts
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
@@ -174,8 +174,8 @@ def _measure_contacts(
 
 
 def _measure_contacts_natively(
-    context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""]
-) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:
+    context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
+) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
     """Return the values of :func:`_measure_contacts`, with all of them read."""
     speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
     agents = (frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
