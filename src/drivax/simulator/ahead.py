@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax import kernels
 from drivax.geometry.boxes import COS, LENGTH, WIDTH, X
 from drivax.geometry.vectors import norm, rotate
+from drivax.kernels.following import look_ahead
 from drivax.scenario.bank.columns import LightRow, RouteColumn
-from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.queries import LEVEL_M, route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
+from drivax.scenario.schema import LightState
 from drivax.simulator.contact import others_on_level
 from drivax.simulator.dynamics import pursuit
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.lights import is_red, is_yellow
-from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
+from drivax.simulator.traffic.corridor import CLOSEST, FREE_M, LEAST_GAP_M, SLOT_BITS, closest, reaching
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 
 #: Points ahead on the route: spacing (m), number, and number of rectangles around them.
@@ -32,6 +37,16 @@ _YELLOW_BRAKING_MPS2 = 3.0
 _LOOKAHEAD_M, _LOOKAHEAD_S, _LOOKAHEAD_BOUNDS_M = 3.0, 0.8, (4.0, 20.0)
 #: Distance before a stop line at which cars stop, m.
 STOP_SHORT_M = 1.0
+#: For the native kernel.
+_RULES: dict[str, Any] = {
+    "points": _POINTS, "rectangles": _RECTANGLES, "closest": CLOSEST, "slot_bits": SLOT_BITS,
+    "red": LightState.STOP, "red_arrow": LightState.ARROW_STOP,
+    "yellow": LightState.CAUTION, "yellow_arrow": LightState.ARROW_CAUTION,
+    "step_m": _STEP_M, "near_m": _NEAR_M, "ends_m": 2.0 * _STEP_M, "level_m": LEVEL_M, "side_m": _SIDE_M,
+    "least_gap_m": LEAST_GAP_M, "free_m": FREE_M, "limit_mps": _FALLBACK_LIMIT_MPS, "curve_mps2": _CURVE_MPS2,
+    "curve_braking_mps2": _CURVE_BRAKING_MPS2, "yellow_braking_mps2": _YELLOW_BRAKING_MPS2,
+    "stop_short_m": STOP_SHORT_M,
+}  # fmt: skip
 
 
 @record
@@ -49,11 +64,14 @@ class Ahead:
         return idm_acceleration(speed, self.desired, self.gap, self.leader, parameters)
 
 
-def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
+def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float | Scalar) -> Ahead:
     """Look 90 m ahead of the driven agent along its route, for stop lines 92 m ahead of its front bumper.
 
     ``min_gap_m`` is the gap that the driver keeps behind a standing leader.
     """
+    if kernels.in_use():
+        native = kernels.with_reference(_ahead_natively, ahead)
+        return native(bank, context, frame, jnp.asarray(min_gap_m, jnp.float32))
     route = _route_points(bank, context)
     leader_m, leader_mps = _leader(frame, context.slot, *route)
     # The driver stops min_gap_m behind a leader, but STOP_SHORT_M before a line.
@@ -63,6 +81,17 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     # Without a second point the route ends within 2 m.
     desired = jnp.where(route[1][1], desired_speed(*route), 0.0)
     return Ahead(jnp.where(jnp.isfinite(gap), gap, FREE_M), leader, desired)
+
+
+def _ahead_natively(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: Scalar) -> Ahead:
+    """Return the values of :func:`ahead`."""
+    maps = (bank.routes, bank.route_points, bank.light_line)
+    agents = (frame.box, frame.velocity, frame.z, frame.valid)
+    arc = jnp.asarray(LightRow.ARC + bank.ego_number(context.row), jnp.int32)
+    speed = context.history[-1, MOTION_SPEED]
+    places = (context.slot, context.index, context.row, arc)
+    ahead = look_ahead(maps, agents, frame.lights, *places, context.route_m, speed, min_gap_m, **_RULES)
+    return Ahead(*ahead)
 
 
 def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:

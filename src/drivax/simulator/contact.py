@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -25,6 +26,12 @@ _TAN_30, _COS_45 = 3.0**-0.5, 0.5**0.5
 _BUMPER_M = 0.02
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
+#: For the native kernel.
+RULES: dict[str, Any] = {
+    "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST, "level_m": LEVEL_M,
+    "horizon_s": TTC_HORIZON_S, "stopped_mps": STOPPED_MPS, "rear_axle": REAR_AXLE, "behind_tan": _TAN_30,
+    "parallel_cos": _COS_45, "bumper_m": _BUMPER_M,
+}  # fmt: skip
 
 
 class Contact(enum.IntEnum):

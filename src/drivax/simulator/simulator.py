@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
@@ -18,7 +19,7 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import forget_crossings, remember_lights
 from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
-from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
+from drivax.simulator.traffic.log import LogTraffic, alone, frame_of, present_frame
 from drivax.simulator.types import (
     Action,
     AgentContext,
@@ -102,6 +103,10 @@ class Simulator:
 
         ``slots`` selects agents; the default is all.
         """
+        is_present = back == 0 and slots is None and driven.slot.shape[0] == 1
+        if is_present and type(self.traffic) is LogTraffic and kernels.in_use():
+            reference = partial(self.frame, back=0)
+            return kernels.with_reference(present_frame, reference)(bank, context, driven)
         agents = self.traffic.agents(bank, context, back)
         return frame_of(bank, context.index, context.step, agents, driven, back, slots)
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, root, wrap
+from drivax.kernels.contacts import measure_contacts
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
@@ -152,6 +155,10 @@ def _measure_contacts(
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
         return contacts, fault.any(), kind, ttc
+    if "ttc_s" in reads and kernels.in_use():
+        reference = partial(_measure_contacts, reads=reads)
+        native = kernels.with_reference(_measure_contacts_natively, reference)
+        return native(context, frame, previous, contacts, unlawful)
     touching = contact.overlaps(frame, context.slot)
     if reads & _FAULTS:
         begins = contact.first_contacts(contacts, touching)
@@ -164,6 +171,16 @@ def _measure_contacts(
         ignored = (codes == Contact.IGNORED) | (codes == Contact.HIT)
         ttc = contact.time_to_collision(frame, context.slot, ignored)
     return codes, fault.any(), kind, ttc
+
+
+def _measure_contacts_natively(
+    context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
+) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
+    """Return the values of :func:`_measure_contacts`, with all of them read."""
+    speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
+    agents = (frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
+    before = (previous.velocity, previous.valid)
+    return measure_contacts(*agents, *before, context.slot, speed, unlawful, contacts, **contact.RULES)
 
 
 def _speeds(frame: Frame) -> Float[Array, " S"]:

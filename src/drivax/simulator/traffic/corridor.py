@@ -39,7 +39,7 @@ FREE_M = 1e4
 #: Lower bound of the gap of overlapping agents, m.
 LEAST_GAP_M = -50.0
 #: Low bits of a squared distance that store the slot or piece; the rest is exact to 0.013 % (of at least 1 m2).
-_SLOT_BITS, _PIECE_BITS = 10, 4
+SLOT_BITS, _PIECE_BITS = 10, 4
 
 
 @record
@@ -215,7 +215,7 @@ def closest(
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
     """Return the slots of the C boxes (:func:`columns`) in ``near`` that are closest to each centre, and their mask."""
     dx, dy = box[X] - centre[:, X : X + 1], box[Y] - centre[:, Y : Y + 1]
-    key = embed_number(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS)
+    key = embed_number(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), SLOT_BITS)
     # Without the barrier XLA computes the keys again for each of the minima.
     key = jax.lax.optimization_barrier(jnp.where(near, key, jnp.inf))
     minima = [jnp.min(key, axis=1, keepdims=True)]
@@ -223,7 +223,7 @@ def closest(
         minima.append(jnp.min(jnp.where(key > minima[-1], key, jnp.inf), axis=1, keepdims=True))
     smallest = jnp.concatenate(minima, axis=1)
     valid = jnp.isfinite(smallest)
-    return jnp.where(valid, number_of(smallest, _SLOT_BITS), 0), valid
+    return jnp.where(valid, number_of(smallest, SLOT_BITS), 0), valid
 
 
 def reaching(

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from drivax.kernels.frame import read_frame
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.schema import DT_S
-from drivax.simulator.types import HISTORY, AgentContext, Frame
+from drivax.simulator.types import HISTORY, MOTION_HEADING, AgentContext, Frame
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,17 @@ def frame_of(
         kind=box[:, SizeColumn.KIND].astype(jnp.int32),
         lights=jnp.where(step >= back, bank.light_state[index, log_step], -1),
     )
+
+
+def present_frame(bank: ScenarioBank, context: AgentContext, driven: AgentContext) -> Frame:
+    """Return the present frame of a single driven agent natively; other agents replay the log."""
+    logs = (bank.agents, bank.agent_box, bank.parked, bank.parked_when, bank.light_state)
+    motion, slot = driven.history[0, -1], driven.slot[0]
+    heading = motion[MOTION_HEADING]
+    direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    box, velocity, z, *others = read_frame(logs, context.index, context.step, slot, motion, direction)
+    is_driven = (jnp.arange(len(z)) == slot) & (slot < bank.agents.shape[2])
+    return Frame(box, velocity, jnp.where(is_driven, driven.z[0], z), *others)
 
 
 def alone(context: AgentContext) -> AgentContext:
