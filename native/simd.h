@@ -4,7 +4,11 @@
 // no templates of the standard library: a linker could choose the copy that was compiled for the largest target.
 #pragma once
 
+// GCC 12 warns of its own header: __builtin_undefined.
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #include <immintrin.h>
+#pragma GCC diagnostic pop
 
 #include <cstdint>
 

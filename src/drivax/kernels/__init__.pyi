@@ -1,3 +1,3 @@
-from .library import in_use, state, without_kernels
+from .library import constants, in_use, state, with_reference, without_kernels
 
-__all__ = ["in_use", "state", "without_kernels"]
+__all__ = ["constants", "in_use", "state", "with_reference", "without_kernels"]

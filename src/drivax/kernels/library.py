@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.sharding import AxisType, PartitionSpec
 
@@ -57,8 +58,9 @@ def state() -> str:
 
 
 def in_use() -> bool:
-    """Whether programs that are traced now call native kernels: on CPUs, if the library is there."""
-    return _allowed.get() and _library() is not None and jax.default_backend() == "cpu"
+    """Whether programs that are traced now call native kernels: on CPUs, if the library is there, in float32."""
+    is_float32 = not jax.config.jax_enable_x64
+    return _allowed.get() and is_float32 and _library() is not None and jax.default_backend() == "cpu"
 
 
 @contextlib.contextmanager
@@ -69,6 +71,26 @@ def without_kernels() -> Iterator[None]:
         yield
     finally:
         _allowed.reset(token)
+
+
+def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``native`` with the derivatives of ``reference``, which computes the same of the same arrays."""
+    function = jax.custom_jvp(native)
+
+    @function.defjvp
+    def derive(primals: Any, tangents: Any) -> tuple[Any, Any]:
+        with without_kernels():
+            return jax.jvp(reference, primals, tangents)
+
+    return function
+
+
+def constants(**values: float) -> dict[str, Any]:
+    """Return attributes of a kernel: integers of 32 bits, and floats."""
+    return {
+        name: np.int32(value) if isinstance(value, int) else np.float32(value)
+        for name, value in values.items()
+    }
 
 
 def call(
