@@ -7,7 +7,7 @@ struct AgentRows {
   const float* size;            // [scenarios, slots, 4]: length, width, height, kind
   const float* routes;          // [routes, points, 7]
   const int32_t* route_points;  // [routes]
-  const float* offsets_m;       // [offsets]: points on the route on which agents are projected, relative to ego
+  const float* offsets_m;       // [offsets]: ascending places on the route, relative to ego, to project agents on
   const float* box;             // [batch, slots, 6]: x, y, cos, sin, length, width
   const float* velocity;        // [batch, slots, 2]
   const bool* valid;            // [batch, slots]
@@ -39,9 +39,11 @@ enum AgentRowColumn {
 struct AgentScratch {
   float* distance;   // [slots + 16]: squared, of valid agents
   int32_t* agent;    // [slots + 16]: their slots
-  int32_t* nearest;  // [count]: the slots of the nearest agents
-  float* path;       // [offsets, 4]: x, y, cos, sin of the route
-  int32_t* on_route; // [offsets]: numbers of the points that are on the route
+  int32_t* nearest;  // [count]: slots of the nearest agents
+  // Places on the route: element of the point before each, share of the way to the next point, x and y.
+  int32_t* element;  // [offsets + 16]
+  float* part;       // [offsets + 16]
+  float* xy;         // [offsets, 2]
 };
 
 EACH_TARGET(void observe_agents(const AgentRows& arguments, int64_t first, int64_t last, const AgentScratch& scratch);)
@@ -56,7 +58,6 @@ EACH_TARGET(void observe_agents(const AgentRows& arguments, int64_t first, int64
 
 namespace drivax::TARGET {
 
-enum PathColumn { kPathX, kPathY, kPathCos, kPathSin, kPathColumns };
 enum { kSizeHeight = 2, kSizeColumns = 4, kMotionSpeed = 3, kTypes = 4 };
 
 // Writes the slots of the nearest agents in ascending order, and returns how many there are, at most `count`.
@@ -75,48 +76,72 @@ INLINE int64_t find_nearest(const AgentRows& a, int64_t sample, const View& view
     size += valid[slot] & (slot != a.slot[sample]);
   }
   store(scratch.distance + size, splat(kInfinity));
-  for (int64_t i = 0; i < size; ++i) {
-    const Floats distance = splat(scratch.distance[i]);
-    int64_t rank = 0;
-    for (int64_t j = 0; j < size; j += LANES) {
-      const Floats others = load(scratch.distance + j);
-      const Ints is_before = numbers() < (int32_t)(i - j);
-      rank += __builtin_popcount(bits((others < distance) | ((others == distance) & is_before)));
+  for (int64_t i = 0; i < size; i += LANES) {
+    const Floats distance = load(scratch.distance + i);
+    const int64_t end = i + LANES < size ? i + LANES : size;
+    Ints rank = {};  // minus the number of agents before each of these
+    for (int64_t j = 0; j < i; ++j) rank += scratch.distance[j] <= distance;
+    for (int64_t j = i; j < end; ++j) {
+      const Floats other = splat(scratch.distance[j]);
+      rank += (other < distance) | ((other == distance) & (numbers() > (int32_t)(j - i)));
     }
-    if (rank < a.count) scratch.nearest[rank] = scratch.agent[i];
+    for (int64_t j = end; j < size; ++j) rank += scratch.distance[j] < distance;
+    for (int64_t j = i; j < end; ++j)
+      if (-rank[j - i] < a.count) scratch.nearest[-rank[j - i]] = scratch.agent[j];
   }
   return size < a.count ? size : a.count;
 }
 
-// Writes the points of the route around ego, and returns how many of them are on it.
-INLINE int64_t read_path(const AgentRows& a, const float* route, float route_m, float end_m,
-                         const AgentScratch& scratch) {
-  int64_t size = 0;
-  for (int64_t i = 0; i < a.offsets; ++i) {
-    const float along_m = route_m + a.offsets_m[i];
-    const RoutePlace place = place_on_route(route, a.points, along_m);
-    float* point = scratch.path + i * kPathColumns;
-    point[kPathX] = place[kRouteX];
-    point[kPathY] = place[kRouteY];
-    point[kPathCos] = place[kRouteCos];
-    point[kPathSin] = place[kRouteSin];
-    scratch.on_route[size] = (int32_t)i;
-    size += (along_m >= 0) & (along_m <= end_m);
-  }
-  return size;
+// The route around ego, in the scratch of a thread.
+struct Path {
+  const float* route;   // [points, 7]
+  int64_t next;         // elements from one point to the next
+  int64_t begin, end;   // places that are on the route
+  int32_t number_mask;  // bits that hold the number of a place
+  const AgentScratch* scratch;
+};
+
+INLINE RoutePlace place_on_path(const Path& path, int64_t number) {
+  const float* row = path.route + path.scratch->element[number];
+  return {row, row + path.next, path.scratch->part[number]};
 }
 
-// Numbers of the points that are nearest to agents; of nearly equal distances the first, as in bank/smallest.py.
-INLINE Ints nearest_point(const float* path, const int32_t* on_route, int64_t size, int32_t number_mask, Floats x,
-                          Floats y) {
-  Floats smallest_key = (Floats)((Ints)splat(1e30f) & ~number_mask);
-  for (int64_t i = 0; i < size; ++i) {
-    const float* point = path + on_route[i] * kPathColumns;
-    const Floats dx = x - point[kPathX], dy = y - point[kPathY];
-    const Floats distance = smaller(dx * dx + dy * dy, splat(1e30f)) + 1e-6f;
-    smallest_key = smaller(smallest_key, (Floats)(((Ints)distance & ~number_mask) | on_route[i]));
+INLINE Path read_path(const AgentRows& a, int64_t sample, const AgentScratch& scratch) {
+  const int64_t number = clamp_row(a.row[sample], a.routes_count);
+  const float end_m = a.route_points[number] > 1 ? (float)(a.route_points[number] - 1) : -1;
+  const int64_t last = a.points > 1 ? a.points - 2 : 0;
+  Path path = {a.routes + number * a.points * kRouteColumns, a.points > 1 ? kRouteColumns : 0};
+  path.begin = a.offsets;
+  path.scratch = &scratch;
+  while (path.number_mask < a.offsets - 1) path.number_mask = 2 * path.number_mask + 1;
+  for (int64_t i = 0; i < a.offsets; i += LANES) {
+    const Floats along = a.route_m[sample] + load_first(a.offsets_m + i, a.offsets - i), at = larger(along, Floats{});
+    const Ints low = as_ints(smaller(at, splat((float)last)));
+    store(scratch.element + i, low * (int32_t)kRouteColumns);
+    store(scratch.part + i, at - as_floats(low));
+    const Ints is_place = numbers() < (int32_t)(a.offsets - i);
+    const uint32_t on_route = bits((along >= 0) & (along <= end_m) & is_place);
+    if (!on_route) continue;
+    if (path.begin > path.end) path.begin = i + __builtin_ctz(on_route);
+    path.end = i + 32 - __builtin_clz(on_route);
   }
-  return (Ints)smallest_key & number_mask;
+  for (int64_t i = path.begin; i < path.end; ++i) {
+    const RoutePlace place = place_on_path(path, i);
+    scratch.xy[2 * i] = place[kRouteX];
+    scratch.xy[2 * i + 1] = place[kRouteY];
+  }
+  return path;
+}
+
+// Numbers of the places that are nearest to agents; of nearly equal distances the first, as in bank/smallest.py.
+INLINE Ints nearest_place(const Path& path, Floats x, Floats y) {
+  Floats smallest_key = (Floats)((Ints)splat(1e30f) & ~path.number_mask);
+  for (int64_t i = path.begin; i < path.end; ++i) {
+    const Floats dx = x - path.scratch->xy[2 * i], dy = y - path.scratch->xy[2 * i + 1];
+    const Floats distance = smaller(dx * dx + dy * dy, splat(1e30f)) + 1e-6f;
+    smallest_key = smaller(smallest_key, (Floats)(((Ints)distance & ~path.number_mask) | (int32_t)i));
+  }
+  return (Ints)smallest_key & path.number_mask;
 }
 
 // A vector of agents.
@@ -145,27 +170,32 @@ INLINE void write_motion(const AgentRows& a, const View& view, float speed, cons
 }
 
 INLINE void write_kind(const AgentRows& a, int64_t sample, const AgentVector& agents, float (*values)[LANES]) {
-  const float* sizes = a.size + clamp_row(a.index[sample], a.scenarios) * a.slots * kSizeColumns;
   for (int lane = 0; lane < agents.size; ++lane) {
-    const int64_t slot = agents.slot[lane];
-    const int32_t kind = a.kind[sample * a.slots + slot];
+    const int32_t kind = a.kind[sample * a.slots + agents.slot[lane]];
     for (int type = 0; type < kTypes; ++type) values[kIsVehicle + type][lane] = kind == a.kinds[type];
-    values[kHeight][lane] = sizes[slot * kSizeColumns + kSizeHeight] / a.size_m;
   }
 }
 
-INLINE void write_route(const AgentRows& a, const MovingBoxes& boxes, const float* path, const int32_t* on_route,
-                        int64_t size, int32_t number_mask, float (*values)[LANES]) {
+INLINE void write_height(const AgentRows& a, int64_t sample, const AgentVector& agents, float (*values)[LANES]) {
+  const float* sizes = a.size + clamp_row(a.index[sample], a.scenarios) * a.slots * kSizeColumns;
+  for (int lane = 0; lane < agents.size; ++lane)
+    values[kHeight][lane] = sizes[agents.slot[lane] * kSizeColumns + kSizeHeight] / a.size_m;
+}
+
+INLINE void write_route(const AgentRows& a, const MovingBoxes& boxes, const Path& path, float (*values)[LANES]) {
   alignas(64) int32_t nearest[LANES];
-  alignas(64) float points[kPathColumns][LANES], offset[LANES];
-  store(nearest, nearest_point(path, on_route, size, number_mask, boxes.x, boxes.y));
+  alignas(64) float x[LANES], y[LANES], cosine[LANES], sine[LANES], offset[LANES];
+  store(nearest, nearest_place(path, boxes.x, boxes.y));
   for (int lane = 0; lane < LANES; ++lane) {
     const int64_t number = nearest[lane] < a.offsets ? nearest[lane] : a.offsets - 1;
-    for (int column = 0; column < kPathColumns; ++column) points[column][lane] = path[number * kPathColumns + column];
+    const RoutePlace place = place_on_path(path, number);
+    x[lane] = place[kRouteX];
+    y[lane] = place[kRouteY];
+    cosine[lane] = place[kRouteCos];
+    sine[lane] = place[kRouteSin];
     offset[lane] = a.offsets_m[number];
   }
-  const Floats dx = boxes.x - load(points[kPathX]), dy = boxes.y - load(points[kPathY]);
-  const Floats cos = load(points[kPathCos]), sin = load(points[kPathSin]);
+  const Floats dx = boxes.x - load(x), dy = boxes.y - load(y), cos = load(cosine), sin = load(sine);
   const Floats forward = dx * cos + dy * sin, left = dy * cos - dx * sin;
   const Floats side = splat(a.side_m);
   const Floats clipped = select(absolute(forward) <= a.alongside_m, clamp(left, -side, side), side);
@@ -196,19 +226,27 @@ INLINE MovingBoxes read_agents(const float* box, const float* velocity, const in
           load(fields[kBoxLength]), load(fields[kBoxWidth]), load(fields[kBoxColumns]), load(fields[kBoxColumns + 1])};
 }
 
-INLINE bool has_column(const AgentRows& a, int32_t first, int32_t last) {
-  bool found = false;
-  for (int64_t i = 0; i < a.column_count; ++i) found |= a.columns[i] >= first && a.columns[i] <= last;
-  return found;
+// Columns that cost more than the motion.
+struct AgentColumns {
+  bool kind, height, route, approach;
+};
+
+INLINE AgentColumns columns_of(const AgentRows& a) {
+  AgentColumns has = {};
+  for (int64_t i = 0; i < a.column_count; ++i) {
+    const int32_t column = a.columns[i];
+    has.kind |= column >= kIsVehicle && column <= kIsOther;
+    has.height |= column == kHeight;
+    has.route |= column >= kRouteAlong && column <= kRouteCosine;
+    has.approach |= column == kClosingSpeed || column == kImminence;
+  }
+  return has;
 }
 
 void observe_agents(const AgentRows& a, int64_t first, int64_t last, const AgentScratch& scratch) {
-  const bool has_kind = has_column(a, kHeight, kIsOther), has_path = has_column(a, kRouteAlong, kRouteCosine);
-  const bool has_approach = has_column(a, kClosingSpeed, kImminence);
-  int32_t number_mask = 0;
-  while (number_mask < a.offsets - 1) number_mask = 2 * number_mask + 1;
+  const AgentColumns has = columns_of(a);
   for (int64_t sample = first; sample < last; ++sample) {
-    if (has_path && sample + 1 < last) {
+    if (has.route && sample + 1 < last) {
       const float* route = a.routes + clamp_row(a.row[sample + 1], a.routes_count) * a.points * kRouteColumns;
       const float route_m = a.route_m[sample + 1];
       prefetch_route(route, a.points, route_m + a.offsets_m[0], route_m + a.offsets_m[a.offsets - 1]);
@@ -218,13 +256,9 @@ void observe_agents(const AgentRows& a, int64_t first, int64_t last, const Agent
     const int64_t ego_slot = clamp_row(a.slot[sample], a.slots);
     const MovingBoxes ego = splat_box(box + ego_slot * kBoxColumns, velocity + ego_slot * 2);
     const int64_t size = find_nearest(a, sample, view, scratch);
-    const bool is_on_path = has_path && a.has_route[sample];
-    int64_t on_route = 0;
-    if (is_on_path && size) {
-      const int64_t number = clamp_row(a.row[sample], a.routes_count);
-      const float end_m = a.route_points[number] > 1 ? (float)(a.route_points[number] - 1) : -1;
-      on_route = read_path(a, a.routes + number * a.points * kRouteColumns, a.route_m[sample], end_m, scratch);
-    }
+    const bool has_route = has.route && a.has_route[sample];
+    Path path = {};
+    if (has_route && size) path = read_path(a, sample, scratch);
     float* row = a.rows + sample * a.count * a.column_count;
     bool* mask = a.mask + sample * a.count;
     for (int64_t agent = 0; agent < size; agent += LANES) {
@@ -234,10 +268,11 @@ void observe_agents(const AgentRows& a, int64_t first, int64_t last, const Agent
       agents.boxes = read_agents(box, velocity, agents.slot, agents.size);
       alignas(64) float values[kAgentRowColumns][LANES];
       write_motion(a, view, a.motion[4 * sample + kMotionSpeed], agents.boxes, values);
-      if (has_kind) write_kind(a, sample, agents, values);
-      if (is_on_path) write_route(a, agents.boxes, scratch.path, scratch.on_route, on_route, number_mask, values);
-      else if (has_path) __builtin_memset(values[kRouteAlong], 0, 4 * sizeof values[0]);
-      if (has_approach) write_approach(a, ego, agents.boxes, values);
+      if (has.kind) write_kind(a, sample, agents, values);
+      if (has.height) write_height(a, sample, agents, values);
+      if (has_route) write_route(a, agents.boxes, path, values);
+      else if (has.route) __builtin_memset(values[kRouteAlong], 0, 4 * sizeof values[0]);
+      if (has.approach) write_approach(a, ego, agents.boxes, values);
       for (int lane = 0; lane < agents.size; ++lane)
         for (int64_t i = 0; i < a.column_count; ++i) *row++ = values[a.columns[i]][lane];
     }
@@ -257,15 +292,16 @@ namespace drivax {
 static AgentScratch scratch_of(const AgentRows& a) {
   thread_local std::vector<float> floats;
   thread_local std::vector<int32_t> ints;
-  const size_t slots = a.slots + 16;
-  if (floats.size() < slots + 4 * a.offsets) floats.resize(slots + 4 * a.offsets);
-  if (ints.size() < slots + a.count + a.offsets + 1) ints.resize(slots + a.count + a.offsets + 1);
+  const size_t slots = a.slots + 16, offsets = a.offsets + 16;
+  if (floats.size() < slots + 3 * offsets) floats.resize(slots + 3 * offsets);
+  if (ints.size() < slots + offsets + a.count) ints.resize(slots + offsets + a.count);
   AgentScratch scratch;
   scratch.distance = floats.data();
-  scratch.path = scratch.distance + slots;
+  scratch.part = scratch.distance + slots;
+  scratch.xy = scratch.part + offsets;
   scratch.agent = ints.data();
-  scratch.nearest = scratch.agent + slots;
-  scratch.on_route = scratch.nearest + a.count;
+  scratch.element = scratch.agent + slots;
+  scratch.nearest = scratch.element + offsets;
   return scratch;
 }
 

@@ -44,52 +44,99 @@ namespace drivax::TARGET {
 enum RoadColumn { kPieceX, kPieceY, kPieceCos, kPieceSin, kPieceLength, kPieceLayer, kPieceLimit, kPieceColumns };
 enum RoadLayer { kLane, kEdge, kArea };
 
-// Writes the numbers of the first pieces in the box, and returns how many there are, at most `count`.
-INLINE int64_t find_pieces(const RoadRows& a, const float* at, const View& view, int32_t* found) {
-  const float *x = at, *y = at + a.pieces, *layer = at + 2 * a.pieces;
-  int64_t size = 0;
-  for (int64_t piece = 0; piece < a.pieces && size < a.count; piece += LANES) {
-    const int64_t rest = a.pieces - piece;
-    const Floats dx = load_first(x + piece, rest) - view.x, dy = load_first(y + piece, rest) - view.y;
-    const Floats ahead_m = ahead(view, dx, dy), left_m = left(view, dx, dy);
-    const Floats layers = load_first(layer + piece, rest);
-    Ints is_observed = {};
-    for (int64_t i = 0; i < a.layer_count; ++i) is_observed |= layers == (float)a.layers[i];
-    is_observed &= (ahead_m < a.ahead_m) & (ahead_m > -a.behind_m) & (absolute(left_m) < a.side_m);
-    if (rest < LANES) is_observed &= numbers() < (int32_t)rest;
-    for (uint32_t lanes = bits(is_observed); lanes; lanes &= lanes - 1)
-      found[size++] = (int32_t)piece + __builtin_ctz(lanes);
+// The layers that are observed; NaN, which equals nothing, in place of others.
+struct Layers {
+  float lane, edge, area;
+};
+
+INLINE Layers layers_of(const RoadRows& a) {
+  const float none = __builtin_nanf("");
+  Layers layers = {none, none, none};
+  for (int64_t i = 0; i < a.layer_count; ++i) {
+    if (a.layers[i] == kLane) layers.lane = kLane;
+    if (a.layers[i] == kEdge) layers.edge = kEdge;
+    if (a.layers[i] == kArea) layers.area = kArea;
   }
+  return layers;
+}
+
+// Returns a bit for each of a vector of pieces that is in the box.
+INLINE uint32_t observed(const RoadRows& a, const View& view, const Layers& layers, Floats x, Floats y, Floats layer) {
+  const Floats dx = x - view.x, dy = y - view.y, ahead_m = ahead(view, dx, dy), left_m = left(view, dx, dy);
+  const Ints is_inside = (ahead_m < a.ahead_m) & (ahead_m > -a.behind_m) & (absolute(left_m) < a.side_m);
+  return bits(is_inside & ((layer == layers.lane) | (layer == layers.edge) | (layer == layers.area)));
+}
+
+// Writes the numbers of the first pieces in the box, and returns how many there are, at most `count`.
+//
+// Memory takes most of the time: asks for the pieces found, which are scattered, and for the next scenario's positions.
+INLINE int64_t find_pieces(const RoadRows& a, int64_t scenario, int64_t next, const View& view, const Layers& layers,
+                           int32_t* found) {
+  const float *x = a.at + scenario * 3 * a.pieces, *y = x + a.pieces, *layer = y + a.pieces;
+  const float* pieces = a.road + scenario * a.pieces * kPieceColumns;
+  const float* next_at = a.at + next * 3 * a.pieces;
+  int64_t size = 0, piece = 0;
+  const auto append = [&](uint32_t lanes) __attribute__((always_inline)) {
+    for (; lanes; lanes &= lanes - 1) {
+      const int32_t number = (int32_t)piece + __builtin_ctz(lanes);
+      __builtin_prefetch(pieces + number * kPieceColumns);
+      __builtin_prefetch(pieces + number * kPieceColumns + kPieceColumns - 1);
+      found[size++] = number;
+    }
+  };
+  for (; piece + LANES <= a.pieces && size < a.count; piece += LANES) {
+    for (int i = 0; i < 3; ++i) __builtin_prefetch(next_at + i * a.pieces + piece);
+    append(observed(a, view, layers, load(x + piece), load(y + piece), load(layer + piece)));
+  }
+  const int64_t rest = a.pieces - piece;
+  if (rest && size < a.count)
+    append(observed(a, view, layers, load_first(x + piece, rest), load_first(y + piece, rest),
+                    load_first(layer + piece, rest)) & ((1u << rest) - 1));
   return size < a.count ? size : a.count;
 }
 
-INLINE void write_columns(const RoadRows& a, const View& view, const float* piece, float curvature, float* values) {
+// Factors to the units of columns.
+struct RoadUnits {
+  float per_position, per_piece, per_speed;
+};
+
+// Writes all columns but the curvature.
+INLINE void write_columns(const RoadUnits& units, const View& view, const float* piece, float* values) {
   const float dx = piece[kPieceX] - view.x, dy = piece[kPieceY] - view.y, limit = piece[kPieceLimit];
-  values[kX] = ahead(view, dx, dy) / a.position_m;
-  values[kY] = left(view, dx, dy) / a.position_m;
+  values[kX] = ahead(view, dx, dy) * units.per_position;
+  values[kY] = left(view, dx, dy) * units.per_position;
   values[kCos] = ahead(view, piece[kPieceCos], piece[kPieceSin]);
   values[kSin] = left(view, piece[kPieceCos], piece[kPieceSin]);
-  values[kLength] = piece[kPieceLength] / a.piece_m;
+  values[kLength] = piece[kPieceLength] * units.per_piece;
   values[kIsLane] = piece[kPieceLayer] == kLane;
   values[kIsEdge] = piece[kPieceLayer] == kEdge;
   values[kIsArea] = piece[kPieceLayer] == kArea;
-  values[kLimit] = limit > 0 ? limit / a.speed_mps : 0;
+  values[kLimit] = limit > 0 ? limit * units.per_speed : 0;
   values[kHasLimit] = limit > 0;
+}
+
+INLINE float scale_curvature(const RoadRows& a, float curvature) {
   const float scaled = curvature / a.curvature_pm;
-  values[kCurvature] = scaled < -a.max_curvature ? -a.max_curvature : scaled < a.max_curvature ? scaled : a.max_curvature;
+  return scaled < -a.max_curvature ? -a.max_curvature : scaled < a.max_curvature ? scaled : a.max_curvature;
 }
 
 void observe_road(const RoadRows& a, int64_t first, int64_t last, int32_t* found) {
+  const Layers layers = layers_of(a);
+  const RoadUnits units = {1 / a.position_m, 1 / a.piece_m, 1 / a.speed_mps};
+  bool has_curvature = false;
+  for (int64_t i = 0; i < a.column_count; ++i) has_curvature |= a.columns[i] == kCurvature;
   for (int64_t sample = first; sample < last; ++sample) {
     const int64_t scenario = clamp_row(a.index[sample], a.scenarios);
+    const int64_t next = clamp_row(a.index[sample + 1 < last ? sample + 1 : sample], a.scenarios);
     const View view = view_of(a.motion + 4 * sample, a.direction + 2 * sample);
-    const int64_t size = find_pieces(a, a.at + scenario * 3 * a.pieces, view, found);
+    const int64_t size = find_pieces(a, scenario, next, view, layers, found);
     float* row = a.rows + sample * a.count * a.column_count;
     bool* mask = a.mask + sample * a.count;
     for (int64_t i = 0; i < size; ++i) {
       const int64_t piece = scenario * a.pieces + found[i];
       float values[kRoadRowColumns];
-      write_columns(a, view, a.road + piece * kPieceColumns, a.curvature[piece], values);
+      write_columns(units, view, a.road + piece * kPieceColumns, values);
+      if (has_curvature) values[kCurvature] = scale_curvature(a, a.curvature[piece]);
       for (int64_t column = 0; column < a.column_count; ++column) *row++ = values[a.columns[column]];
     }
     __builtin_memset(row, 0, sizeof(float) * (a.count - size) * a.column_count);

@@ -98,6 +98,11 @@ void observe_route(const RouteRows& a, int64_t first, int64_t last) {
     const float* route = a.routes + number * a.points * kRouteColumns;
     const int32_t points = a.route_points[number];
     const float end_m = (float)(points - 1), route_m = a.route_m[sample];
+    if (sample + 1 < last) {
+      const float* next = a.routes + clamp_row(a.row[sample + 1], a.routes_count) * a.points * kRouteColumns;
+      for (int64_t i = 0; i < a.count; ++i)
+        __builtin_prefetch(place_on_route(next, a.points, a.route_m[sample + 1] + a.offsets_m[i]).row);
+    }
     const View view = view_of(a.motion + 4 * sample, a.direction + 2 * sample);
     float* row = a.rows + sample * a.count * a.column_count;
     bool* mask = a.mask + sample * a.count;
