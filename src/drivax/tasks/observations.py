@@ -237,7 +237,9 @@ def _agents(
     if config.steps == 1 and config.agents and kernels.in_use():
 
         def reference(bank: ScenarioBank, context: AgentContext, view: View, now: Frame) -> Observation:
-            return _agents(config, bank, context, view, lambda _, slots=None: now if slots is None else now.at(slots))
+            return _agents(
+                config, bank, context, view, lambda _, slots=None: now if slots is None else now.at(slots)
+            )
 
         native = kernels.with_reference(partial(_agents_natively, config), reference)
         return native(bank, context, view, now)
@@ -368,7 +370,11 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
 
 
 def _road_natively(
-    config: ObservationConfig, selected: Collection[str], bank: ScenarioBank, context: AgentContext, view: View
+    config: ObservationConfig,
+    selected: Collection[str],
+    bank: ScenarioBank,
+    context: AgentContext,
+    view: View,
 ) -> Observation:
     """Return the road group of :func:`_road` with the selected features."""
     layers = {RoadLayer.LANE: config.lanes, RoadLayer.EDGE: config.edges, RoadLayer.AREA: config.crosswalks}
