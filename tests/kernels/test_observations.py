@@ -34,7 +34,7 @@ CONFIGS = {
     "default": ObservationConfig(agents=33, steps=1, road=301, edges=False, road_side_m=80.0, route=17),
     "cut": ObservationConfig(agents=1, steps=1, road=60, road_cut=5, perception=Perception(noise_m=0.5), features=ALL),
 }  # fmt: skip
-SIZES = [(1, 1, 2), (3, 7, 9), (19, 33, 40), (40, 517, 130)]
+SIZES = [(1, 1, 2), (19, 33, 40), (40, 517, 130)]
 SAMPLES, MARGIN = 24, 1e-3
 
 
@@ -143,14 +143,14 @@ def assert_equal(actual, expected, clear_road, clear_agents):
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_random_arrays(name, size):
     config = CONFIGS[name]
-    for seed in range(6):
+    for seed in range(4):
         arrays = world(size, seed)
         expected = run(config, *arrays, natively=False)
         assert_equal(run(config, *arrays), expected, *is_clear(config, *arrays))
 
 
 def test_single_samples_and_nested_batches_equal_batches():
-    config, (bank, context, frame) = CONFIGS["all"], world(SIZES[2], 0)
+    config, (bank, context, frame) = CONFIGS["all"], world(SIZES[1], 0)
     expected = run(config, bank, context, frame)
     single = jax.jit(partial(observe, config))
     for number in range(3):

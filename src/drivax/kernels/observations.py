@@ -45,7 +45,9 @@ def observe_road(
     """Return the first ``count`` pieces of road of some ``layers`` in a box around ego.
 
     Args:
-        road_at, road, curvature: As in the bank.
+        road_at: Positions and layers of the bank's pieces.
+        road: These pieces.
+        curvature: Their ``road_curvature``.
         ego: The driven agent.
         count: Number of rows K.
         columns: Numbers of the columns F among all of the group.
