@@ -21,6 +21,8 @@ using Word = ffi::Buffer<ffi::U32>;
 using Bool = ffi::Buffer<ffi::PRED>;
 template <typename Buffer>
 using Result = ffi::Result<Buffer>;
+// An attribute: constants, such as columns.
+using Numbers = ffi::Span<const int32_t>;
 
 enum Target { kSse42, kAvx2, kAvx512 };
 // The instruction set that is in use; see library.cc.

@@ -26,6 +26,8 @@ from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, F
 
 #: Points ahead on the route: spacing (m), number, and number of rectangles around them.
 _STEP_M, _POINTS, _RECTANGLES = 2.0, 46, 9
+#: Largest distance along the route to the nearest of its points at which a pose is alongside it, m.
+ALONGSIDE_M = 2.0 * _STEP_M
 _FALLBACK_LIMIT_MPS = 13.4
 #: Free space next to the car, m; lateral acceleration in curves, m/s2; braking towards curves, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
@@ -171,7 +173,7 @@ def project(
     x, y = xy[:, 0] - point[:, 0], xy[:, 1] - point[:, 1]
     cos, sin = point[:, RouteColumn.COS], point[:, RouteColumn.SIN]
     forward, left = x * cos + y * sin, y * cos - x * sin
-    is_alongside = jnp.abs(forward) <= 2.0 * _STEP_M
+    is_alongside = jnp.abs(forward) <= ALONGSIDE_M
     relative_cos = heading[:, 0] * cos + heading[:, 1] * sin
     relative_sin = heading[:, 1] * cos - heading[:, 0] * sin
     return offsets[nearest] + forward, jnp.where(is_alongside, left, jnp.inf), relative_cos, relative_sin

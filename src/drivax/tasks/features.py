@@ -5,7 +5,7 @@ The columns of a group follow the order of :data:`COLUMNS`, not that of a config
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 
@@ -27,15 +27,17 @@ POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Unit of curvature, 1/m: a turn of 10 m radius is 1.
 CURVATURE_PM = 0.1
 #: Maximum of curvatures, in these units.
-_MAX_CURVATURE = 3.0
+MAX_CURVATURE = 3.0
 #: Points of the route on which agents are projected: position of the first relative to ego, m; spacing, m; number.
 _ROUTE_START_M, _ROUTE_STEP_M, _ROUTE_POINTS = -30.0, 2.0, 61
+#: Largest distance of the goal in each direction, in units of positions.
+MAX_GOAL = 5.0
 #: Maximum distance of an agent to either side of the route, m.
-_ROUTE_SIDE_M = 20.0
+ROUTE_SIDE_M = 20.0
 #: Horizon of times to overlap, s.
-_OVERLAP_S = 8.0
+OVERLAP_S = 8.0
 #: Half the distance over which the curvature of the route is measured, m.
-_HALF_WINDOW_M = 2.0
+HALF_WINDOW_M = 2.0
 
 _MOTION = {"position": ("x", "y"), "heading": ("sin", "cos"), "velocity": ("ahead", "left")}
 #: Columns of each feature of each group; "" for a feature with one column.
@@ -171,10 +173,10 @@ def concatenate_features(
     return jnp.concatenate([columns[name]() for name in selected], axis=-1)
 
 
-def columns_of(group: str, selected: Sequence[str]) -> list[int]:
-    """Return the indices of the selected features' columns among those of all default features."""
+def columns_of(group: str, selected: Collection[str], available: Sequence[str] | None = None) -> list[int]:
+    """Return the indices of the selected features' columns among those of the available ones: the default ones."""
     start, columns = 0, []
-    for name in getattr(Features(), group):
+    for name in getattr(Features(), group) if available is None else available:
         width = len(COLUMNS[group][name])
         columns += range(start, start + width) if name in selected else ()
         start += width
@@ -183,7 +185,7 @@ def columns_of(group: str, selected: Sequence[str]) -> list[int]:
 
 def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return a curvature (1/m) in units of 0.1 1/m, clipped to [-3, 3]."""
-    return jnp.clip(curvature / CURVATURE_PM, -_MAX_CURVATURE, _MAX_CURVATURE)
+    return jnp.clip(curvature / CURVATURE_PM, -MAX_CURVATURE, MAX_CURVATURE)
 
 
 def route_coordinates(
@@ -194,12 +196,17 @@ def route_coordinates(
     Positions are in units of 50 m and 5 m; left is at most 20 m, as for an agent that is not alongside the route. Zeros
     without a route.
     """
-    offsets = _ROUTE_START_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
+    offsets = projection_offsets()
     path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
     on_route &= context.route_m + offsets >= 0.0
     along, left, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
-    columns = [along / POSITION_M, jnp.clip(left, -_ROUTE_SIDE_M, _ROUTE_SIDE_M) / SIZE_M, sin, cos]
+    columns = [along / POSITION_M, jnp.clip(left, -ROUTE_SIDE_M, ROUTE_SIDE_M) / SIZE_M, sin, cos]
     return [jnp.where(has_route(bank, context), column, 0.0) for column in columns]
+
+
+def projection_offsets() -> Float[Array, " P"]:
+    """Return the places on the route on which agents are projected, relative to ego, m."""
+    return _ROUTE_START_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
 
 
 def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
@@ -218,7 +225,7 @@ def closing_speed(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], age
 
 def overlap_imminence(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"], agents: Frame) -> Array:
     """Return 1 - t / 8 s for the time t until agents overlap ego at constant velocity and heading; 0 from 8 s on."""
-    return 1.0 - time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, _OVERLAP_S) / _OVERLAP_S
+    return 1.0 - time_to_overlap(ego, ego_velocity, agents.box, agents.velocity, OVERLAP_S) / OVERLAP_S
 
 
 def route_curvature(
@@ -229,8 +236,8 @@ def route_curvature(
     The window is shorter at the ends of the route.
     """
     last = (bank.route_points[row] - 1).astype(jnp.float32)
-    start_m = jnp.clip(along_m - _HALF_WINDOW_M, 0.0, last)
-    end_m, zero = jnp.clip(along_m + _HALF_WINDOW_M, 0.0, last), jnp.zeros(())
+    start_m = jnp.clip(along_m - HALF_WINDOW_M, 0.0, last)
+    end_m, zero = jnp.clip(along_m + HALF_WINDOW_M, 0.0, last), jnp.zeros(())
     start, _ = route_ahead(bank, row, zero, start_m)
     end, _ = route_ahead(bank, row, zero, end_m)
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
@@ -248,7 +255,7 @@ def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
     """Return the goal (ego frame, m) in units of 50 m, both coordinates clipped to [-5, 5]."""
-    return jnp.clip(goal_m / POSITION_M, -5.0, 5.0)
+    return jnp.clip(goal_m / POSITION_M, -MAX_GOAL, MAX_GOAL)
 
 
 def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:

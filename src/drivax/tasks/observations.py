@@ -7,8 +7,9 @@ pieces by 10 m).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -16,14 +17,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.errors import UsageError, did_you_mean
+from drivax.kernels.observations import Ego, observe_agents, observe_road, observe_route
 from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S, AgentKind, LightState
-from drivax.simulator.ahead import has_route
+from drivax.simulator.ahead import ALONGSIDE_M, has_route
 from drivax.simulator.lights import is_red, is_yellow
-from drivax.simulator.types import HISTORY, MOTION_HEADING, MOTION_SPEED, AgentContext
+from drivax.simulator.types import HISTORY, MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 from drivax.tasks import features
 from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
 from drivax.tasks.own import check_unique, name_of
@@ -231,6 +234,15 @@ def _agents(
 ) -> Observation:
     """Return the group ``agents`` [agents, steps, F]: the nearest agents at the present step, nearest first."""
     now = frames(0)
+    if config.steps == 1 and config.agents and kernels.in_use():
+
+        def reference(bank: ScenarioBank, context: AgentContext, view: View, now: Frame) -> Observation:
+            return _agents(
+                config, bank, context, view, lambda _, slots=None: now if slots is None else now.at(slots)
+            )
+
+        native = kernels.with_reference(partial(_agents_natively, config), reference)
+        return native(bank, context, view, now)
     slots = now.valid.shape[0]
     others = now.valid & (jnp.arange(slots) != context.slot)
     dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
@@ -271,14 +283,44 @@ def _agents(
     return {name: jnp.moveaxis(values, 0, 1) for name, values in group.items()}
 
 
+def _agents_natively(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, now: Frame
+) -> Observation:
+    """Return the group ``agents`` of :func:`_agents` for one step."""
+    rules = {"kinds": _TYPES, "position_m": POSITION_M, "speed_mps": SPEED_MPS, "size_m": SIZE_M}
+    rules |= {"side_m": features.ROUTE_SIDE_M, "alongside_m": ALONGSIDE_M, "horizon_s": features.OVERLAP_S}
+    rows, mask = observe_agents(
+        bank.agent_box, (bank.routes, bank.route_points), (now.box, now.velocity, now.valid, now.kind),
+        _native_ego(bank, context, view), config.agents, _columns("agents", config.features.agents),
+        features.projection_offsets(), **rules,
+    )  # fmt: skip
+    return {"agents": rows[:, None], "agents_mask": mask[:, None]}
+
+
+def _native_ego(bank: ScenarioBank, context: AgentContext, view: View) -> Ego:
+    """Return what native kernels read of the driven agent."""
+    direction = jnp.stack([view.cos, view.sin])
+    place = context.index, context.row, context.slot, context.route_m, has_route(bank, context)
+    return Ego(*place, context.history[-1], direction)
+
+
+def _columns(group: str, selected: Collection[str]) -> list[int]:
+    """Return the indices of the selected features' columns among those of all features of a group."""
+    return features.columns_of(group, selected, tuple(COLUMNS[group]))
+
+
 def _road_group(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
 ) -> Observation:
     """Return the road group: pieces cut into rows, with noise, in the selected columns."""
     selected, has_noise = config.features.road, config.perception.noise_m > 0
+    is_whole = config.road_cut == 1 and not has_noise
+    if is_whole and kernels.in_use():
+        native = partial(_road_natively, config, selected)
+        return kernels.with_reference(native, partial(_road_group, config))(bank, context, view)
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
     group = _road(pieces, bank, context, view)
-    if config.road_cut == 1 and selected == Features().road and not has_noise:
+    if is_whole and selected == Features().road:
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
@@ -294,6 +336,9 @@ def _road_group(
 
 def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     """Return the road group with all default features, and the curvature if it is selected."""
+    if kernels.in_use():
+        native = partial(_road_natively, config, {*Features().road, *config.features.road})
+        return kernels.with_reference(native, partial(_road, config))(bank, context, view)
 
     def rotate(x: Array, y: Array) -> tuple[Array, Array]:
         """Return the components ahead and left; unlike :meth:`View.rotate`, which rounds differently."""
@@ -322,6 +367,25 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
     if "curvature" in config.features.road:
         columns.append(features.scale_curvature(bank.road_curvature[context.index, source]))
     return _masked_columns("road", columns, jnp.arange(config.road) < running[-1])
+
+
+def _road_natively(
+    config: ObservationConfig,
+    selected: Collection[str],
+    bank: ScenarioBank,
+    context: AgentContext,
+    view: View,
+) -> Observation:
+    """Return the road group of :func:`_road` with the selected features."""
+    layers = {RoadLayer.LANE: config.lanes, RoadLayer.EDGE: config.edges, RoadLayer.AREA: config.crosswalks}
+    rows, mask = observe_road(
+        bank.road_at, bank.road, bank.road_curvature, _native_ego(bank, context, view), config.road,
+        _columns("road", selected), [layer for layer, is_included in layers.items() if is_included],
+        ahead_m=float(config.road_ahead_m), behind_m=float(config.road_behind_m), side_m=float(config.road_side_m),
+        position_m=POSITION_M, piece_m=PIECE_M, speed_mps=SPEED_MPS, curvature_pm=features.CURVATURE_PM,
+        max_curvature=features.MAX_CURVATURE,
+    )  # fmt: skip
+    return {"road": rows, "road_mask": mask}
 
 
 def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
@@ -378,6 +442,9 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 
 def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     """Return the group ``route``: points ahead on the route; all masked without a route on lanes."""
+    if config.route and kernels.in_use():
+        native = partial(_route_natively, config)
+        return kernels.with_reference(native, partial(_route, config))(bank, context, view)
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, exists = route_ahead(bank, context.row, context.route_m, offsets)
     exists &= has_route(bank, context)
@@ -396,3 +463,17 @@ def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext,
         "goal": lambda: jnp.broadcast_to(features.goal_ahead(view.point(goal)), (config.route, 2)),
     }
     return _masked_group("route", features.concatenate_features(config.features.route, columns), exists)
+
+
+def _route_natively(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
+) -> Observation:
+    """Return the group ``route`` of :func:`_route`."""
+    offsets = jnp.arange(1, config.route + 1) * config.route_step_m
+    rows, mask = observe_route(
+        (bank.routes, bank.route_points), bank.goal, _native_ego(bank, context, view),
+        _columns("route", config.features.route), offsets, half_window_m=features.HALF_WINDOW_M,
+        position_m=POSITION_M, speed_mps=SPEED_MPS, curvature_pm=features.CURVATURE_PM,
+        max_curvature=features.MAX_CURVATURE, max_goal=features.MAX_GOAL,
+    )  # fmt: skip
+    return {"route": rows, "route_mask": mask}
