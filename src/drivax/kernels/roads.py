@@ -1,0 +1,115 @@
+"""Queries of lanes and road edges around the box of a vehicle.
+
+Constants are those of ``scenario.bank.queries``, whose functions pass them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.kernels.library import call, in_use
+
+
+class SegmentGrid(NamedTuple):
+    """Segments of all scenarios of a bank, sorted by the cells of their grids.
+
+    Attributes:
+        segments: Segments of lanes or of edges, by feature.
+        start: First segment of each cell, and the end.
+        origin: Smallest x, y of each grid.
+        cell_m, longest_run: Size of a cell; longest run of three neighbouring cells.
+        long_ego: Whether corners of some vehicle lie outside of the cells around its centre.
+    """
+
+    segments: Float[Array, "N features S"]
+    start: Int[Array, "N cells1"]
+    origin: Float[Array, "N 2"]
+    cell_m: float
+    longest_run: int
+    long_ego: bool
+
+    @property
+    def _arrays(self) -> tuple[Array, Array, Array]:
+        return self.segments, self.start, self.origin
+
+    @property
+    def _constants(self) -> dict[str, Any]:
+        return {
+            "cell_m": np.float32(self.cell_m),
+            "longest_run": np.int32(self.longest_run),
+            "long_ego": bool(self.long_ego),
+        }
+
+
+class Lanes(NamedTuple):
+    """Values of ``queries.LaneHits``; ``nearest_z`` is the height of the nearest lane, also if it is not near."""
+
+    near: Bool[Array, "*batch"]
+    corners_near: Bool[Array, "*batch 4"]
+    on_corridor: Bool[Array, "*batch"]
+    wrong_way: Bool[Array, "*batch"]
+    straddling: Bool[Array, "*batch"]
+    leaving_lane: Bool[Array, "*batch"]
+    limit: Float[Array, "*batch"]
+    nearest_z: Float[Array, "*batch"]
+
+
+def supports(grid: SegmentGrid, corners: Float[Array, "corners 2"], *others: Float[Array, "..."]) -> bool:
+    """Whether the native kernels are in use and have these types: single precision, and four corners."""
+    types = {array.dtype for array in (grid.segments, corners, *others)}
+    is_compiled = types == {jnp.dtype(jnp.float32)} and grid.start.dtype == jnp.int16 and len(corners) == 4
+    return is_compiled and in_use()
+
+
+def query_lanes(
+    grid: SegmentGrid, map_box: Float[Array, "N 4"], index: Int[Array, ""], ego: Int[Array, ""],
+    centre: Float[Array, "2"], heading: Float[Array, "2"], corners: Float[Array, "4 2"],
+    ground: Float[Array, ""], routed: Bool[Array, ""], **constants: float,
+) -> Lanes:  # fmt: skip
+    """Return what is known of the lanes around a box.
+
+    Args:
+        grid: Segments of lanes.
+        map_box: Smallest and largest x, y of each map.
+        index, ego: Number of the scenario; number of its ego whose corridor counts.
+        centre, heading, corners, ground: Pose of the box, and the height of the ground.
+        routed: Whether lanes of the corridor are driven before others.
+        constants: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
+    """
+    flag, number = (jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.bool_, jnp.float32))
+    corner_flags = jax.ShapeDtypeStruct((4,), jnp.bool_)
+    results = [flag, corner_flags, flag, flag, flag, flag, number, number]
+    common = jax.lax.stop_gradient([*grid._arrays, map_box])
+    batched = jax.lax.stop_gradient([index, ego, centre, heading, corners, ground, routed])
+    attributes = grid._constants | {name: np.float32(value) for name, value in constants.items()}
+    return Lanes(*call("query_lanes", results, common, batched, **attributes))
+
+
+def query_edges(
+    grid: SegmentGrid, sides: Int[Array, "N cells"], index: Int[Array, ""], centre: Float[Array, "2"],
+    corners: Float[Array, "4 2"], near_lane: Bool[Array, "4"], ground: Float[Array, ""], *,
+    cutoff_m: float, level_m: float, split: int, not_drivable: int,
+) -> Float[Array, "4"]:  # fmt: skip
+    """Return the distances of corners beyond the nearest edge, m: positive off the road.
+
+    Args:
+        grid: Segments of edges.
+        sides: Packed drivable sides of the parts of cells, ``split`` along each axis.
+        index: Number of the scenario.
+        centre, corners, ground: Centre and corners of the box, and the height of the ground.
+        near_lane: Whether a lane is near the corners.
+        cutoff_m, level_m: Largest distance, and difference in height, of edges that count.
+        split, not_drivable: Parts along a cell, and the code of those off the road.
+    """
+    results = [jax.ShapeDtypeStruct((4,), jnp.float32)]
+    batched = (index, centre, corners, near_lane, ground)
+    attributes = grid._constants | {
+        "cutoff_m": np.float32(cutoff_m), "level_m": np.float32(level_m),
+        "split": np.int32(split), "not_drivable": np.int32(not_drivable),
+    }  # fmt: skip
+    return call("query_edges", results, (*grid._arrays, sides), batched, **attributes)[0]
