@@ -93,6 +93,12 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
   const float* corner = q.corners + 2 * kCorners * sample;
   const Ints routed = splat(-(int32_t)q.routed[sample]);
   const float corridor_scale = (float)(1 << q.ego[sample]);
+  // Lanes further away than the farthest corner and all that counts there have no effect.
+  float corner_m = 0;
+  for (int c = 0; c < kCorners; ++c)
+    corner_m = larger(corner_m, squared(corner[2 * c] - x) + squared(corner[2 * c + 1] - y));
+  corner_m = square_root(corner_m);
+  const float least_reach_m = larger(q.goes_on_m, q.cutoff_m + corner_m);
   Visited v = {};
   v.driven = v.nearest = v.opposed = v.friendly = v.outside_m = far;
   for (int run = 0; run < kRuns; ++run) {
@@ -102,6 +108,8 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
       const Floats half_width = feature(q.grid, runs, kHalfWidth, i), limit = feature(q.grid, runs, kLimit, i);
       const Distances<Floats> centre = distances(segments, x, y);
       const Floats own = select(inside, centre.squared, far);
+      const Floats reach = larger(half_width + (q.margin_m + q.joint_m + corner_m), splat(least_reach_m));
+      if (!any(inside & (own <= reach * reach))) continue;
 
       const Floats aligned_cos = (segments.ux * cosine + segments.uy * sine) * segments.inverse_length;
       const Ints is_aligned = inside & (aligned_cos > 0.0f), is_against = aligned_cos < -kAgainstCos;
