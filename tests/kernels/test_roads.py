@@ -184,7 +184,7 @@ def poses_near(bank, count, rng, length_m=4.8):
     known = (ends > 0)[:, None] & (rng.random((maps, count)) < 0.9)
     middle = np.asarray(bank.grid_origin, np.float64)[:, None] + rng.uniform(-9, 60, (maps, count, 2))
     xy = np.where(known[..., None], start[..., :2], middle)
-    xy += rng.normal(size=xy.shape) * rng.choice([0.3, 2.0, 8.0], (maps, count, 1))
+    xy += rng.normal(size=xy.shape) * rng.choice([0.3, 0.8, 2.0, 8.0], (maps, count, 1))
     along = np.arctan2(start[..., 3] - start[..., 1], start[..., 2] - start[..., 0])
     turn = rng.choice([0.0, 0.3, 3.0], (maps, count)) * rng.normal(size=(maps, count))
     heading = along + turn + rng.choice([0.0, np.pi], (maps, count), p=[0.8, 0.2])
@@ -192,8 +192,8 @@ def poses_near(bank, count, rng, length_m=4.8):
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     box = jnp.asarray(np.concatenate([xy, direction, size], axis=-1), jnp.float32)
     index = np.broadcast_to(np.arange(maps, dtype=np.int32)[:, None], (maps, count))
-    ground = rng.choice([0.0, 0.3, 2.5, 7.0], (maps, count), p=[0.6, 0.2, 0.1, 0.1])
-    ground = np.where(known, start[..., LaneRow.Z], 0.0) * rng.integers(0, 2, (maps, count)) + ground
+    ground = rng.choice([0.0, 0.3, 2.5, 7.0], (maps, count), p=[0.7, 0.1, 0.1, 0.1])
+    ground = ground + np.where(known & (rng.random((maps, count)) < 0.8), start[..., LaneRow.Z], 0.0)
     return Poses(
         index=jnp.asarray(index),
         row=jnp.asarray(index * egos + rng.integers(0, egos, (maps, count)), jnp.int32),
@@ -268,8 +268,8 @@ def test_queries_of_random_maps_equal_those_of_xla(maps):
     results, excluded = fuzz(maps, 120, 8, 0)
     assert excluded <= 2
     for name in ("near", "points_near", "on_corridor", "wrong_way", "straddling", "leaving_lane"):
-        assert 0.005 < results[name].mean() < 0.995, name
-    assert len(np.unique(results["limit"])) == 4 and len(np.unique(results["offroad_m"])) > 500
+        assert 0.002 < results[name].mean() < 0.998, name
+    assert len(np.unique(results["limit"])) == 4 and len(np.unique(results["offroad_m"])) > 100
 
 
 @pytest.mark.slow
