@@ -343,7 +343,9 @@ def test_ground_along_proposals_equals_that_of_xla(worlds, every):
     heading = heading + curvature * speed * time
     steps = 0.1 * speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     xy = start[:, None, None, AgentColumn.XY] + np.cumsum(steps, axis=2)
-    motion = np.concatenate([xy, heading[..., None], np.broadcast_to(speed[..., None], (3, 6, 41, 1))], axis=-1)
+    motion = np.concatenate(
+        [xy, heading[..., None], np.broadcast_to(speed[..., None], (3, 6, 41, 1))], axis=-1
+    )
     z = np.broadcast_to(start[:, None, None, AgentColumn.Z] - 0.75, (3, 6, 41)).astype(np.float32)
     on_route, needs_lanes = rng.random((3, 6, 41)) < 0.9, rng.random((3, 6, 41)) < 0.1
     arguments = jnp.arange(3), motion.astype(np.float32), z, on_route, needs_lanes

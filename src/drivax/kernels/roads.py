@@ -76,8 +76,12 @@ def query_lanes(
     Args:
         grid: Segments of lanes.
         map_box: Smallest and largest x, y of each map.
-        index, ego: Number of the scenario; number of its ego whose corridor counts.
-        centre, heading, corners, ground: Pose of the box, and the height of the ground.
+        index: Number of the scenario.
+        ego: Number of its ego whose corridor counts.
+        centre: Centre of the box.
+        heading: Cosine and sine of its heading.
+        corners: Its corners.
+        ground: Height of the ground.
         routed: Whether lanes of the corridor are driven before others.
         constants: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
     """
@@ -86,8 +90,8 @@ def query_lanes(
     results = [flag, corner_flags, flag, flag, flag, flag, number, number]
     common = jax.lax.stop_gradient([*grid._arrays, map_box])
     batched = jax.lax.stop_gradient([index, ego, centre, heading, corners, ground, routed])
-    attributes = grid._constants | {name: np.float32(value) for name, value in constants.items()}
-    return Lanes(*call("query_lanes", results, common, batched, **attributes))
+    attributes: dict[str, Any] = {name: np.float32(value) for name, value in constants.items()}
+    return Lanes(*call("query_lanes", results, common, batched, **grid._constants, **attributes))
 
 
 def query_edges(
@@ -101,10 +105,14 @@ def query_edges(
         grid: Segments of edges.
         sides: Packed drivable sides of the parts of cells, ``split`` along each axis.
         index: Number of the scenario.
-        centre, corners, ground: Centre and corners of the box, and the height of the ground.
-        near_lane: Whether a lane is near the corners.
-        cutoff_m, level_m: Largest distance, and difference in height, of edges that count.
-        split, not_drivable: Parts along a cell, and the code of those off the road.
+        centre: Centre of the box.
+        corners: Its corners.
+        near_lane: Whether a lane is near each corner.
+        ground: Height of the ground.
+        cutoff_m: Largest distance of edges that count.
+        level_m: Largest difference in height of edges that count.
+        split: Number of parts along a cell.
+        not_drivable: Code of parts off the road.
     """
     results = [jax.ShapeDtypeStruct((4,), jnp.float32)]
     batched = (index, centre, corners, near_lane, ground)
