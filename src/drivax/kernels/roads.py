@@ -46,6 +46,15 @@ class SegmentGrid(NamedTuple):
         }
 
 
+class Box(NamedTuple):
+    """Box of a vehicle: centre, heading (cosine, sine) and corners, and the height of the ground."""
+
+    centre: Float[Array, "2"]
+    heading: Float[Array, "2"]
+    corners: Float[Array, "4 2"]
+    ground: Float[Array, ""]
+
+
 class Lanes(NamedTuple):
     """Values of ``queries.LaneHits``; ``nearest_z`` is the height of the nearest lane, also if it is not near."""
 
@@ -67,9 +76,8 @@ def supports(grid: SegmentGrid, corners: Float[Array, "corners 2"], *others: Flo
 
 
 def query_lanes(
-    grid: SegmentGrid, map_box: Float[Array, "N 4"], index: Int[Array, ""], ego: Int[Array, ""],
-    centre: Float[Array, "2"], heading: Float[Array, "2"], corners: Float[Array, "4 2"],
-    ground: Float[Array, ""], routed: Bool[Array, ""], **constants: float,
+    grid: SegmentGrid, map_box: Float[Array, "N 4"], index: Int[Array, ""], box: Box, ego: Int[Array, ""],
+    routed: Bool[Array, ""], **constants: float,
 ) -> Lanes:  # fmt: skip
     """Return what is known of the lanes around a box.
 
@@ -77,11 +85,8 @@ def query_lanes(
         grid: Segments of lanes.
         map_box: Smallest and largest x, y of each map.
         index: Number of the scenario.
-        ego: Number of its ego whose corridor counts.
-        centre: Centre of the box.
-        heading: Cosine and sine of its heading.
-        corners: Its corners.
-        ground: Height of the ground.
+        box: Pose of the box.
+        ego: Number of the ego of the scenario whose corridor counts.
         routed: Whether lanes of the corridor are driven before others.
         constants: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
     """
@@ -89,15 +94,15 @@ def query_lanes(
     corner_flags = jax.ShapeDtypeStruct((4,), jnp.bool_)
     results = [flag, corner_flags, flag, flag, flag, flag, number, number]
     common = jax.lax.stop_gradient([*grid._arrays, map_box])
-    batched = jax.lax.stop_gradient([index, ego, centre, heading, corners, ground, routed])
+    batched = jax.lax.stop_gradient([index, ego, *box, routed])
     attributes: dict[str, Any] = {name: np.float32(value) for name, value in constants.items()}
     return Lanes(*call("query_lanes", results, common, batched, **grid._constants, **attributes))
 
 
 def query_edges(
     grid: SegmentGrid, sides: Int[Array, "N cells"], index: Int[Array, ""], centre: Float[Array, "2"],
-    corners: Float[Array, "4 2"], near_lane: Bool[Array, "4"], ground: Float[Array, ""], *,
-    cutoff_m: float, level_m: float, split: int, not_drivable: int,
+    corners: Float[Array, "4 2"], near_lane: Bool[Array, "4"], ground: Float[Array, ""],
+    **constants: float | int,
 ) -> Float[Array, "4"]:  # fmt: skip
     """Return the distances of corners beyond the nearest edge, m: positive off the road.
 
@@ -109,15 +114,11 @@ def query_edges(
         corners: Its corners.
         near_lane: Whether a lane is near each corner.
         ground: Height of the ground.
-        cutoff_m: Largest distance of edges that count.
-        level_m: Largest difference in height of edges that count.
-        split: Number of parts along a cell.
-        not_drivable: Code of parts off the road.
+        constants: ``cutoff_m``, ``level_m``, and of the parts of cells ``split`` and ``not_drivable``.
     """
     results = [jax.ShapeDtypeStruct((4,), jnp.float32)]
     batched = (index, centre, corners, near_lane, ground)
-    attributes = grid._constants | {
-        "cutoff_m": np.float32(cutoff_m), "level_m": np.float32(level_m),
-        "split": np.int32(split), "not_drivable": np.int32(not_drivable),
-    }  # fmt: skip
-    return call("query_edges", results, (*grid._arrays, sides), batched, **attributes)[0]
+    attributes: dict[str, Any] = {
+        name: (np.int32 if isinstance(value, int) else np.float32)(value) for name, value in constants.items()
+    }
+    return call("query_edges", results, (*grid._arrays, sides), batched, **grid._constants, **attributes)[0]

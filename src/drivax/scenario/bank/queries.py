@@ -172,9 +172,15 @@ def around_lanes(
     highest limit, lanes of the corridor of the route ``row`` before others if it is ``routed``. Without such lanes it
     drives the nearest within 30 degrees, else the nearest within 90 degrees.
     """
-    grid = _lane_grid(bank)
-    if roads.supports(grid, points, centre, heading, z):
-        return _native_lanes(bank, grid, index, centre, heading, points, z, routed, row)
+    if roads.supports(_lane_grid(bank), points, centre, heading, z):
+        return _native_lanes(bank, index, roads.Box(centre, heading, points, z), routed, row)
+    return _xla_lanes(bank, index, centre, heading, points, z, routed, row)
+
+
+def _xla_lanes(
+    bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""], row: Any,
+) -> LaneHits:  # fmt: skip
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & is_level(rows[LaneRow.Z], z)
     box = jnp.concatenate([centre[None], points])
@@ -228,14 +234,13 @@ def around_lanes(
 
 
 def _native_lanes(
-    bank: ScenarioBank, grid: roads.SegmentGrid, index: Integer, centre: Vector, heading: Vector,
-    points: Float[Array, "4 2"], z: Scalar, routed: bool | Bool[Array, ""], row: Any,
-) -> LaneHits:  # fmt: skip
+    bank: ScenarioBank, index: Integer, box: roads.Box, routed: bool | Bool[Array, ""], row: Any
+) -> LaneHits:
     """Return :func:`around_lanes` by the native kernel."""
     lanes = roads.query_lanes(
-        grid, bank.map_box, jnp.asarray(index, jnp.int32), jnp.asarray(bank.ego_number(row), jnp.int32),
-        centre, heading, points, z, jnp.asarray(routed), cutoff_m=LANE_CUTOFF_M, level_m=LEVEL_M,
-        margin_m=LANE_MARGIN_M, goes_on_m=_GOES_ON_M, joint_m=_JOINT_M, parallel_cos=_FITS,
+        _lane_grid(bank), bank.map_box, jnp.asarray(index, jnp.int32), box,
+        jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), cutoff_m=LANE_CUTOFF_M,
+        level_m=LEVEL_M, margin_m=LANE_MARGIN_M, goes_on_m=_GOES_ON_M, joint_m=_JOINT_M, parallel_cos=_FITS,
     )  # fmt: skip
     return LaneHits(
         near=lanes.near,
@@ -245,7 +250,7 @@ def _native_lanes(
         straddling=lanes.straddling,
         leaving_lane=lanes.leaving_lane,
         limit=lanes.limit,
-        z=jnp.where(lanes.near, lanes.nearest_z, z),
+        z=jnp.where(lanes.near, lanes.nearest_z, box.ground),
     )
 
 
