@@ -4,8 +4,9 @@
 // no templates of the standard library: a linker could choose the copy that was compiled for the largest target.
 #pragma once
 
-// GCC 12 warns of its own header: __builtin_undefined.
+// GCC's headers use undefined values on purpose.
 #pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wuninitialized"
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #include <immintrin.h>
 #pragma GCC diagnostic pop
@@ -83,6 +84,12 @@ INLINE float smallest(Floats values) {
   return _mm_cvtss_f32(_mm_min_ss(half, _mm_shuffle_ps(half, half, 1)));
 }
 #endif
+
+INLINE float square_root(float value) { return __builtin_sqrtf(value); }
+INLINE float larger(float a, float b) { return a > b ? a : b; }
+INLINE float smaller(float a, float b) { return a < b ? a : b; }
+INLINE float clamp(float value, float low, float high) { return smaller(larger(value, low), high); }
+INLINE float absolute(float value) { return __builtin_fabsf(value); }
 
 INLINE float largest(Floats values) { return -smallest(-values); }
 INLINE bool any(Ints mask) { return bits(mask) != 0; }

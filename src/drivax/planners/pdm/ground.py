@@ -2,6 +2,7 @@
 
 The queries of the grid read padded cells, many times as many segments as are near. Along proposals, which share a path,
 the segments near the path are selected once and sorted along it; groups of neighbouring poses read short runs of them.
+Native kernels read no padding and look up every pose in the grid.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax import kernels
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm
 from drivax.planners.pdm.forecast import boxes_of
@@ -76,17 +78,21 @@ def ground_along(
     count = len(motion)
     box, z, on_route = (values[:, ::every] for values in (boxes_of(motion, size), z, on_route))
     box, z, on_route = box.reshape(-1, 6), z.reshape(-1), on_route.reshape(-1)
+
+    def each_step(value: Array) -> Array:
+        value = value.reshape(count, -1)
+        return jnp.concatenate([value[:, :1], jnp.repeat(value[:, 1:], every, axis=1)], axis=1)
+
+    if kernels.in_use():
+        return jax.tree.map(each_step, jax.vmap(partial(ground_at, bank, row))(box, z, on_route))
     any_needs_lanes = needs_lanes[:, 1:].reshape(count, -1, every).any(axis=2)
     needs_lanes = jnp.concatenate([needs_lanes[:, :1], any_needs_lanes], axis=1).reshape(-1)
     ground, is_exact = _look_up_sorted(bank, row, box, z, count)
     needs_query = ~is_exact | ~(bank.on_lanes[row] & on_route) | needs_lanes
     exact = map_where(needs_query, partial(ground_at, bank, row), box, z, on_route)
 
-    def each_step(value: Array, exact: Array) -> Array:
-        value = jnp.where(needs_query, exact, value).reshape(count, -1)
-        return jnp.concatenate([value[:, :1], jnp.repeat(value[:, 1:], every, axis=1)], axis=1)
-
-    return jax.tree.map(each_step, ground, exact)
+    ground = jax.tree.map(partial(jnp.where, needs_query), exact, ground)
+    return jax.tree.map(each_step, ground)
 
 
 def _look_up_sorted(

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm, root
+from drivax.kernels import roads
 from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn, StrandColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
@@ -173,6 +174,15 @@ def around_lanes(
     highest limit, lanes of the corridor of the route ``row`` before others if it is ``routed``. Without such lanes it
     drives the nearest within 30 degrees, else the nearest within 90 degrees.
     """
+    if roads.supports(_lane_grid(bank), points, centre, heading, z):
+        return _native_lanes(bank, index, roads.Box(centre, heading, points, z), routed, row)
+    return _xla_lanes(bank, index, centre, heading, points, z, routed, row)
+
+
+def _xla_lanes(
+    bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
+    points: Float[Array, "P 2"], z: Scalar, routed: bool | Bool[Array, ""], row: Any,
+) -> LaneHits:  # fmt: skip
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & is_level(rows[LaneRow.Z], z)
     box = jnp.concatenate([centre[None], points])
@@ -222,6 +232,27 @@ def around_lanes(
         leaving_lane=has_lane & (outside_m > LANE_MARGIN_M),
         limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
         z=jnp.where(near, nearest[LaneRow.Z], z),
+    )
+
+
+def _native_lanes(
+    bank: ScenarioBank, index: Integer, box: roads.Box, routed: bool | Bool[Array, ""], row: Any
+) -> LaneHits:
+    """Return :func:`around_lanes` by the native kernel."""
+    lanes = roads.query_lanes(
+        _lane_grid(bank), bank.map_box, jnp.asarray(index, jnp.int32), box,
+        jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), cutoff_m=LANE_CUTOFF_M,
+        level_m=LEVEL_M, margin_m=LANE_MARGIN_M, goes_on_m=_GOES_ON_M, joint_m=_JOINT_M, parallel_cos=_FITS,
+    )  # fmt: skip
+    return LaneHits(
+        near=lanes.near,
+        points_near=lanes.corners_near,
+        on_corridor=lanes.on_corridor,
+        wrong_way=lanes.wrong_way,
+        straddling=lanes.straddling,
+        leaving_lane=lanes.leaving_lane,
+        limit=lanes.limit,
+        z=jnp.where(lanes.near, lanes.nearest_z, box.ground),
     )
 
 
@@ -297,6 +328,16 @@ def offroad_distance(
     Without an edge within the cut-off the stored side decides, and if that is unknown, whether a lane centre is near;
     the distance is then plus or minus the cut-off.
     """
+    arguments = bank, index, centre, points, points_near_lane, z
+    if roads.supports(_edge_grid(bank), points, centre, z):
+        return _native_offroad_distance(*arguments)
+    return _xla_offroad_distance(*arguments)
+
+
+def _xla_offroad_distance(
+    bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "P 2"],
+    points_near_lane: Bool[Array, " P"], z: Scalar,
+) -> Float[Array, " P"]:  # fmt: skip
     if bank.long_ego:
         look = jax.vmap(lambda p: left_of_edges(bank, index, p, p[None], z))
         left, known = (part[:, 0] for part in look(points))
@@ -304,6 +345,35 @@ def offroad_distance(
         left, known = left_of_edges(bank, index, centre, points, z)
     distance, is_known = offroad_by_edges(bank, index, points, left, known)
     return jnp.where(is_known, distance, jnp.where(points_near_lane, -EDGE_CUTOFF_M, EDGE_CUTOFF_M))
+
+
+@jax.custom_jvp
+def _native_offroad_distance(
+    bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "4 2"],
+    points_near_lane: Bool[Array, "4"], z: Scalar,
+) -> Float[Array, "4"]:  # fmt: skip
+    """Return :func:`offroad_distance` by the native kernel; derivatives are those of XLA."""
+    return roads.query_edges(
+        _edge_grid(bank), bank.grid_side, jnp.asarray(index, jnp.int32), centre, points, points_near_lane, z,
+        cutoff_m=EDGE_CUTOFF_M, level_m=LEVEL_M, split=SPLIT, not_drivable=NOT_DRIVABLE,
+    )  # fmt: skip
+
+
+@_native_offroad_distance.defjvp
+def _differentiate_offroad_distance(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    return jax.jvp(_xla_offroad_distance, primals, tangents)
+
+
+def _edge_grid(bank: ScenarioBank) -> roads.SegmentGrid:
+    return roads.SegmentGrid(
+        bank.edges, bank.grid_edge, bank.grid_origin, bank.cell_m, bank.edge_run, bank.long_ego
+    )
+
+
+def _lane_grid(bank: ScenarioBank) -> roads.SegmentGrid:
+    return roads.SegmentGrid(
+        bank.lanes, bank.grid_lane, bank.grid_origin, bank.cell_m, bank.lane_run, bank.long_ego
+    )
 
 
 def offroad_by_edges(

@@ -1,0 +1,264 @@
+// The lanes around the box of a vehicle: drivax.scenario.bank.queries.around_lanes.
+//
+// One pass over the lanes in the cells around the centre finds all values. The driven and the nearest lane, which the
+// minima of keys name, are then measured again.
+#include "segments.h"
+#include "smallest.h"
+
+namespace drivax {
+
+struct LaneQuery {
+  SegmentGrid grid;          // of lanes, with the features of drivax.scenario.bank.columns.LaneRow
+  const float* map_box;      // [scenarios, 4]: smallest and largest x, y
+  const int32_t* scenario;   // [batch]
+  const int32_t* ego;        // [batch]: number of the ego whose corridor counts
+  const float* centre;       // [batch, 2]
+  const float* heading;      // [batch, 2]: cosine and sine
+  const float* corners;      // [batch, 4, 2]
+  const float* ground;       // [batch]: height
+  const bool* routed;        // [batch]: whether lanes of the corridor are driven before others
+  float cutoff_m, level_m, margin_m, goes_on_m, joint_m, parallel_cos;
+  bool long_ego;             // corners are outside of the cells around the centre: read those around each
+  // Results; see queries.LaneHits.
+  bool* near;                // [batch]
+  bool* corners_near;        // [batch, 4]
+  bool* on_corridor;         // [batch], as the following
+  bool* wrong_way;
+  bool* straddling;
+  bool* leaving_lane;
+  float* limit;
+  float* nearest_z;
+};
+
+EACH_TARGET(void query_lanes(const LaneQuery& query, int64_t first, int64_t last);)
+
+}  // namespace drivax
+
+#ifdef TARGET
+
+namespace drivax::TARGET {
+
+constexpr int kCorners = 4;
+enum LaneRow { kHeight = 4, kHalfWidth, kLimit, kLane };
+// Cosine of 45 degrees: lanes that lead further away from the opposite direction are not driven against.
+constexpr float kAgainstCos = 0.70710678118654752f;
+
+INLINE float squared(float value) { return value * value; }
+
+// What is known of the lanes that were visited.
+struct Visited {
+  // Keys of the lane that is driven, and of the nearest, in each element of the vectors.
+  Floats driven, nearest;
+  // Smallest squared distances to lanes against and in the direction; smallest width outside of a lane.
+  Floats opposed, friendly, outside_m;
+  Ints on_corridor;
+  Ints corner_near[kCorners], corner_held[kCorners];
+};
+
+// One lane, measured alone.
+struct Lane {
+  bool exists;
+  Segments<float> segment;
+  float squared, height, half_width, limit;
+  float side[kCorners];
+};
+
+INLINE Lane lane_of(const LaneQuery& q, const Runs& runs, float key, int64_t stride, int bits, int64_t sample) {
+  Lane lane = {};
+  lane.exists = key < kFar / 2;
+  if (!lane.exists) return lane;
+  const int64_t number = number_of(key, bits), run = number / stride;
+  const float* features = runs.segments + runs.begin[run] + number - run * stride;
+  const int64_t size = q.grid.size;
+  lane.segment = segments_between(features[0], features[size], features[2 * size], features[3 * size]);
+  lane.squared = distances(lane.segment, q.centre[2 * sample], q.centre[2 * sample + 1]).squared;
+  lane.height = features[kHeight * size];
+  lane.half_width = features[kHalfWidth * size];
+  lane.limit = features[kLimit * size];
+  const float* corner = q.corners + 2 * kCorners * sample;
+  for (int c = 0; c < kCorners; ++c) lane.side[c] = distances(lane.segment, corner[2 * c], corner[2 * c + 1]).side;
+  return lane;
+}
+
+// Whether the index of a lane, scaled by a power of two, says that it is in the corridor of an ego.
+INLINE Ints in_corridor(Floats code, float scale) {
+  const Floats scaled = code * scale;
+  return scaled - as_floats(as_ints(scaled)) >= 0.5f;  // Codes are not negative.
+}
+
+INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride, int bits, int64_t sample) {
+  const Floats far = splat(kFar);
+  const float x = q.centre[2 * sample], y = q.centre[2 * sample + 1];
+  const float cosine = q.heading[2 * sample], sine = q.heading[2 * sample + 1], ground = q.ground[sample];
+  const float* corner = q.corners + 2 * kCorners * sample;
+  const Ints routed = splat(-(int32_t)q.routed[sample]);
+  const float corridor_scale = (float)(1 << q.ego[sample]);
+  // Lanes further away than the farthest corner and all that counts there have no effect.
+  float corner_m = 0;
+  for (int c = 0; c < kCorners; ++c)
+    corner_m = larger(corner_m, squared(corner[2 * c] - x) + squared(corner[2 * c + 1] - y));
+  corner_m = square_root(corner_m);
+  const float least_reach_m = larger(q.goes_on_m, q.cutoff_m + corner_m);
+  Visited v = {};
+  v.driven = v.nearest = v.opposed = v.friendly = v.outside_m = far;
+  for (int run = 0; run < kRuns; ++run) {
+    for (int64_t i = runs.begin[run]; i < runs.end[run]; i += LANES) {
+      const Ints inside = is_inside(q.grid, runs, run, i, ground, q.level_m);
+      const Segments<Floats> segments = segments_at(q.grid, runs, i);
+      const Floats half_width = feature(q.grid, runs, kHalfWidth, i), limit = feature(q.grid, runs, kLimit, i);
+      const Distances<Floats> centre = distances(segments, x, y);
+      const Floats own = select(inside, centre.squared, far);
+      const Floats reach = larger(half_width + (q.margin_m + q.joint_m + corner_m), splat(least_reach_m));
+      if (!any(inside & (own <= reach * reach))) continue;
+
+      const Floats aligned_cos = (segments.ux * cosine + segments.uy * sine) * segments.inverse_length;
+      const Ints is_aligned = inside & (aligned_cos > 0.0f), is_against = aligned_cos < -kAgainstCos;
+      const Ints holds_centre = inside & (own <= half_width * half_width);
+      const Ints is_alongside = inside & (own - centre.side * centre.side <= squared(q.joint_m));
+      const Ints is_parallel = is_alongside & (aligned_cos > q.parallel_cos);
+      const Ints is_corridor = inside & in_corridor(feature(q.grid, runs, kLane, i), corridor_scale);
+
+      // By limit, on the route first; without lanes that hold the centre the nearest, parallel ones first.
+      const Floats by_limit = select(is_corridor & routed, Floats{}, splat(0.2f)) + 1e-3f * (100.0f - limit);
+      const Floats by_distance =
+          select(is_parallel & (own <= squared(q.cutoff_m)), splat(1.0f), splat(100.0f)) + own;
+      const Floats rank = select(is_parallel & holds_centre, by_limit, select(is_aligned, by_distance, far));
+      const Ints number = numbers() + (int32_t)(run * stride + i - runs.begin[run]);
+      v.driven = smaller(v.driven, embed_numbers(select(inside, rank, far), number, bits));
+      v.nearest = smaller(v.nearest, embed_numbers(own, number, bits));
+      v.opposed = smaller(v.opposed, select(is_against & holds_centre, own, far));
+      v.friendly = smaller(v.friendly, select(is_aligned, own, far));
+
+      const Floats widened = (half_width + q.margin_m) * (half_width + q.margin_m);
+      v.on_corridor |= is_corridor & (own <= widened);
+      Floats widest = {};
+#pragma GCC unroll 4
+      for (int c = 0; c < kCorners; ++c) {
+        const Distances<Floats> distance = distances(segments, corner[2 * c], corner[2 * c + 1]);
+        v.corner_near[c] |= inside & (distance.squared <= squared(q.cutoff_m));
+        v.corner_held[c] |= is_aligned & (distance.squared <= widened);
+        widest = larger(widest, absolute(distance.side));
+      }
+      v.outside_m = smaller(v.outside_m, select(is_aligned & is_alongside, widest - half_width, far));
+    }
+  }
+  return v;
+}
+
+// Looks up the lanes around one corner of a long vehicle.
+INLINE void visit_corner(const LaneQuery& q, int64_t scenario, int64_t sample, int c, Visited& v) {
+  const float* corner = q.corners + 2 * (kCorners * sample + c);
+  const float cosine = q.heading[2 * sample], sine = q.heading[2 * sample + 1];
+  const Runs runs = runs_around(q.grid, scenario, corner);
+  v.corner_near[c] = v.corner_held[c] = Ints{};
+  for (int run = 0; run < kRuns; ++run) {
+    for (int64_t i = runs.begin[run]; i < runs.end[run]; i += LANES) {
+      const Ints inside = is_inside(q.grid, runs, run, i, q.ground[sample], q.level_m);
+      const Segments<Floats> segments = segments_at(q.grid, runs, i);
+      const Floats distance = distances(segments, corner[0], corner[1]).squared;
+      const Floats reach = feature(q.grid, runs, kHalfWidth, i) + q.margin_m;
+      v.corner_near[c] |= inside & (distance <= squared(q.cutoff_m));
+      v.corner_held[c] |=
+          inside & (segments.ux * cosine + segments.uy * sine > 0.0f) & (distance <= reach * reach);
+    }
+  }
+}
+
+INLINE void write_hits(const LaneQuery& q, int64_t scenario, int64_t sample, const Visited& v, const Lane& driven,
+                       const Lane& nearest) {
+  const float* corner = q.corners + 2 * kCorners * sample;
+  const float* box = q.map_box + 4 * scenario;
+  bool straddling = false;
+  float widest = 0;
+  for (int c = 0; c < kCorners; ++c) {
+    const float x = corner[2 * c], y = corner[2 * c + 1];
+    const bool is_outside_box = x < box[0] || y < box[1] || x > box[2] || y > box[3];
+    const bool goes_on = !nearest.exists || absolute(nearest.side[c]) <= q.cutoff_m ||
+                         nearest.squared > squared(q.goes_on_m);
+    q.corners_near[kCorners * sample + c] = any(v.corner_near[c]) || (is_outside_box && goes_on);
+    straddling |= !any(v.corner_held[c]);
+    widest = larger(widest, absolute(driven.side[c]));
+  }
+  const float along = driven.segment.ux * q.heading[2 * sample] + driven.segment.uy * q.heading[2 * sample + 1];
+  const bool has_lane = driven.exists && driven.squared <= squared(q.cutoff_m) && along > 0;
+  const float outside_m = smaller(smallest(v.outside_m), widest - driven.half_width);
+  const float opposed = smallest(v.opposed);
+  q.near[sample] = nearest.exists && nearest.squared <= squared(q.cutoff_m);
+  q.on_corridor[sample] = any(v.on_corridor);
+  q.wrong_way[sample] = opposed < kFar / 2 && opposed < smallest(v.friendly);
+  q.straddling[sample] = straddling;
+  q.leaving_lane[sample] = has_lane && outside_m > q.margin_m;
+  q.limit[sample] = has_lane ? driven.limit : -1.0f;
+  q.nearest_z[sample] = nearest.height;
+}
+
+void query_lanes(const LaneQuery& q, int64_t first, int64_t last) {
+  // Numbers as in the concatenated runs of queries.lanes_around.
+  const int64_t stride = q.grid.side == 1 ? q.grid.size : q.grid.longest_run;
+  const int bits = bits_for(q.grid.side == 1 ? stride : kRuns * stride);
+  for (int64_t sample = first; sample < last; ++sample) {
+    const int64_t scenario = scenario_at(q.grid, q.scenario[sample]);
+    prefetch_next(q.grid, q.scenario, q.centre, sample, last);
+    const Runs runs = runs_around(q.grid, scenario, q.centre + 2 * sample);
+    Visited visited = visit_lanes(q, runs, stride, bits, sample);
+    if (q.long_ego)
+      for (int c = 0; c < kCorners; ++c) visit_corner(q, scenario, sample, c, visited);
+    const Lane driven = lane_of(q, runs, smallest(visited.driven), stride, bits, sample);
+    const Lane nearest = lane_of(q, runs, smallest(visited.nearest), stride, bits, sample);
+    write_hits(q, scenario, sample, visited, driven, nearest);
+  }
+}
+
+}  // namespace drivax::TARGET
+
+#else
+
+namespace drivax {
+
+static ffi::Error query_lanes(ffi::ThreadPool pool, Float lanes, Short start, Float origin, Float map_box,
+                              Int scenario, Int ego, Float centre, Float heading, Float corners, Float ground,
+                              Bool routed, float cell_m, int32_t longest_run, bool long_ego, float cutoff_m,
+                              float level_m, float margin_m, float goes_on_m, float joint_m, float parallel_cos,
+                              Result<Bool> near, Result<Bool> corners_near, Result<Bool> on_corridor,
+                              Result<Bool> wrong_way, Result<Bool> straddling, Result<Bool> leaving_lane,
+                              Result<Float> limit, Result<Float> nearest_z) {
+  LaneQuery q;
+  q.grid = segment_grid(lanes, start, origin, cell_m, longest_run);
+  q.map_box = map_box.typed_data();
+  q.scenario = scenario.typed_data();
+  q.ego = ego.typed_data();
+  q.centre = centre.typed_data();
+  q.heading = heading.typed_data();
+  q.corners = corners.typed_data();
+  q.ground = ground.typed_data();
+  q.routed = routed.typed_data();
+  q.cutoff_m = cutoff_m;
+  q.level_m = level_m;
+  q.margin_m = margin_m;
+  q.goes_on_m = goes_on_m;
+  q.joint_m = joint_m;
+  q.parallel_cos = parallel_cos;
+  q.long_ego = long_ego;
+  q.near = near->typed_data();
+  q.corners_near = corners_near->typed_data();
+  q.on_corridor = on_corridor->typed_data();
+  q.wrong_way = wrong_way->typed_data();
+  q.straddling = straddling->typed_data();
+  q.leaving_lane = leaving_lane->typed_data();
+  q.limit = limit->typed_data();
+  q.nearest_z = nearest_z->typed_data();
+  divide(pool, scenario.element_count(), 64, [&](int64_t first, int64_t last) { CALL(query_lanes, q, first, last); });
+  return ffi::Error::Success();
+}
+
+BIND(query_lanes, query_lanes,
+     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Short>().Arg<Float>().Arg<Float>()
+     .Arg<Int>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>()
+     .Attr<float>("cell_m").Attr<int32_t>("longest_run").Attr<bool>("long_ego").Attr<float>("cutoff_m")
+     .Attr<float>("level_m").Attr<float>("margin_m").Attr<float>("goes_on_m").Attr<float>("joint_m")
+     .Attr<float>("parallel_cos")
+     .Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Float>().Ret<Float>())
+
+}  // namespace drivax
+
+#endif
