@@ -3,7 +3,6 @@
 // One pass over the lanes in the cells around the centre finds all values. The driven and the nearest lane, which the
 // minima of keys name, are then measured again.
 #include "segments.h"
-#include "smallest.h"
 
 namespace drivax {
 
@@ -35,6 +34,8 @@ EACH_TARGET(void query_lanes(const LaneQuery& query, int64_t first, int64_t last
 }  // namespace drivax
 
 #ifdef TARGET
+
+#include "order.h"
 
 namespace drivax::TARGET {
 
@@ -124,8 +125,8 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
           select(is_parallel & (own <= squared(q.cutoff_m)), splat(1.0f), splat(100.0f)) + own;
       const Floats rank = select(is_parallel & holds_centre, by_limit, select(is_aligned, by_distance, far));
       const Ints number = numbers() + (int32_t)(run * stride + i - runs.begin[run]);
-      v.driven = smaller(v.driven, embed_numbers(select(inside, rank, far), number, bits));
-      v.nearest = smaller(v.nearest, embed_numbers(own, number, bits));
+      v.driven = smaller(v.driven, embed_numbers(comparable(select(inside, rank, far)), number, bits));
+      v.nearest = smaller(v.nearest, embed_numbers(comparable(own), number, bits));
       v.opposed = smaller(v.opposed, select(is_against & holds_centre, own, far));
       v.friendly = smaller(v.friendly, select(is_aligned, own, far));
 

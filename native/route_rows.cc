@@ -42,8 +42,6 @@ namespace drivax::TARGET {
 // What is read of each point, before it is transformed.
 enum RoutePointField { kPointX, kPointY, kPointCos, kPointSin, kPointLimit, kWindow, kTurnCross, kTurnDot, kFields };
 
-INLINE float clip(float value, float low, float high) { return value < low ? low : value < high ? value : high; }
-
 INLINE void read_point(const RouteRows& a, const float* route, float along_m, bool has_curvature, float end_m,
                        float (*fields)[LANES], int lane) {
   const RoutePlace place = place_on_route(route, a.points, along_m);
@@ -53,7 +51,7 @@ INLINE void read_point(const RouteRows& a, const float* route, float along_m, bo
   fields[kPointSin][lane] = place[kRouteSin];
   fields[kPointLimit][lane] = place.row[kRouteLimit];
   if (!has_curvature) return;
-  const float from_m = clip(along_m - a.half_window_m, 0, end_m), to_m = clip(along_m + a.half_window_m, 0, end_m);
+  const float from_m = clamp(along_m - a.half_window_m, 0, end_m), to_m = clamp(along_m + a.half_window_m, 0, end_m);
   const RoutePlace from = place_on_route(route, a.points, from_m), to = place_on_route(route, a.points, to_m);
   const float cos0 = from[kRouteCos], sin0 = from[kRouteSin], cos1 = to[kRouteCos], sin1 = to[kRouteSin];
   fields[kWindow][lane] = to_m - from_m;
@@ -85,8 +83,8 @@ INLINE void write_columns(const RouteRows& a, const View& view, const float (*fi
     store(values[kRecommendedSpeed], speed / a.speed_mps);
   }
   const float goal_x = goal[0] - view.x, goal_y = goal[1] - view.y;
-  store(values[kGoalX], splat(clip(ahead(view, goal_x, goal_y) / a.position_m, -a.max_goal, a.max_goal)));
-  store(values[kGoalY], splat(clip(left(view, goal_x, goal_y) / a.position_m, -a.max_goal, a.max_goal)));
+  store(values[kGoalX], splat(clamp(ahead(view, goal_x, goal_y) / a.position_m, -a.max_goal, a.max_goal)));
+  store(values[kGoalY], splat(clamp(left(view, goal_x, goal_y) / a.position_m, -a.max_goal, a.max_goal)));
 }
 
 void observe_route(const RouteRows& a, int64_t first, int64_t last) {
