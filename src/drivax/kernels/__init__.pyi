@@ -1,3 +1,4 @@
-from .library import constants, in_use, state, with_reference, without_kernels
-
-__all__ = ["constants", "in_use", "state", "with_reference", "without_kernels"]
+from .library import in_use as in_use
+from .library import state as state
+from .library import with_reference as with_reference
+from .library import without_kernels as without_kernels

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -15,9 +17,8 @@ Agents = tuple[Float[Array, "S 6"], Float[Array, "S 2"], Float[Array, " S"], Boo
 
 
 def look_ahead(
-    maps: Maps, agents: Agents, lights: Int[Array, " L"], slot: Int[Array, ""], index: Int[Array, ""],
-    row: Int[Array, ""], arc: Int[Array, ""], route_m: Float[Array, ""], speed: Float[Array, ""],
-    min_gap_m: Float[Array, ""], **rules: float,
+    maps: Maps, agents: Agents, lights: Int[Array, " L"], numbers: Sequence[Int[Array, ""]],
+    route_m: Float[Array, ""], speed: Float[Array, ""], min_gap_m: Float[Array, ""], rules: Mapping[str, float],
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:  # fmt: skip
     """Return the gap to the nearest obstacle (m), its speed along the route, and the desired speed (m/s).
 
@@ -25,16 +26,15 @@ def look_ahead(
         maps: Routes, numbers of their points, and stop lines of all scenarios.
         agents: Boxes, velocities, heights and mask of all agents.
         lights: States.
-        slot: Slot of the driven agent.
-        index: Its scenario.
-        row: Its route.
-        arc: Row of the arc lengths of stop lines on that route.
+        numbers: Slot, scenario and route of the driven agent, and row of the arc lengths of stop lines on that route.
         route_m: Arc length of the agent along it, m.
         speed: Of the agent, m/s.
         min_gap_m: Gap that the driver keeps behind a standing leader.
         rules: ``FollowingRules`` in ``native/following.cc``.
     """
     number = jax.ShapeDtypeStruct((), jnp.float32)
-    batched = (*agents, lights.astype(jnp.int8), slot, index, row, arc, route_m, speed, min_gap_m)
-    gap_m, leader_mps, desired_mps = call("look_ahead", [number] * 3, maps, batched, **constants(**rules))
+    batched = (*agents, lights.astype(jnp.int8), *numbers, route_m, speed, min_gap_m)
+    gap_m, leader_mps, desired_mps = call(
+        "look_ahead", [number] * 3, maps, batched, attributes=constants(rules)
+    )
     return gap_m, leader_mps, desired_mps

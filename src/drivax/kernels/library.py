@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,7 @@ _allowed: ContextVar[bool] = ContextVar("kernels are allowed", default=True)
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    """Return the library with its kernels registered, or None: not there, not wanted, or not loadable."""
+    """Return the library with its kernels registered, or None: not there, switched off, or not loadable."""
     if os.environ.get(VARIABLE) == "0" or not PATH.exists():
         return None
     try:
@@ -59,7 +59,7 @@ def state() -> str:
 
 def in_use() -> bool:
     """Whether programs that are traced now call native kernels: on CPUs, if the library is there, in float32."""
-    is_float32 = not jax.config.jax_enable_x64
+    is_float32 = jax.dtypes.canonicalize_dtype(float) == jnp.float32
     return _allowed.get() and is_float32 and _library() is not None and jax.default_backend() == "cpu"
 
 
@@ -85,17 +85,18 @@ def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) ->
     return function
 
 
-def constants(**values: float) -> dict[str, Any]:
-    """Return attributes of a kernel: integers of 32 bits, and floats."""
+def constants(values: Mapping[str, float]) -> dict[str, Any]:
+    """Return attributes of a kernel: truths, integers of 32 bits, and floats."""
+    types = {bool: bool, int: np.int32, float: np.float32}
     return {
-        name: np.int32(value) if isinstance(value, int) else np.float32(value)
+        name: next(types[kind] for kind in types if isinstance(value, kind))(value)
         for name, value in values.items()
     }
 
 
 def call(
     kernel: str, results: Sequence[jax.ShapeDtypeStruct], common: Sequence[Any], batched: Sequence[Any] = (),
-    axes: int = 0, **attributes: Any,
+    axes: int = 0, attributes: Mapping[str, Any] | None = None,
 ) -> list[Any]:  # fmt: skip
     """Call a kernel on a batch, or on one sample that ``jax.vmap`` makes a batch.
 
@@ -120,7 +121,7 @@ def call(
 
     def run_share(common: Any, batched: Any) -> list[Any]:
         shapes = [jax.ShapeDtypeStruct((*lead(batched), *result.shape), result.dtype) for result in results]
-        return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **attributes))
+        return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **(attributes or {})))
 
     def lead(batched: Any) -> tuple[int, ...]:
         return batched[0].shape[:axes] if axes else ()
@@ -135,7 +136,7 @@ def call(
             value if is_array_batched else jnp.broadcast_to(value, (size, *value.shape))
             for value, is_array_batched in zip(batched, is_batched, strict=True)
         ]
-        return call(kernel, results, common, batched, axes + 1, **attributes), outputs
+        return call(kernel, results, common, batched, axes + 1, attributes), outputs
 
     return run(list(common), list(batched))
 

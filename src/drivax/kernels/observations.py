@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,9 @@ from drivax.kernels.library import call, constants
 Group = tuple[Float[Array, "K F"], Bool[Array, " K"]]
 
 
-class Ego(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ego:
     """The driven agent, unbatched.
 
     Attributes:
@@ -40,7 +42,7 @@ class Ego(NamedTuple):
 
 def observe_road(
     road_at: Float[Array, "N 3 O"], road: Float[Array, "N O 7"], curvature: Float[Array, "N O"], ego: Ego,
-    count: int, columns: Sequence[int], layers: Sequence[int], **rules: float,
+    count: int, columns: Sequence[int], layers: Sequence[int], rules: Mapping[str, float],
 ) -> Group:  # fmt: skip
     """Return the first ``count`` pieces of road of some ``layers`` in a box around ego.
 
@@ -55,40 +57,42 @@ def observe_road(
         rules: Range and units: the numbers of ``RoadRows`` in ``native/road_rows.cc``.
     """
     common, batched = (road_at, road, curvature), (_int(ego.index), ego.motion, ego.direction)
-    attributes = constants(**rules) | {"columns": _numbers(columns), "layers": _numbers(layers)}
-    rows, mask = call("observe_road", _shapes(count, columns), common, batched, **attributes)
+    attributes = constants(rules) | {"columns": _numbers(columns), "layers": _numbers(layers)}
+    rows, mask = call("observe_road", _shapes(count, columns), common, batched, attributes=attributes)
     return rows, mask
 
 
 def observe_agents(
-    sizes: Float[Array, "N S 4"], routes: tuple[Float[Array, "M R 7"], Int[Array, " M"]],
+    sizes: Float[Array, "N S 4"], routes: tuple[Float[Array, "M R 7"], Int[Array, " M"], Float[Array, " P"]],
     frame: tuple[Float[Array, "S 6"], Float[Array, "S 2"], Bool[Array, " S"], Int[Array, " S"]], ego: Ego,
-    count: int, columns: Sequence[int], offsets_m: Float[Array, " P"], **rules: float | Sequence[int],
+    count: int, columns: Sequence[int], kinds: Sequence[int], rules: Mapping[str, float],
 ) -> Group:  # fmt: skip
     """Return the ``count`` agents that are nearest to ego, nearest first.
 
     Args:
         sizes: ``agent_box`` of the bank.
-        routes: Routes and their numbers of points.
+        routes: Routes, their numbers of points, and the places on ego's, relative to ego (m), on which agents are
+            projected.
         frame: Boxes, velocities, validity and kinds of all agents (``simulator.types.Frame``).
         ego: The driven agent.
         count: Number of rows K.
         columns: Numbers of the columns F among all of the group.
-        offsets_m: Places on the route, relative to ego, on which agents are projected.
-        rules: Kinds and units: the numbers of ``AgentRows`` in ``native/agent_rows.cc``.
+        kinds: Kinds of agents, in the order of the columns of their types.
+        rules: Units: the numbers of ``AgentRows`` in ``native/agent_rows.cc``.
     """
     box, velocity, valid, kind = frame
     places = _int(ego.slot), _int(ego.index), _int(ego.row), ego.route_m, ego.has_route
     batched = (box, velocity, valid, _int(kind), *places, ego.motion, ego.direction)
-    attributes = {"columns": _numbers(columns), "kinds": _numbers(rules.pop("kinds"))} | constants(**rules)
-    common = (sizes, *routes, offsets_m)
-    rows, mask = call("observe_agents", _shapes(count, columns), common, batched, **attributes)
+    attributes = constants(rules) | {"columns": _numbers(columns), "kinds": _numbers(kinds)}
+    rows, mask = call(
+        "observe_agents", _shapes(count, columns), (sizes, *routes), batched, attributes=attributes
+    )
     return rows, mask
 
 
 def observe_route(
     routes: tuple[Float[Array, "M R 7"], Int[Array, " M"]], goal: Float[Array, "M 2"], ego: Ego,
-    columns: Sequence[int], offsets_m: Float[Array, " K"], **rules: float,
+    columns: Sequence[int], offsets_m: Float[Array, " K"], rules: Mapping[str, float],
 ) -> Group:  # fmt: skip
     """Return the points of ego's route at ``offsets_m`` ahead of it.
 
@@ -101,9 +105,9 @@ def observe_route(
         rules: Window of the curvature and units: the numbers of ``RouteRows`` in ``native/route_rows.cc``.
     """
     batched = (_int(ego.row), ego.route_m, ego.has_route, ego.motion, ego.direction)
-    attributes = constants(**rules) | {"columns": _numbers(columns)}
+    attributes = constants(rules) | {"columns": _numbers(columns)}
     shapes = _shapes(offsets_m.shape[0], columns)
-    rows, mask = call("observe_route", shapes, (*routes, goal, offsets_m), batched, **attributes)
+    rows, mask = call("observe_route", shapes, (*routes, goal, offsets_m), batched, attributes=attributes)
     return rows, mask
 
 

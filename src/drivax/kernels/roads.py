@@ -5,14 +5,14 @@ Constants are those of ``scenario.bank.queries``, whose functions pass them.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.kernels.library import call, in_use
+from drivax.kernels.library import call, constants, in_use
 
 
 class SegmentGrid(NamedTuple):
@@ -38,12 +38,8 @@ class SegmentGrid(NamedTuple):
         return self.segments, self.start, self.origin
 
     @property
-    def _constants(self) -> dict[str, Any]:
-        return {
-            "cell_m": np.float32(self.cell_m),
-            "longest_run": np.int32(self.longest_run),
-            "long_ego": bool(self.long_ego),
-        }
+    def _constants(self) -> dict[str, float]:
+        return {"cell_m": self.cell_m, "longest_run": self.longest_run, "long_ego": self.long_ego}
 
 
 class Box(NamedTuple):
@@ -77,7 +73,7 @@ def supports(grid: SegmentGrid, corners: Float[Array, "corners 2"], *others: Flo
 
 def query_lanes(
     grid: SegmentGrid, map_box: Float[Array, "N 4"], index: Int[Array, ""], box: Box, ego: Int[Array, ""],
-    routed: Bool[Array, ""], **constants: float,
+    routed: Bool[Array, ""], rules: Mapping[str, float],
 ) -> Lanes:  # fmt: skip
     """Return what is known of the lanes around a box.
 
@@ -88,21 +84,21 @@ def query_lanes(
         box: Pose of the box.
         ego: Number of the ego of the scenario whose corridor counts.
         routed: Whether lanes of the corridor are driven before others.
-        constants: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
+        rules: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
     """
     flag, number = (jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.bool_, jnp.float32))
     corner_flags = jax.ShapeDtypeStruct((4,), jnp.bool_)
     results = [flag, corner_flags, flag, flag, flag, flag, number, number]
     common = jax.lax.stop_gradient([*grid._arrays, map_box])
     batched = jax.lax.stop_gradient([index, ego, *box, routed])
-    attributes: dict[str, Any] = {name: np.float32(value) for name, value in constants.items()}
-    return Lanes(*call("query_lanes", results, common, batched, **grid._constants, **attributes))
+    attributes = constants({**grid._constants, **rules})
+    return Lanes(*call("query_lanes", results, common, batched, attributes=attributes))
 
 
 def query_edges(
     grid: SegmentGrid, sides: Int[Array, "N cells"], index: Int[Array, ""], centre: Float[Array, "2"],
     corners: Float[Array, "4 2"], near_lane: Bool[Array, "4"], ground: Float[Array, ""],
-    **constants: float | int,
+    rules: Mapping[str, float],
 ) -> Float[Array, "4"]:  # fmt: skip
     """Return the distances of corners beyond the nearest edge, m: positive off the road.
 
@@ -114,11 +110,9 @@ def query_edges(
         corners: Its corners.
         near_lane: Whether a lane is near each corner.
         ground: Height of the ground.
-        constants: ``cutoff_m``, ``level_m``, and of the parts of cells ``split`` and ``not_drivable``.
+        rules: ``cutoff_m``, ``level_m``, and of the parts of cells ``split`` and ``not_drivable``.
     """
     results = [jax.ShapeDtypeStruct((4,), jnp.float32)]
     batched = (index, centre, corners, near_lane, ground)
-    attributes: dict[str, Any] = {
-        name: (np.int32 if isinstance(value, int) else np.float32)(value) for name, value in constants.items()
-    }
-    return call("query_edges", results, (*grid._arrays, sides), batched, **grid._constants, **attributes)[0]
+    attributes = constants({**grid._constants, **rules})
+    return call("query_edges", results, (*grid._arrays, sides), batched, attributes=attributes)[0]

@@ -92,8 +92,7 @@ def _ahead_natively(bank: ScenarioBank, context: AgentContext, frame: Frame, min
     arc = jnp.asarray(LightRow.ARC + bank.ego_number(context.row), jnp.int32)
     speed = context.history[-1, MOTION_SPEED]
     places = (context.slot, context.index, context.row, arc)
-    ahead = look_ahead(maps, agents, frame.lights, *places, context.route_m, speed, min_gap_m, **_RULES)
-    return Ahead(*ahead)
+    return Ahead(*look_ahead(maps, agents, frame.lights, places, context.route_m, speed, min_gap_m, _RULES))
 
 
 def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:

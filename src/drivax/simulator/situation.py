@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax import kernels
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, root, wrap
-from drivax.kernels.contacts import measure_contacts
+from drivax.kernels.contacts import Agents, measure_contacts
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
@@ -178,9 +178,9 @@ def _measure_contacts_natively(
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
     """Return the values of :func:`_measure_contacts`, with all of them read."""
     speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
-    agents = (frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
+    agents = Agents(frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
     before = (previous.velocity, previous.valid)
-    return measure_contacts(*agents, *before, context.slot, speed, unlawful, contacts, **contact.RULES)
+    return measure_contacts(agents, before, context.slot, speed, unlawful, contacts, contact.RULES)
 
 
 def _speeds(frame: Frame) -> Float[Array, " S"]:

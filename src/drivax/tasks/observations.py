@@ -287,12 +287,15 @@ def _agents_natively(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, now: Frame
 ) -> Observation:
     """Return the group ``agents`` of :func:`_agents` for one step."""
-    rules = {"kinds": _TYPES, "position_m": POSITION_M, "speed_mps": SPEED_MPS, "size_m": SIZE_M}
-    rules |= {"side_m": features.ROUTE_SIDE_M, "alongside_m": ALONGSIDE_M, "horizon_s": features.OVERLAP_S}
+    rules = {
+        "position_m": POSITION_M, "speed_mps": SPEED_MPS, "size_m": SIZE_M, "side_m": features.ROUTE_SIDE_M,
+        "alongside_m": ALONGSIDE_M, "horizon_s": features.OVERLAP_S,
+    }  # fmt: skip
+    routes = bank.routes, bank.route_points, features.projection_offsets()
     rows, mask = observe_agents(
-        bank.agent_box, (bank.routes, bank.route_points), (now.box, now.velocity, now.valid, now.kind),
+        bank.agent_box, routes, (now.box, now.velocity, now.valid, now.kind),
         _native_ego(bank, context, view), config.agents, _columns("agents", config.features.agents),
-        features.projection_offsets(), **rules,
+        _TYPES, rules,
     )  # fmt: skip
     return {"agents": rows[:, None], "agents_mask": mask[:, None]}
 
@@ -381,9 +384,11 @@ def _road_natively(
     rows, mask = observe_road(
         bank.road_at, bank.road, bank.road_curvature, _native_ego(bank, context, view), config.road,
         _columns("road", selected), [layer for layer, is_included in layers.items() if is_included],
-        ahead_m=float(config.road_ahead_m), behind_m=float(config.road_behind_m), side_m=float(config.road_side_m),
-        position_m=POSITION_M, piece_m=PIECE_M, speed_mps=SPEED_MPS, curvature_pm=features.CURVATURE_PM,
-        max_curvature=features.MAX_CURVATURE,
+        {
+            "ahead_m": float(config.road_ahead_m), "behind_m": float(config.road_behind_m),
+            "side_m": float(config.road_side_m), "position_m": POSITION_M, "piece_m": PIECE_M, "speed_mps": SPEED_MPS,
+            "curvature_pm": features.CURVATURE_PM, "max_curvature": features.MAX_CURVATURE,
+        },
     )  # fmt: skip
     return {"road": rows, "road_mask": mask}
 
@@ -472,8 +477,11 @@ def _route_natively(
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, mask = observe_route(
         (bank.routes, bank.route_points), bank.goal, _native_ego(bank, context, view),
-        _columns("route", config.features.route), offsets, half_window_m=features.HALF_WINDOW_M,
-        position_m=POSITION_M, speed_mps=SPEED_MPS, curvature_pm=features.CURVATURE_PM,
-        max_curvature=features.MAX_CURVATURE, max_goal=features.MAX_GOAL,
+        _columns("route", config.features.route), offsets,
+        {
+            "half_window_m": features.HALF_WINDOW_M, "position_m": POSITION_M, "speed_mps": SPEED_MPS,
+            "curvature_pm": features.CURVATURE_PM, "max_curvature": features.MAX_CURVATURE,
+            "max_goal": features.MAX_GOAL,
+        },
     )  # fmt: skip
     return {"route": rows, "route_mask": mask}

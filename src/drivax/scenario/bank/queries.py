@@ -37,6 +37,12 @@ _GOES_ON_M = 8.0
 #: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far a car may be
 #: beyond the ends of a segment, m.
 _FITS, _JOINT_M = 0.75**0.5, 0.5
+#: For the native kernels.
+_LANE_RULES = {
+    "cutoff_m": LANE_CUTOFF_M, "level_m": LEVEL_M, "margin_m": LANE_MARGIN_M, "goes_on_m": _GOES_ON_M,
+    "joint_m": _JOINT_M, "parallel_cos": _FITS,
+}  # fmt: skip
+_EDGE_RULES = {"cutoff_m": EDGE_CUTOFF_M, "level_m": LEVEL_M, "split": SPLIT, "not_drivable": NOT_DRIVABLE}
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
 #: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
@@ -241,8 +247,7 @@ def _native_lanes(
     """Return :func:`around_lanes` by the native kernel."""
     lanes = roads.query_lanes(
         _lane_grid(bank), bank.map_box, jnp.asarray(index, jnp.int32), box,
-        jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), cutoff_m=LANE_CUTOFF_M,
-        level_m=LEVEL_M, margin_m=LANE_MARGIN_M, goes_on_m=_GOES_ON_M, joint_m=_JOINT_M, parallel_cos=_FITS,
+        jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), _LANE_RULES,
     )  # fmt: skip
     return LaneHits(
         near=lanes.near,
@@ -355,7 +360,7 @@ def _native_offroad_distance(
     """Return :func:`offroad_distance` by the native kernel; derivatives are those of XLA."""
     return roads.query_edges(
         _edge_grid(bank), bank.grid_side, jnp.asarray(index, jnp.int32), centre, points, points_near_lane, z,
-        cutoff_m=EDGE_CUTOFF_M, level_m=LEVEL_M, split=SPLIT, not_drivable=NOT_DRIVABLE,
+        _EDGE_RULES,
     )  # fmt: skip
 
 
