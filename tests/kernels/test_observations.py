@@ -1,7 +1,7 @@
 """Native observation groups equal those of XLA: floats within 1e-5 (absolute; columns are about 1), masks exactly.
 
-Where rounding decides whether a piece of road is in the box, or which of two agents is nearer, XLA's choice is as close
-by a float64 computation; those samples are excluded.
+Rounding decides whether a piece of road within a millimetre of the box's sides is inside, and which of two agents as
+near is nearer; fuzzed samples with such pieces or agents are left out.
 """
 
 from dataclasses import replace
