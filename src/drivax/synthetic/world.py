@@ -103,7 +103,8 @@ class WorldConfig:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
         timing = self.signal_timing
-        if min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1e-6):
+        # numpy.random refuses probabilities whose sum differs from 1 by more than 1.5e-8.
+        if len(timing) != 3 or min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1e-8):
             raise UsageError(f"signal_timing is {list(timing)}", cure="use three shares that add up to 1")
         self.noise.check()
         self.sensor.check()
