@@ -214,9 +214,11 @@ def test_domains_determine_roads():
         generate_one(0, 0, WorldConfig(domain="city"))
 
 
-def test_negative_seeds_are_refused():
+def test_negative_seeds_and_short_recordings_are_refused():
     with pytest.raises(UsageError, match="must not be negative; choose 0 or more"):
         generate_recording(-1, 0)
+    with pytest.raises(UsageError, match="steps is 90; use 91 or more"):
+        generate_recording(0, 0, steps=90)
 
 
 def test_world_needs_no_jax():
@@ -243,6 +245,7 @@ def test_two_shares_of_signal_timing_are_refused():
     object.__setattr__(config, "signal_timing", (0.5, 0.5))  # which the type checks of tests refuse earlier
     with pytest.raises(UsageError, match="use three shares"):
         config.check()
+    WorldConfig(signal_timing=(0.33333333,) * 3).check()
 
 
 @pytest.mark.parametrize(
