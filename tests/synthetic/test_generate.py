@@ -104,10 +104,11 @@ def test_workers_inherit_disabled_features(monkeypatch):
     """A worker lacks the processor features that its parent disabled."""
     has = {"A": True, "B": False, "C": False}
     monkeypatch.setattr(generation, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))
-    monkeypatch.setenv("NPY_DISABLE_CPU_FEATURES", "B")
-    with portable_workers():
-        assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "A B"
-    assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "B"
+    for disabled, expected in (("B", "A B"), ("B,C", "A B C"), ("B, C", "A B C")):
+        monkeypatch.setenv("NPY_DISABLE_CPU_FEATURES", disabled)
+        with portable_workers():
+            assert os.environ["NPY_DISABLE_CPU_FEATURES"] == expected
+        assert os.environ["NPY_DISABLE_CPU_FEATURES"] == disabled
 
 
 def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_path):

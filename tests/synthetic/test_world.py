@@ -214,9 +214,11 @@ def test_domains_determine_roads():
         generate_one(0, 0, WorldConfig(domain="city"))
 
 
-def test_negative_seeds_are_refused():
+def test_negative_seeds_and_short_recordings_are_refused():
     with pytest.raises(UsageError, match="must not be negative; choose 0 or more"):
         generate_recording(-1, 0)
+    with pytest.raises(UsageError, match="steps is 90; use 91 or more"):
+        generate_recording(0, 0, steps=90)
 
 
 def test_world_needs_no_jax():
@@ -238,6 +240,14 @@ def test_noise_changes_other_agents_only():
     assert exact.seen is not None and exact.seen[0].all() and not exact.seen[~exact.tracks.valid].any()
 
 
+def test_two_shares_of_signal_timing_are_refused():
+    config = WorldConfig()
+    object.__setattr__(config, "signal_timing", (0.5, 0.5))  # which the type checks of tests refuse earlier
+    with pytest.raises(UsageError, match="use three shares"):
+        config.check()
+    WorldConfig(signal_timing=(0.33333333,) * 3).check()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -246,6 +256,10 @@ def test_noise_changes_other_agents_only():
         (
             {"signal_timing": (0.5, 0.5, 0.5)},
             "signal_timing is [0.5, 0.5, 0.5]; use three shares that add up to 1",
+        ),
+        (
+            {"signal_timing": (0.3333333,) * 3},
+            "signal_timing is [0.3333333, 0.3333333, 0.3333333]; use three",
         ),
         ({"signal_timing": (-0.5, 0.5, 1.0)}, "signal_timing is [-0.5, 0.5, 1.0]"),
         ({"signal_timing": (float("nan"), 0.5, 0.5)}, "signal_timing is [nan, 0.5, 0.5]"),

@@ -1,5 +1,6 @@
 """Checks of user-defined components: built-in components pass, and each rule has a component that violates it."""
 
+import inspect
 import itertools
 import re
 
@@ -76,6 +77,22 @@ def test_invalid_reward_terms_fail(words):
     refused(check_reward, term, words)
 
 
+@pytest.mark.parametrize(
+    ("number", "kind"), [((0.0, 1.0), "tuple"), ({"a": 0.0}, "dict"), (None, "NoneType")]
+)
+def test_terms_that_return_no_number_fail(number, kind):
+    refused(
+        check_reward, lambda before, now, around: number, f"'<lambda>' gives {kind} instead of one float32"
+    )
+
+
+def test_values_that_are_no_components_fail():
+    refused(check_reward, "math:pi", "reward term 'float' cannot be called")
+    refused(inspect.unwrap(check_metric), len, "is not a Metric")
+    refused(check_feature, "math:pi", "observation feature 'float' is no function")
+    refused(check_feature, View, "observation feature 'View' is no function")
+
+
 def test_batched_terms_fail():
     def term(before, now, around):
         inside = jnp.ndim(now.speed_mps) == 0 and isinstance(now.speed_mps, jax.core.Tracer)
@@ -93,6 +110,10 @@ def metric(read, reads=frozenset(), **more):
     return Metric(
         "m", "low", "a wrong one", step_value=StepValue("wrong", "m", read, reads), operator="max", **more
     )
+
+
+def test_metrics_without_a_pair_fail():
+    refused(check_metric, metric(lambda m: m.facts.speed_mps), "reads no pair; return the number and whether")
 
 
 def test_invalid_metrics_fail():
@@ -123,6 +144,8 @@ WRONG_FEATURES = {
     "cannot be compiled": lambda b, s, f: jnp.asarray([float(s.history[-1, 3])]),
     r"gives int32": lambda b, s, f: s.step[None, None],
     r"float32\[\] for": lambda b, s, f: s.history[-1, 3],
+    "gives float; return an array": lambda b, s, f: 1.0,
+    "gives tuple; return an array": lambda b, s, f: (s.history, None),
     r"bool\[2\] as the mask of \[1, 2\]": lambda b, s, f: (s.history[-1:, 2:] * 0.0, jnp.ones(2, bool)),
     "is not finite": lambda b, s, f: jnp.log(s.history[-1:, 3:]),
     r"reaches \d+": lambda b, s, f: s.history[-1:, 3:] * 100.0,
@@ -136,7 +159,9 @@ WRONG_FEATURES = {
 }
 
 
-@pytest.mark.parametrize("words", some(WRONG_FEATURES, "the log's future changes"))
+@pytest.mark.parametrize(
+    "words", some(WRONG_FEATURES, "the log's future changes", "gives float; return an array")
+)
 def test_invalid_features_fail(words):
     def feature(bank, context, frames):
         return WRONG_FEATURES[words](bank, context, frames)
@@ -188,7 +213,7 @@ class Wrong(nnx.Module):
             x = x + jnp.where(mask.any(axes), jnp.sqrt(jnp.sum(x * 0.0, -1)), 0.0)[..., None]
         if self.fault == "batch" and x.ndim > 1:
             x = x - x.mean(0)
-        return x[..., :2] if self.fault == "width" else x
+        return {"width": x[..., :2], "tree": (x, x)}.get(self.fault, x)
 
 
 class WrongConfig:
@@ -203,7 +228,8 @@ class WrongConfig:
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "width": "with width 3", "state": "not parameters", "seed": "other initial parameters",
+        "width": "with width 3", "tree": r"float32\[6, 3\], float32\[6, 3\] with", "state": "not parameters",
+        "seed": "other initial parameters",
         "batch": "differs in a batch", "constant": "all observations equally", "mask": "changes with masked rows",
         "nobody": "without rows is not finite", "gradient": "non-finite gradients",
         "blind": "ignores the group 'agents'",

@@ -35,6 +35,7 @@ class Wrong(Memoryless):
             return jnp.zeros(2), carry
         here = {
             "size": jnp.zeros(3),
+            "pair": (jnp.zeros(()), jnp.zeros(())),
             "finite": jnp.stack([1.0 / jnp.maximum(frame.valid.sum() - 1.0, 0.0), 0.0]),
             "random": jnp.full(2, 0.1) * next(count),
             "litter": jnp.stack([jnp.max(jnp.abs(frame.velocity)) / 1e3, 0.0]),
@@ -56,6 +57,7 @@ def refused(planner, words):
 def test_shapes_are_checked_before_anything_runs():
     refused(ConstantVelocity, "is not a planner")
     refused(Wrong(fault="size"), r"gives float32\[3\] as an action; return float32\[2\]")
+    refused(Wrong(fault="pair"), r"gives float32\[\], float32\[\] as an action; return float32\[2\]")
     refused(Wrong(fault="form"), "changes the shape of its carry")
     refused(Wrong(fault="python"), "cannot be compiled")
 

@@ -21,6 +21,13 @@ def test_log_replay_passes():
     check_traffic(LogTraffic())
 
 
+def test_classes_of_traffic_models_fail():
+    with pytest.raises(
+        BrokenContract, match="is not a traffic model; give it name, start, advance and agents"
+    ):
+        check_traffic(LogTraffic)
+
+
 def test_rows_without_agents_pass():
     rows, view = np.zeros((1, 2, 3, 8), np.float32), View(jnp.zeros(2), jnp.ones(()), jnp.zeros(()))
     _check_rows("traffic 'empty'", _Rollout(rows, rows, view))

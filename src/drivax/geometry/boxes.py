@@ -55,7 +55,7 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
     """Return the fractions of segments ``start`` to ``end`` (``[..., 2]``) at which they enter and leave boxes.
 
     A segment passes through the box if the first fraction is smaller than the second. If it does, both are in [0, 1]
-    (slab test).
+    (slab test). A segment along a side may count as passing or not.
     """
     xp = box.__array_namespace__()
     cos, sin = box[..., COS], box[..., SIN]

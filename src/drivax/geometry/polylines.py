@@ -74,7 +74,8 @@ class Polylines:
 
         Returns:
             The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first or
-            last segment, with a fraction outside [0, 1]: evaluation continues straight on.
+            last segment, with a fraction outside [0, 1]: evaluation continues straight on, except where points are
+            repeated at that end.
         """
         # Minimum and maximum are several times as fast as clip on few elements.
         key = np.minimum(np.maximum(s, 0.0), self.length[row]) + self._base[row]
@@ -256,7 +257,7 @@ def project_monotone(
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
         reach = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
         along_x, along_y, length, begin = step_x[reach], step_y[reach], span[reach], arc[:-1][reach]
-        if not len(length):  # the previous position is the end of the line, which begins no segment
+        if not len(length):  # ``low`` is the end of the line, which begins no segment
             result[k] = low
             continue
         offset_x, offset_y = xy[k, 0] - x[reach], xy[k, 1] - y[reach]

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def wrap(angle: Any) -> Any:
-    """Wrap angles to [-pi, pi)."""
+    """Wrap angles to [-pi, pi); one that is less than -pi by a rounding error may become pi."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 

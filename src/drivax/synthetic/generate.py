@@ -34,7 +34,7 @@ from drivax.tracking.workers import worker_pool
 #: NumPy's module with the table of CPU features, and the environment variable that disables features.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
-#: Scenarios per audited batch; in the first one, in the first task of a worker and at least in each other task.
+#: Scenarios per audited batch; in the first batch, in the first task, and at least in others but the last one.
 _BATCH, _FIRST = 64, 4
 #: Largest number of scenarios per task, and number of tasks per worker that smaller sets are divided into.
 _CHUNK, _TASKS = 16, 4
@@ -56,7 +56,8 @@ Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 def portable_workers() -> Iterator[None]:
     """Context in which started worker processes compute the same bits on any x86-64 processor."""
     # The table shows features that this process disables as missing, but the variable is replaced, so add them.
-    disabled = os.environ.get(_FEATURES, "").split()
+    # NumPy splits the variable at commas, too.
+    disabled = os.environ.get(_FEATURES, "").replace(",", " ").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
     settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
     before = {name: os.environ.get(name) for name in settings}

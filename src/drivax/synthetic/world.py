@@ -103,7 +103,8 @@ class WorldConfig:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
         timing = self.signal_timing
-        if min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1e-6):
+        # numpy.random refuses probabilities whose sum differs from 1 by more than about 1.49e-8.
+        if len(timing) != 3 or min(timing) < 0.0 or not math.isclose(sum(timing), 1.0, abs_tol=1.4e-8):
             raise UsageError(f"signal_timing is {list(timing)}", cure="use three shares that add up to 1")
         self.noise.check()
         self.sensor.check()
@@ -149,10 +150,12 @@ def generate_many(
     own roads, new ones for each attempt, on which the event can happen.
 
     Raises:
-        UsageError: A setting is wrong, seed or index are negative, no roads suit the event, or no draw gives a clean
-            expert.
+        UsageError: A setting is wrong, there are too few steps, seed or index are negative, no roads suit the event, or
+            no draw gives a clean expert.
     """
     domain = config.check()
+    if steps < STEPS:
+        raise UsageError(f"steps is {steps}", cure=f"use {STEPS} or more")
     return run_all(_generate(seed, index, config, domain, steps) for index in indices)
 
 

@@ -49,6 +49,11 @@ def instance(component: Any) -> Any:
     return component() if isinstance(component, type) else component
 
 
+def label(function: Any) -> str:
+    """Return the name of a function, or else of its class, for messages."""
+    return getattr(function, "__name__", type(function).__name__)
+
+
 @contextlib.contextmanager
 def _tracing_errors(what: str) -> Iterator[None]:
     """Turn tracing errors of JAX into :class:`BrokenContract`."""
@@ -105,7 +110,7 @@ class Program:
         """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
         repeated = program(what, self._batched)(*arguments)
-        cure = "take randomness from a key, and keep no state between calls"
+        cure = "use no random numbers but those of a fixed key, and keep no state between calls"
         expect(same(results, repeated, 0.0), f"{what} is not deterministic", cure)
         first_row = [
             argument if axis is None else jax.tree.map(lambda leaf: leaf[0], argument)

@@ -20,7 +20,6 @@ from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     TOLERANCE,
-    array_type,
     check_numbers,
     expect,
     instance,
@@ -63,8 +62,10 @@ def check_encoder(config: EncoderConfig | str) -> None:
         run = program(what, encoder)
         embedding = run(batch)
         width = getattr(encoder, "width", None)
-        valid = embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32
-        problem = f"{what} embeds {_BATCH} observations as {array_type(embedding)} with width {width}"
+        structure, types = layout(embedding)
+        valid = structure == jax.tree.structure(0.0) and embedding.shape == (_BATCH, width)
+        valid = valid and embedding.dtype == jnp.float32
+        problem = f"{what} embeds {_BATCH} observations as {', '.join(types)} with width {width}"
         expect(valid, problem, "return [*batch, width] float32, and set width")
         check_numbers(what, embedding)
         _check_state(what, settings, spec, encoder)
@@ -190,7 +191,7 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     third, logs = iterate(data, second)
     _check_logs(what, logs)
     parameters = jax.tree.leaves(_host_arrays(third.parameters))
-    check_numbers(what, [np.atleast_1d(leaf) for leaf in parameters])
+    check_numbers(f"a parameter of {what}", [np.atleast_1d(leaf) for leaf in parameters])
     return third
 
 

@@ -107,7 +107,8 @@ def _two_actions(simulator: Simulator, planner: Planner) -> Callable[..., Array]
 
 def _act(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any
-) -> tuple[Array, Any]:
+) -> tuple[Any, Any]:
+    """Return the action and the carry, which are the user's and may be anything."""
     situation, observation = simulator.situation(bank, state), simulator.observe(bank, state.context)
     return planner.act(carry, bank, state, situation, observation, jax.random.key(5))
 
@@ -122,8 +123,8 @@ def _check_layout(what: str, simulator: Simulator, planner: Planner, bank: Scena
         return state.context.action, action, jax.tree.map(jnp.asarray, (before, after))
 
     expected, action, (before, after) = result_shapes(what, act_once, bank)
-    problem = f"{what} gives {array_type(action)} as an action"
-    expect(array_type(action) == array_type(expected), problem, f"return {array_type(expected)}")
+    problem = f"{what} gives {', '.join(layout(action)[1])} as an action"
+    expect(layout(action) == layout(expected), problem, f"return {array_type(expected)}")
     cure = "return from act the same structure, shapes and types as from init"
     expect(layout(before) == layout(after), f"{what} changes the shape of its carry", cure)
 
@@ -145,6 +146,9 @@ def check_traffic(traffic: Traffic | str) -> None:
     of the world, the order of agents, padding, or rows of absent agents.
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
+    valid = isinstance(traffic, Traffic) and not isinstance(traffic, type)
+    cure = "give it name, start, advance and agents (simulator.types.Traffic)"
+    expect(valid, f"{traffic!r} is not a traffic model", cure)
     what = f"traffic {traffic.name!r}"
     bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
@@ -194,9 +198,9 @@ def _roll_out(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Rollout]:
 def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator, shape = Simulator(Task(), traffic), bank.agents.shape[2:]
     rows = jax.eval_shape(lambda bank: traffic.agents(bank, simulator.context(bank, 0, _START), 0), bank)
-    problem = f"{what} gives {array_type(rows)} as the rows of {shape[0]} agents"
+    problem = f"{what} gives {', '.join(layout(rows)[1])} as the rows of {shape[0]} agents"
     cure = "return float32 rows like bank.agents[index, step]"
-    expect(rows.shape == shape and rows.dtype == jnp.float32, problem, cure)
+    expect(layout(rows) == layout(jax.ShapeDtypeStruct(shape, jnp.float32)), problem, cure)
 
     def states(bank: ScenarioBank) -> tuple[Any, Any]:
         context = simulator.context(bank, 0, _START)

@@ -17,7 +17,6 @@ from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import FACTS, ON_REQUEST, AgentContext, Frame
 from drivax.tasks.observations import Feature, OwnGroup
-from drivax.tasks.own import name_of
 from drivax.tasks.rewards import Term
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -30,6 +29,7 @@ from drivax.testing.contract import (
     check_variants,
     expect,
     instance,
+    label,
 )
 from drivax.testing.worlds import ANGLE, Moments
 
@@ -47,21 +47,27 @@ def check_reward(term: Term | str) -> None:
     absent agents.
     """
     function = instance(term)
+    what = f"reward term {label(function)!r}"
+    cure = "write a function of facts before, facts now and surroundings"
+    expect(callable(function), f"{what} cannot be called", cure)
 
     def value(moment: Moments) -> Any:
-        return function(moment.before, moment.situation.facts, moment.situation.surroundings)
+        number = function(moment.before, moment.situation.facts, moment.situation.surroundings)
+        problem = f"{what} gives {type(number).__name__} instead of one float32 number"
+        expect(jax.tree.structure(number) == jax.tree.structure(0.0), problem, "return the number alone")
+        return number
 
-    _check_moments(f"reward term {name_of(function)!r}", value)
+    _check_moments(what, value)
 
 
 def check_metric(metric: Metric | str) -> None:
     """Check a metric or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It has a unit and a definition. Its step value, if any, is a number and whether it is defined; a defined number
-    follows the rules of :func:`check_reward`, and the metric declares all facts that it reads. ``compute``, if any,
+    It has a unit and a definition. Its step value, if any, is a number or boolean and whether it is defined; a defined
+    one follows the rules of :func:`check_reward`, and the metric declares all facts that it reads. ``compute``, if any,
     returns a ``Value`` at the end of an episode, which is finite if defined.
     """
-    what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
+    what = f"metric {getattr(metric, 'definition', metric)!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
     expect(isinstance(spec, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
     cure = "tables and reports print them; '-' is the unit of fractions"
@@ -70,8 +76,10 @@ def check_metric(metric: Metric | str) -> None:
         step = spec.step_value
 
         def value(moment: Moments) -> tuple[Any, Any]:
-            number, defined = step.read(Moment(moment.situation, moment.start, jnp.ones((), bool)))
-            number = jnp.asarray(number)
+            result = step.read(Moment(moment.situation, moment.start, jnp.ones((), bool)))
+            is_pair = isinstance(result, tuple | list) and len(result) == 2
+            expect(is_pair, f"{what} reads no pair", "return the number and whether it is defined")
+            number, defined = jnp.asarray(result[0]), result[1]
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
             return jnp.where(defined, number.astype(jnp.float32), 0.0), defined
 
@@ -89,8 +97,10 @@ def check_feature(feature: Feature | str) -> None:
     rotation and shift of the world, the order of agents, padding, or rows of absent agents.
     """
     function: Any = find_named(feature) if isinstance(feature, str) else feature
-    group = OwnGroup(function)
-    what = f"observation feature {group.name!r}"
+    what = f"observation feature {label(function)!r}"
+    cure = "write a function of bank, context and frames"
+    expect(callable(function) and not isinstance(function, type), f"{what} is no function", cure)
+    group = OwnGroup(function, "checked")
     simulator = Simulator(Task())
 
     def observe(bank: ScenarioBank, context: AgentContext) -> Any:
@@ -121,7 +131,10 @@ def check_feature(feature: Feature | str) -> None:
 
 def _check_form(what: str, rows: Any) -> None:
     """Check shapes and dtypes while tracing."""
-    value, mask = rows if isinstance(rows, tuple) else (rows, None)
+    is_pair = isinstance(rows, tuple) and len(rows) == 2
+    valid = all(hasattr(part, "dtype") for part in (rows if is_pair else (rows,)))
+    expect(valid, f"{what} gives {type(rows).__name__}", "return an array, or an array and its mask")
+    value, mask = rows if is_pair else (rows, None)
     valid = value.dtype == jnp.float32 and value.ndim >= 1
     cure = "return float32 with features on the last axis"
     expect(valid, f"{what} gives {array_type(value)} for a context", cure)
@@ -179,7 +192,8 @@ def _check_computed(what: str, metric: Metric) -> None:
     for defined in (True, False):
         rows = (jnp.arange(12) % len(bank), jnp.linspace(0.0, 1.0, 12), jnp.full(12, defined))
         result = program.check_pure(*rows) if defined else program(*rows)
-        valid = isinstance(result, Value) and result.value.shape == (12,) and result.defined.dtype == bool
+        valid = isinstance(result, Value) and result.value.shape == result.defined.shape == (12,)
+        valid = valid and result.defined.dtype == bool
         cure = "return drivax.metrics.steps.Value(number, defined)"
         expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))

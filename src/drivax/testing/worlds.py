@@ -233,11 +233,13 @@ def change_future(bank: ScenarioBank, step: int) -> ScenarioBank:
     is_future = jnp.arange(bank.steps) > step
     agents = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
     agents = agents.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
+    # States of observed lights are 0 to 8.
+    light_state = (bank.light_state + 1) % 9
     return replace(
         bank,
         agents=jnp.where(is_future[None, :, None, None], agents, bank.agents),
         parked_when=bank.parked_when ^ as_words(np.asarray(is_future)[None, :, None]),
-        light_state=jnp.where(is_future[None, :, None], (bank.light_state + 1) % 9, bank.light_state),
+        light_state=jnp.where(is_future[None, :, None], light_state, bank.light_state),
         log_progress=jnp.where(is_future[None], bank.log_progress + 99.0, bank.log_progress),
         log_ahead=jnp.full_like(bank.log_ahead, 99.0),
         log_routes=bank.log_routes + 50.0,

@@ -128,9 +128,9 @@ class CrossTraffic(EventScript):
             return None
         entry, adversary, required = schedule
         # The label ends 1 s after the entry, which may be before the actor reaches ego's path. If it blocks the path
-        # 0.8 s after the entry, the label lasts until it leaves.
+        # 0.8 s after the entry, the label lasts until it leaves (if it does before the recording's end).
         leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
-        # A queue at its light would block the actor.
+        # A queue at its light would block the actor: up to 0.5 s after the entry, no vehicle is in its way.
         removed = vehicles_in_lane(view, adversary, entry + 5)
         last = min(max(leaves, entry + 10), view.last_step)
         staging = Staging(extras=(adversary,), removed=removed)

@@ -49,7 +49,8 @@ class Destination:
 class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
-    Some of its lanes lie behind ego's start, where the recording begins; the destination is on lane ``lanes[place]``.
+    Its first lanes lie behind ego's start, where the recording begins, if there are any there; the destination is on
+    lane ``lanes[place]``.
     """
 
     start: Start

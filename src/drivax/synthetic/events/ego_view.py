@@ -45,7 +45,7 @@ class Track:
     def pose(
         self, station: Float64[np.ndarray, "*n"], left_m: Float64[np.ndarray, "*n"] | float = 0.0
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
-        """Positions at stations and lateral offsets, and the path's headings there."""
+        """Positions at stations and lateral offsets, and the path's headings there; beyond an end, those of the end."""
         sample = np.clip(station / STEP_M, 0.0, len(self.xy) - 1.001)
         index = sample.astype(int)
         share = sample - index
@@ -87,6 +87,7 @@ def ego_track(motion: Motion) -> Track:
         headings = np.concatenate([headings, turn + shift])
         along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
     ahead = np.array([np.cos(headings[-1]), np.sin(headings[-1])])
+    # 300 m exceed ``_BEYOND_M``: the samples below never reach the end.
     points = np.concatenate([points, [points[-1] + 300.0 * ahead]])
     headings, along = np.append(headings, headings[-1]), np.append(along, along[-1] + 300.0)
     station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)

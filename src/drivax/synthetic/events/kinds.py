@@ -45,7 +45,8 @@ class StagedEvent:
         first_step, last_step: Steps of the misbehaviour, both included. That of cross traffic usually ends 1 s after it
             enters the junction, even before the conflict.
         severity_mps2: Constant deceleration with which ego just avoids the actor if it brakes 0.4 s after the first
-            step, when the actor's behaviour is visible, and keeps its speed until then.
+            step, when the actor's behaviour is visible, and until then drives as without the event (but reacts to an
+            added leader before it brakes).
     """
 
     kind: EventKind

@@ -23,6 +23,8 @@ _LEAST_MPS = 10.0
 _LEADER_MPS = 3.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
+#: Acceleration of a new leader that drives on, m/s2.
+_RESUMING_MPS2 = 1.5
 #: Time that a leader stands after ego would have reached it at constant speed, s.
 _HOLD_S = 1.5
 #: Largest distance of a vehicle behind ego that becomes a tailgater, m.
@@ -179,7 +181,7 @@ def _propose_leader(
     times = DT_S * (np.arange(view.steps) - step)
     braked_m, _ = speed_change(ego_mps, 0.0, draft[0], times)
     last = view.last_step if departure is None else step + _stop_steps(speed, draft[1])
-    resumed_m, _ = speed_change(0.0, ego_mps, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    resumed_m, _ = speed_change(0.0, ego_mps, _RESUMING_MPS2, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + braked_m + resumed_m)
     if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None

@@ -141,9 +141,11 @@ class Jaywalker(_StreetScript):
         station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
         speed = view.motion.speed[0, steps]
+        # Cars next to the path, from 6 m ahead of ego at the first step to 40 m ahead of it at the last one.
         is_near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
         order = rng.permutation(np.flatnonzero(is_near & (station < view.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
+            # The pedestrian's centre is 0.55 m beyond the car's far end.
             line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
             front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
@@ -151,6 +153,7 @@ class Jaywalker(_StreetScript):
             rooms = [math.inf if room is None else room for room in rooms]
             error = np.where(speed > SLOWEST_MPS, rooms, math.inf) - (line - front)
             best = int(np.argmin(np.abs(error)))
+            # Ego is at most 0.08 s of travel from the place at which the requested severity is exact.
             if abs(error[best]) < 0.08 * speed[best]:
                 return int(steps[best]), line, offset
         return None

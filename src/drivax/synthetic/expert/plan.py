@@ -33,7 +33,7 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
 #: Bounds of acceleration (m/s2) and jerk (m/s3), the most comfortable first.
 _BOUNDS_BY_COMFORT = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
-#: Cost of the original path below which no alternatives are computed.
+#: Cost of the original path below which no alternatives are computed if its smooth speeds keep their bounds.
 _GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
 _SHIFT_COST, _OFFSET_COST, _WRONG_WAY_COST = 8.0, 2.0, 6.0

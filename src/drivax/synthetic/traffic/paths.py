@@ -174,6 +174,7 @@ def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, t
     whole_turns = round((a.heading[-1] - b.heading[-1]) / (2 * math.pi))
     heading[0], heading[-1] = a.heading[0], b.heading[-1] + 2 * math.pi * whole_turns
     end = change.begin_m + change.length_m
+    # The vehicle occupies the new lane from 15 m before the change on, and the old one for 70 % of the change.
     return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
 
 

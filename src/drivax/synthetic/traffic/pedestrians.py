@@ -367,7 +367,7 @@ def _along_sidewalk(
     _, sidewalk, index = best
     pieces = [piece for piece in (sidewalk.xy[index:], sidewalk.xy[index::-1]) if len(piece) > 4]
     piece = pieces[int(rng.integers(len(pieces)))]
-    return piece[1:81]
+    return piece[1:81]  # about 40 m
 
 
 def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:

@@ -21,7 +21,8 @@ _PASSAGE_M = 2.3
 _MANOEUVRING_ROOM_M = 0.6
 #: Distance of double-parked cars from the ends of lanes, m.
 _MIN_FROM_ENDS_M = 15.0
-#: Smallest distance between centres of vehicles placed on a lane: a vehicle's length and a gap, m, and a time gap, s.
+#: Smallest distance between centres of vehicles placed on a lane (except from ego to the leader of ``leader_share``):
+#: a vehicle's length and a gap, m, and a time gap, s.
 _LENGTH_M, _GAP_M, _GAP_S = 10.0, 5.0, 0.9
 #: Free gaps on busy lanes relative to those elsewhere.
 _BUSY_GAP_SHARE = 0.4
@@ -162,6 +163,7 @@ def place_vehicles(
 ) -> Placement:  # fmt: skip
     """Draw initial positions off connectors, with safe gaps to ego, other vehicles and parked cars.
 
+    Ego's leader is on ego's lane, even if that is a connector, and may be as close as 18 m.
     Lanes in ``busy`` are as dense as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)

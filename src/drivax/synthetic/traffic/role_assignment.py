@@ -73,7 +73,10 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
 
 
 def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
-    """Add the lanes that lead to any of several lanes within 160 m."""
+    """Add the lanes that lead to any of several lanes within 160 m.
+
+    The search is depth first: a lane that it reaches on the longer of two ways first may lack feeders.
+    """
     result: set[int] = set()
     queue = [(lane, 0.0) for lane in sorted(lanes)]
     while queue:

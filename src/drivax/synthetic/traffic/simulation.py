@@ -394,7 +394,7 @@ class _Simulation:
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
-        # Only a planned ego reverses; the IDM treats it as standing.
+        # Only an ego on a plan could reverse; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
         accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
@@ -518,6 +518,7 @@ class _Simulation:
             on_path = [lane for lane in options if lane in old_lanes]
             # Other branches take turns, which draws no random number.
             lanes.append(on_path[0] if on_path else options[(number + len(lanes)) % len(options)])
+        # One wave of 8 cm, 90 m long, with a phase of the vehicle's own.
         sway = Sway((0.08,), (0.07,), (float(number),))
         target = lane_path(network, tuple(lanes), sway)
         path, position = lane_change_path(target, present, self._position_m[row], change.length_m)

@@ -315,8 +315,8 @@ class Corridor:
     """Settings of the family ``corridor``: a main road with two junctions.
 
     Each has lights, or gives the main road priority over two side roads or one. The junctions share the lanes between
-    them. Two lights may be coordinated: the same cycle, and the second one turns green when vehicles arrive that left
-    the first one at the beginning of green.
+    them. Two lights may be coordinated: the same cycle, and the second one begins its first phase when vehicles arrive
+    that left the first one at the beginning of its first phase.
 
     Attributes:
         side_reach: Shape of side roads: nearly straight, which keeps those of both junctions separate.

@@ -178,7 +178,7 @@ class ParkedStreet(StreetFamily):
     name: str = "parked_street"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a street with one of the two lowest limits of the style, and lanes of about its least width."""
+        """Draw a narrow street with one of the two lowest limits of the style, of which repeated ones count twice."""
         one_way = rng.random() < self.one_way_share
         middle = self.draw_middle(rng, style.curvature)
         row = float(rng.uniform(*self.row_m))
