@@ -311,6 +311,11 @@ def test_unreadable_file_is_skipped_and_a_full_process_stops(folder, tmp_path, m
         convert(folder, tmp_path / "other")
 
 
+def test_file_that_cannot_be_opened_is_a_bad_record(tmp_path):
+    (bad,) = convert_file(tmp_path / "gone.tfrecord", Conversion(format="womd-scenario"))
+    assert isinstance(bad, BadRecord) and bad.problem == "No such file or directory" and bad.cure
+
+
 # --- What is left out, and what is written next to the scenarios.
 
 
