@@ -167,11 +167,13 @@ def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterato
 
 
 def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    """Call a function; return the bad record of any error in place of a result."""
+    """Call a function; return the bad record of any error but a lack of memory in place of a result."""
     try:
         return function()
     except DrivaxError as error:
         return BadRecord.of(error, path, record)
+    except MemoryError:  # a skipped record would make the set depend on the machine
+        raise
     except Exception as error:  # one odd recording must not end a conversion of a hundred thousand
         problem = f"assembling failed ({type(error).__name__}: {error})"
         return BadRecord(path, record, problem, "report it with this file and record")
