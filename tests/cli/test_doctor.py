@@ -282,7 +282,7 @@ def test_families_of_one_name_are_named_with_their_folder():
     assert gaps(paths) == ["train/t.tfrecord: all 1 shards", "val/t.tfrecord: all 1 shards"]
 
 
-def test_families_of_one_name_in_folders_of_one_name_are_told_apart():
+def test_families_of_one_name_in_folders_of_one_name_are_distinguished():
     paths = [Path("data", version, "train", "t.tfrecord-00000-of-00001") for version in ("v1", "v2")]
     assert gaps(paths) == [
         "v1/train/t.tfrecord: all 1 shards",

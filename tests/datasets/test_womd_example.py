@@ -246,7 +246,7 @@ def test_describe_and_count(wire, write_records):
     assert reader.count(write_records("d", wire.scenario())) == 0
 
 
-def test_no_version_is_told_by_a_map_without_lines(wire, write_records, monkeypatch):
+def test_a_map_without_lines_shows_no_version(wire, write_records, monkeypatch):
     path = write_records("a", wire.example())
     crosswalk = MapFeature(1, RoadKind.CROSSWALK, np.zeros((4, 3)))
     recording = replace(WomdExample().first(path), features=(crosswalk,))
