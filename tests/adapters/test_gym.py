@@ -202,9 +202,33 @@ def test_errors_are_one_line(env):
     for action in (np.zeros(3), np.array([np.nan, 0.0])):
         with pytest.raises(UsageError, match="give 2 finite numbers"):
             env.step(action)
+    for action in ("left", [[1.0], [1.0, 2.0]], {"steer": 1.0}):
+        with pytest.raises(UsageError, match="is not an action; give 2 finite numbers"):
+            env.step(action)
     drive(env, 1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(STILL)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: DrivingEnv(0), "0 scenarios to generate; use 1 or more"),
+        (lambda: VectorDrivingEnv(0, 1), "num_envs is 0; use 1 or more"),
+        (lambda: gym.make(num_envs=-1), "num_envs is -1; use 1 or more"),
+    ],
+)
+def test_environments_without_scenarios_or_places_are_refused(make, words):
+    with pytest.raises(UsageError) as error:
+        make()
+    assert str(error.value) == words
+
+
+def test_choices_of_a_batch_are_one_per_environment(data):
+    vector = VectorDrivingEnv(2, data, replace(SMALL, actions=TASKS["discrete"].actions))
+    for actions in ([1, 2, 3], [[1], [2, 3]], 1):
+        with pytest.raises(UsageError, match="give choices from 0 to 90, one for each of 2 environments"):
+            vector._backend.convert_actions(actions, (2,))
 
 
 def test_held_decisions_are_refused(data):
@@ -278,10 +302,13 @@ def test_seeds_and_errors_of_a_batch(data):
         ({"scenarios": [0, 1]}, "2 scenarios for 3 environments; give one per environment"),
         ({"scenarios": [0, 1, 2]}, "there is no scenario 2; use a row from 0 to 1"),
         ({"scenario": 1}, "there is no reset option 'scenario'; the only one is 'scenarios'"),
+        ({"scenarios": 1}, "the reset option 'scenarios' is 1; give a list of 3 rows"),
     ):
+        rows = vector._rows
         with pytest.raises(UsageError) as error:
             vector.reset(options=options)
         assert str(error.value) == words
+        assert vector._rows is rows  # the episodes that run go on
     with pytest.raises(UsageError, match="give 3 x 2 finite numbers"):
         vector.step(np.zeros((2, 2)))
 
@@ -312,6 +339,17 @@ def test_render_draws_ego_at_its_simulated_pose(data):
         vector.step(brake)
     for picture, wanted in zip(vector.render(), [first, second, first], strict=True):
         np.testing.assert_array_equal(picture, wanted)
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_make_passes_trust_on(num_envs, monkeypatch):
+    def refuse(*arguments):
+        raise RuntimeError(*arguments)
+
+    monkeypatch.setattr(gym, "_Backend", refuse)
+    with pytest.raises(RuntimeError) as error:
+        gym.make(SMALL, 3, num_envs=num_envs, traffic="idm", trust=("mine",))
+    assert error.value.args == (3, SMALL, "idm", ("mine",))
 
 
 @pytest.mark.parametrize(("traffic", "name"), [("idm", "idm"), ("own_terms:Drift", "drift")])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import importlib
 import json
+import os
 import pickle
 import shutil
 import subprocess
@@ -16,9 +17,10 @@ import pytest
 from datasets.samples import womd_scenario as wire
 from drivax.cli import doctor, main
 from drivax.datasets.conversion import convert
-from drivax.datasets.doctor import Part, diagnose, gaps
+from drivax.datasets.doctor import Part, _notes, diagnose, gaps
+from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import Description
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 
 FORMATS = {
     "av2_motion": "Argoverse 2 Motion Forecasting",
@@ -130,14 +132,15 @@ WRONG = {
     "short.tfrecord": (lambda: wire.frame(wire.scenario())[:500], "truncated", "again"),
     "empty.tfrecord": (lambda: b"", "empty", "again"),
     "log.db": (lambda: b"SQLite format 3\0" + bytes(4096), "without nuPlan's tables", "logs of nuPlan"),
-    "part-0.parquet": (lambda: b"PAR1" + bytes(99) + b"PAR1", "without the columns of Argoverse 2", "motion"),
-    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not a table of annotations", "folder of the log"),
+    "part-0.parquet": (lambda: b"PAR1" + bytes(99) + b"PAR1", "not named as a scenario of Argoverse 2", "motion"),
+    "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not named as annotations", "folder of the log"),
     "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "no ScenarioNet scenario", "sd_*.pkl"),
     "tfrecord-1_1.json": (
         lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(),
         "without GPUDrive's positions", "GPUDrive's present converter"
     ),
     "log_map_archive_x.json": (lambda: b'{"lane_segments": {}}', "without its recording", "scenario_*.parquet"),
+    "sample.json": (lambda: b'[{"token": "a", "scene_token": "b"}]', "a table of nuScenes", "metadata archive"),
     "notes.json": (lambda: b'{"mine": 1}', "JSON of no data set", "as downloaded"),
     "data.zip": (lambda: b"PK\x03\x04" + bytes(99), "zip archive", "unzip"),
     "data.tar": (lambda: bytes(257) + b"ustar" + bytes(512), "tar archive", "tar xf"),
@@ -212,6 +215,42 @@ def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
     assert "about 8 scenarios" in out
 
 
+def test_a_file_that_lacks_nothing_is_convertible_next_to_one_without_its_map(tmp_path):
+    for name in ("whole", "half"):
+        sample("av2_motion", tmp_path / name)
+    (map_path,) = (tmp_path / "half").rglob("log_map_archive_*.json")
+    map_path.unlink()
+    found = diagnose(tmp_path)
+    assert found.parts[0].description.missing == (map_path.name,) and found.convertible
+
+
+def test_the_test_split_of_nuscenes_is_not_convertible(tmp_path):
+    folder = sample("nuscenes", tmp_path / "data")
+    for path in folder.rglob("sample_annotation.json"):
+        path.write_text("[]")
+    found = diagnose(folder)
+    assert (found.convertible, found.scenarios) == (False, 0)
+
+
+def test_all_notes_on_a_single_file_are_listed():
+    notes = tuple(f"note {number}" for number in range(8))
+    one, other = Description("a", "b", notes=notes), Description("a", "b", notes=notes[:7])
+    assert list(_notes([one])) == list(notes)
+    assert list(_notes([one, other]))[6:] == [
+        "2 more notes; run drivax doctor on a single file to see all of its own"
+    ]
+
+
+@pytest.mark.parametrize("function", [diagnose, detect, survey])
+def test_a_pipe_is_refused_unopened(function, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    try:
+        (problem,) = function(tmp_path / "pipe").problems
+    except DataError as error:
+        problem = error
+    assert "not a regular file" in problem.problem
+
+
 def test_unknown_number_of_recordings_is_not_mentioned():
     part = Part("nuplan", Description("nuPlan", "log"), 4, whole=False)
     assert ("format", "nuplan: 8 files (4 of them inspected)") in doctor._part_rows(part, 8)
@@ -241,6 +280,14 @@ def test_many_gaps_are_counted_only():
 def test_families_of_one_name_are_named_with_their_folder():
     paths = [Path(split, "t.tfrecord-00000-of-00001") for split in ("train", "val")]
     assert gaps(paths) == ["train/t.tfrecord: all 1 shards", "val/t.tfrecord: all 1 shards"]
+
+
+def test_families_of_one_name_in_folders_of_one_name_are_distinguished():
+    paths = [Path("data", version, "train", "t.tfrecord-00000-of-00001") for version in ("v1", "v2")]
+    assert gaps(paths) == [
+        "v1/train/t.tfrecord: all 1 shards",
+        "v2/train/t.tfrecord: all 1 shards",
+    ]
 
 
 def test_shards_are_grouped_by_folder(tmp_path, capsys):

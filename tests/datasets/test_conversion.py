@@ -192,6 +192,12 @@ def test_unexpected_failure_is_a_bad_record(wire, write_records, monkeypatch):
     assert (bad.record, bad.problem) == ("odd", "assembling failed (IndexError: off by one)")
 
 
+def test_lack_of_memory_skips_no_record(wire, write_records, monkeypatch):
+    monkeypatch.setattr("drivax.datasets.conversion.assemble", lambda *_: [0] * 2**62)
+    with pytest.raises(MemoryError):
+        list(convert_file(write_records("x.tfrecord", wire.scenario("fine")), Conversion()))
+
+
 def test_long_recordings_become_windows_of_one_segment(wire, write_records, tmp_path):
     path = write_records("long.tfrecord", wire.scenario("long", steps=180, now=wire.whole(10, 0)))
     convert(path, tmp_path / "set")
@@ -309,6 +315,11 @@ def test_unreadable_file_is_skipped_and_a_full_process_stops(folder, tmp_path, m
     monkeypatch.setattr(reader, "read", read_or_fail(errno.EMFILE))
     with pytest.raises(OSError):
         convert(folder, tmp_path / "other")
+
+
+def test_file_that_cannot_be_opened_is_a_bad_record(tmp_path):
+    (bad,) = convert_file(tmp_path / "gone.tfrecord", Conversion(format="womd-scenario"))
+    assert isinstance(bad, BadRecord) and bad.problem == "No such file or directory" and bad.cure
 
 
 # --- What is left out, and what is written next to the scenarios.

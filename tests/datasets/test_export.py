@@ -214,6 +214,14 @@ def test_invalid_options_are_refused(stored, tmp_path, options):
         export(stored, tmp_path / "out", options)
 
 
+@pytest.mark.parametrize("name", ["format", "paths"])
+def test_unknown_choices_are_refused(stored, tmp_path, name):
+    options = Export("tfexample")
+    object.__setattr__(options, name, "json")  # the type checker of the tests would refuse it first
+    with pytest.raises(UsageError, match="use one of"):
+        export(stored, tmp_path / "out", options)
+
+
 def test_command_exports_selected_scenarios(stored, tmp_path, capsys):
     (tmp_path / "ids.txt").write_text("one\ta\nb\nc\nd\n")
     command = ["export", str(stored), str(tmp_path / "out"), "--ids", str(tmp_path / "ids.txt")]

@@ -173,5 +173,7 @@ def test_folder_without_recordings(tmp_path):
     with pytest.raises(DataError, match="none of the 1 files") as caught:
         survey(tmp_path)
     assert caught.value.file == tmp_path and caught.value.cure
+    with pytest.raises(DataError, match="none of the 1 files in it is of the format nuplan"):
+        survey(tmp_path, "nuplan")
     with pytest.raises(DataError, match="does not exist"):
         survey(tmp_path / "none")

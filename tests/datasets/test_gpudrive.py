@@ -133,6 +133,14 @@ def test_item_5_jumps_split_dense_polylines_only(content):
     assert (assemble(decode(content)).feature_id == 8).sum() == 1
 
 
+def test_only_a_map_with_thinned_lines_is_called_thinned(tmp_path):
+    thinned = [dict(road, geometry=road["geometry"][::8]) for road in sample.roads()[:6]]
+    for number, (roads, is_thinned) in enumerate(((sample.roads(), False), (thinned, True), ([], False))):
+        (tmp_path / str(number)).mkdir()
+        notes = GpuDrive().describe(sample.write(tmp_path / str(number), roads=roads)).notes
+        assert any("thinned" in note for note in notes) == is_thinned
+
+
 def test_item_3_implausible_sizes_are_those_of_the_class(content):
     content["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
     stored = assemble(decode(content))

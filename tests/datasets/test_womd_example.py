@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd.example_reader import WomdExample
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import MapFeature, Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
 decode = WomdExample().decode
@@ -243,6 +244,14 @@ def test_describe_and_count(wire, write_records):
     with pytest.raises(DataError, match="use --format womd-scenario"):
         reader.describe(write_records("c", wire.scenario()))
     assert reader.count(write_records("d", wire.scenario())) == 0
+
+
+def test_a_map_without_lines_shows_no_version(wire, write_records, monkeypatch):
+    path = write_records("a", wire.example())
+    crosswalk = MapFeature(1, RoadKind.CROSSWALK, np.zeros((4, 3)))
+    recording = replace(WomdExample().first(path), features=(crosswalk,))
+    monkeypatch.setattr(WomdExample, "first", lambda *_: recording)
+    assert WomdExample().describe(path).version is None
 
 
 # --- The real file (shared/data/README.md counts it by an independent reader).

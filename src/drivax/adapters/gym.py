@@ -43,7 +43,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing_package(error) or error from error
 
-#: Bound of observations (5 km, 1.5 km/s), since Gymnasium needs finite bounds.
+#: Bound to which observations are clipped (5 km, 1.5 km/s; own groups too), since Gymnasium needs finite bounds.
 LIMIT = 100.0
 
 
@@ -72,6 +72,8 @@ def _load(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], 
     if isinstance(data, int | str | Path):
         scenarios: Sequence[Scenario]
         if isinstance(data, int):
+            if data < 1:
+                raise UsageError(f"{data} scenarios to generate", cure="use 1 or more")
             scenarios = [assemble(generate_recording(seed=0, index=index)) for index in range(data)]
         else:
             scenarios = ScenarioSet.open(data)
@@ -183,16 +185,20 @@ class _Backend:
         Values beyond [-1, 1] pass: the simulator clips them.
         """
         space = self.task.actions
+        try:
+            values = np.asarray(actions, None if isinstance(space, Discrete) else np.float32)
+        except (TypeError, ValueError):  # texts, or rows of different lengths
+            values = np.array(None)  # refused below
         if isinstance(space, Discrete):
-            choices = np.asarray(actions)
+            choices = values
             is_index = choices.dtype.kind in "iu" and choices.shape == lead
             if not is_index or ((choices < 0) | (choices >= space.choices)).any():
                 cure = f"give choices from 0 to {space.choices - 1}"
+                cure += f", one for each of {lead[0]} environments" if lead else ""
                 raise UsageError(f"{actions!r} is not an action", cure=cure)
             accelerations, curvatures = (np.asarray(level) for level in space.levels())
             row, column = np.divmod(choices, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
-        values = np.asarray(actions, np.float32)
         shape = (*lead, space.size)
         if values.shape != shape or not np.isfinite(values).all():
             cure = f"give {' x '.join(map(str, shape))} finite numbers in [-1, 1]"
@@ -203,14 +209,15 @@ class _Backend:
 class DrivingEnv(gymnasium.Env[Observation, Any]):
     """Drive ego from the current step of a scenario to the end of its log, one episode at a time.
 
-    Observations are the task's groups that are not empty: ``Box`` for features, ``MultiBinary`` for masks (1 for a
-    valid row). Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is
-    ``terminated``, the end of log or map is ``truncated``. ``info`` has ``scenario_id`` and, after the last step,
-    ``metrics``: all defined episode metrics. The simulation runs on the CPU.
+    Observations are the task's groups that are not empty: ``Box`` for features, clipped to [-100, 100], ``MultiBinary``
+    for masks (1 for a valid row). Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the
+    episode is ``terminated``, the end of log or map is ``truncated``. ``info`` has ``scenario_id`` and, after the last
+    step, ``metrics``: all defined episode metrics. The simulation runs on the CPU.
 
     Args:
         data: Result of ``drivax.load``, folder of a scenario set, or number of scenarios to generate.
-        task: Action space, observation, reward and termination; by default ``Task()``.
+        task: Action space, observation, reward and termination; by default ``Task()``. Its ``conditions`` keep the
+            values of evaluation.
         render_mode: ``rgb_array`` draws the scenario from above (needs the extra ``show``).
         traffic: Model of the other agents: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
             ``package.module:name``, or a traffic model.
@@ -286,9 +293,10 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
 class VectorDrivingEnv(VectorEnv):
     """Step ``num_envs`` :class:`DrivingEnv` in one compiled call; the other arguments are the same.
 
-    Autoreset is Gymnasium's ``NEXT_STEP``: after the last step of an episode, the next step ignores the environment's
-    action and starts its next episode with reward 0. ``info`` has ``scenario_id`` of every environment and, for
-    episodes that end, ``metrics`` as arrays with ``_metrics`` masks. ``render`` returns one picture per environment.
+    Autoreset is Gymnasium's ``NEXT_STEP``: after the last step of an episode, the next step checks but does not execute
+    the environment's action, and starts its next episode with reward 0. ``info`` has ``scenario_id`` of every
+    environment and, for episodes that end, ``metrics`` as arrays with ``_metrics`` masks. ``render`` returns one
+    picture per environment.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -299,6 +307,8 @@ class VectorDrivingEnv(VectorEnv):
         self, num_envs: int = 1, data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, task: Task | None = None,
         render_mode: str | None = None, traffic: str | Traffic = "log", trust: Sequence[str] = (),
     ) -> None:  # fmt: skip
+        if num_envs < 1:
+            raise UsageError(f"num_envs is {num_envs}", cure="use 1 or more")
         self._backend = _Backend(data, task, traffic, trust)
         self.num_envs = num_envs
         self.render_mode = _check_render_mode(render_mode)
@@ -325,11 +335,16 @@ class VectorDrivingEnv(VectorEnv):
         """
         super().reset(seed=seed)
         backend, scenarios = self._backend, _option(options, "scenarios")
-        rows = self._sample_rows() if scenarios is None else list(map(backend.check_row, scenarios))
-        self._rows = np.array(rows, np.int32)
-        if self._rows.shape != (self.num_envs,):
-            problem = f"{len(self._rows)} scenarios for {self.num_envs} environments"
+        try:
+            rows = self._sample_rows() if scenarios is None else list(scenarios)
+        except TypeError as error:
+            problem = f"the reset option 'scenarios' is {scenarios!r}"
+            raise UsageError(problem, cure=f"give a list of {self.num_envs} rows") from error
+        rows = [backend.check_row(row) for row in rows]
+        if len(rows) != self.num_envs:
+            problem = f"{len(rows)} scenarios for {self.num_envs} environments"
             raise UsageError(problem, cure="give one per environment")
+        self._rows = np.array(rows, np.int32)
         self._done[:] = False
         self._state, observation = _reset_all(backend.simulator, backend.bank, self._rows)
         self._extend_paths(np.ones(self.num_envs, bool))
@@ -391,15 +406,19 @@ class VectorDrivingEnv(VectorEnv):
 def make(
     task: str | Task = "optimal", data: Scenarios | str | Path | int = DEFAULT_SCENARIOS, *,
     num_envs: int | None = None, traffic: str | Traffic = "log", render_mode: str | None = None,
+    trust: Sequence[str] = (),
 ) -> DrivingEnv | VectorDrivingEnv:  # fmt: skip
-    """Make an environment for a task or a name in :data:`TASKS`, vectorised if ``num_envs`` is given."""
+    """Make an environment for a task or a name in :data:`TASKS`, vectorised if ``num_envs`` is given.
+
+    The other arguments are those of :class:`DrivingEnv`.
+    """
     if isinstance(task, str):
         if task not in TASKS:
             raise UsageError(f"there is no task {task!r}", cure=did_you_mean(task, TASKS))
         task = TASKS[task]
     if num_envs is None:
-        return DrivingEnv(data, task, render_mode, traffic)
-    return VectorDrivingEnv(num_envs, data, task, render_mode, traffic)
+        return DrivingEnv(data, task, render_mode, traffic, trust)
+    return VectorDrivingEnv(num_envs, data, task, render_mode, traffic, trust)
 
 
 def _check_render_mode(render_mode: str | None) -> Any:

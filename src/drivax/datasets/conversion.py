@@ -65,7 +65,7 @@ class Conversion:
         stride: Steps between the starts of two windows of a longer recording.
         split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
         workers: Processes that read, each a file at a time; 1 reads in the main process.
-        strict: Stop at the first unreadable record instead of skipping it.
+        strict: Stop at the first record that cannot be converted or is a duplicate instead of skipping it.
         overwrite: Replace an existing scenario set, or start again after another, interrupted conversion.
         shard_size: Scenarios per shard of the set, the unit of resume.
     """
@@ -141,10 +141,12 @@ def _key(scenario: Scenario) -> tuple[str, str]:
 def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
     """Yield the recordings of a file, and a bad record for a file or disk that cannot be read.
 
-    Limits of this process (open files, memory) are raised.
+    Limits of this process (open files, memory) and missing packages are raised.
     """
     try:
         yield from reader.read(path)
+    except DataError as error:  # the file cannot be opened
+        yield BadRecord.of(error, path)
     except OSError as error:
         if (unreachable := explain_system(error, path)) is None or not isinstance(unreachable, DataError):
             raise
@@ -165,11 +167,13 @@ def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterato
 
 
 def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    """Call a function; return the bad record of any error in place of a result."""
+    """Call a function; return the bad record of any error but a lack of memory in place of a result."""
     try:
         return function()
     except DrivaxError as error:
         return BadRecord.of(error, path, record)
+    except MemoryError:  # a skipped record would make the set depend on the machine
+        raise
     except Exception as error:  # one odd recording must not end a conversion of a hundred thousand
         problem = f"assembling failed ({type(error).__name__}: {error})"
         return BadRecord(path, record, problem, "report it with this file and record")
@@ -193,8 +197,8 @@ class Converted:
         scenarios: Number of scenarios in it.
         written: Number of those that an interrupted conversion wrote.
         files: Number of files read.
-        ignored: Number of files of unknown format in the folder.
-        formats: Number of files by format.
+        ignored: Number of other files in the folder that are not read, companions (maps, poses) not counted.
+        formats: Number of files by recognised format.
         skipped: Records that could not be read or converted, and duplicates.
         filtered: Number of scenarios that the filters rejected.
         seconds: Wall time.
@@ -237,7 +241,7 @@ def convert(
         UsageError: An option is invalid, ``out`` exists, is being written, or was started with other options, or a
             package that the format needs is missing.
         DataError: ``src`` holds nothing that can be converted, the disk is too small, or with ``strict`` a record
-            is unreadable.
+            cannot be converted or is a duplicate.
     """
     options = options or Conversion()
     options.check()
@@ -278,7 +282,7 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return what must not have changed for a conversion to resume another; of a file only its ends are compared."""
+    """Return what a conversion shares with one that it resumes: options, and path, size and ends of each file."""
     digest = hashlib.sha256()
     for entry in data.inputs:
         size, ends = _ends(entry.path)
@@ -365,7 +369,10 @@ class _Sink:
         return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
 
     def _batch_size(self) -> int:
-        """Return the number of scenarios to wait for: 1 without an audit, else up to the end of the shard or limit."""
+        """Return the number of scenarios to wait for: 1 without an audit, else a batch.
+
+        Without filters a batch ends at the latest where the shard or the limit does.
+        """
         if self._audit is None:
             return 1
         if self._options.filters:  # the number of scenarios that pass is unknown
@@ -387,7 +394,7 @@ class _Sink:
                     raise item.error()
                 self.skipped.append(item)
             elif self._write(next(results), batch[number][1]) or self.full:
-                # A shard is closed: the rest begins a new batch.
+                # A shard is closed, or the limit is reached: the rest begins a new batch.
                 self._waiting = batch[number + 1 :]
                 self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
                 return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,7 @@ _SAMPLE = 24
 _COUNT_FILES = 48
 #: Most files of unknown format that are named.
 _MOST_NAMES = 10
-#: Most notes and flavours that are listed for files of one kind, and runs of missing shards for a family.
+#: Most notes and flavours that are listed for several files of one kind, and runs of missing shards for a family.
 _NOTES, _FLAVOURS, _RUNS = 6, 3, 8
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
@@ -33,14 +34,15 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 class Part:
     """Files of one format, data set and version: ``sample_size`` of them are described, ``whole`` if those are all.
 
-    ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` and
-    ``missing`` are those of all of them.
+    ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` are
+    the most frequent ones, ``missing`` those of all of them. ``convertible`` says whether some file lacks nothing.
     """
 
     format: str
     description: Description
     sample_size: int
     whole: bool
+    convertible: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Diagnosis:
         parts: What can be read in it.
         files: Number of files by recognised format.
         input_bytes: Size of these files and of those that only have the name of a format's files.
-        companions: Number of files that are read along with them; ``ignored`` ones belong to no format.
+        companions: Number of files that belong to them (maps, poses, indices); ``ignored`` is that of all others.
         scenarios: Estimated number of scenarios after conversion; ``set_bytes`` is their size.
         free_bytes: Free space on the disk of ``path``.
         shards: One sentence per family of numbered shards.
@@ -103,7 +105,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
         free_bytes=expected.free_bytes,
         shards=tuple(gaps(data.paths())),
         problems=tuple(problems),
-        convertible=any(not part.description.missing for part in parts),
+        convertible=any(part.convertible for part in parts),
     )
 
 
@@ -121,9 +123,11 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
                 problems.append(description)
             else:
                 groups[name, description.dataset, description.version, step == 1].append(description)
-    return tuple(
-        Part(key[0], _merge(sample), len(sample), key[-1]) for key, sample in groups.items()
-    ), problems
+    parts = [
+        Part(name, _merge(sample), len(sample), whole, any(not file.missing for file in sample))
+        for (name, _, _, whole), sample in groups.items()
+    ]
+    return tuple(parts), problems
 
 
 def _merge(sample: Sequence[Description]) -> Description:
@@ -141,26 +145,29 @@ def _merge(sample: Sequence[Description]) -> Description:
 
 
 def _notes(sample: Sequence[Description]) -> Iterator[str]:
-    """Yield the most frequent notes on some files, each with the number of its files unless all have it."""
+    """Yield the notes on a file, or the most frequent ones on several, with the number of files unless all have it."""
     counts = Counter(note for description in sample for note in dict.fromkeys(description.notes))
-    for note, times in counts.most_common(_NOTES):
+    most = _NOTES if len(sample) > 1 else len(counts)
+    for note, times in counts.most_common(most):
         yield note if times == len(sample) else f"{note} (in {times} of {len(sample)} files)"
-    if len(counts) > _NOTES:
-        yield f"{len(counts) - _NOTES} more notes on single files; name one of them to see its own"
+    if len(counts) > most:
+        more = count_text(len(counts) - most, "more note")
+        yield f"{more}; run drivax doctor on a single file to see all of its own"
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
     """Return a sentence per folder and family of numbered shards (``NAME-00003-of-00150``): how many are there.
 
-    Missing numbers are named if they form at most 8 runs.
+    Missing numbers are named if they form at most 8 runs, families of one name with their folder.
     """
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
             families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
     sentences, folders = [], Counter(prefix for _, prefix, _ in families)
+    root = os.path.commonpath([folder for folder, _, _ in families]) if families else ""
     for (folder, prefix, total), numbers in sorted(families.items()):
-        name = prefix if folders[prefix] == 1 else f"{folder.name}/{prefix}"
+        name = prefix if folders[prefix] == 1 else (folder / prefix).relative_to(root).as_posix()
         missing = sorted(set(range(total)) - numbers)
         if not missing:
             sentences.append(f"{name}: all {total:,} shards")

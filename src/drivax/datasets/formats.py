@@ -17,6 +17,7 @@ from drivax.datasets.scenarionet.reader import ScenarioNet
 from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError, did_you_mean
+from drivax.reading import check_regular
 
 #: Every reader; a new format is one module and one entry here. A file goes to the readers whose patterns it matches,
 #: then to the others, both in this order: those that look at a name or a few bytes come first.
@@ -32,6 +33,7 @@ READERS: tuple[Reader, ...] = (
     ScenarioMax(),
 )
 AUTO = "auto"
+_NAME_FILE = "name a file"
 #: Endings of sensor data and texts, which data sets hold by the hundred thousand: in folders they are never opened.
 _NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
@@ -57,8 +59,9 @@ def detect(path: str | Path) -> Reader:
     """Return the reader that recognises a file.
 
     Raises:
-        DataError: The file is missing, damaged at its beginning, or of no format that drivax reads.
+        DataError: The file is missing, no regular file, damaged at its beginning, or of no format that drivax reads.
     """
+    check_regular(Path(path), _NAME_FILE)
     if (reader := recognise(Path(path))) is None:
         raise unsupported.explain(Path(path))
     return reader
@@ -78,8 +81,8 @@ class Survey:
 
     Attributes:
         inputs: The files to read, sorted by path.
-        companions: Number of files that are read along with them (maps, poses).
-        ignored: Number of other files.
+        companions: Number of files that belong to them (maps, poses, indices).
+        ignored: Number of other files, images among them.
     """
 
     root: Path
@@ -113,7 +116,7 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
         name: A format, or ``auto`` for all of them.
 
     Raises:
-        DataError: ``src`` does not exist, or the folder holds no such file.
+        DataError: ``src`` does not exist or is a pipe or device, or the folder holds no such file.
         UsageError: There is no such format.
     """
     src = Path(src)
@@ -121,6 +124,7 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
     if not src.exists():
         raise DataError("does not exist", file=src, cure="check the path")
     if not src.is_dir():
+        check_regular(src, _NAME_FILE)
         reader = only or recognise(src)
         return Survey(src, (Input(src, None if reader is None else reader.name),))
     readers = READERS if only is None else (only,)
@@ -159,8 +163,9 @@ def _is_visible_file(path: Path, folder: Path) -> bool:
 def _no_input_error(folder: Path, files: int, readers: tuple[Reader, ...]) -> DataError:
     """Return the error for a folder with ``files`` files of which none can be read."""
     names = ", ".join(reader.name for reader in readers)
+    kind = f"of the format {names}" if len(readers) == 1 else f"of a known format ({names})"
     return unsupported.explain_folder(folder) or DataError(
-        f"none of the {files} files in it is of a known format ({names})",
+        f"none of the {files} files in it is {kind}",
         file=folder,
         cure="name the folder that holds the downloaded data; drivax doctor tells more",
     )

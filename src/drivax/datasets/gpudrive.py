@@ -100,7 +100,7 @@ class GpuDrive:
         ]
         if not recording.lights:
             notes.append("no traffic lights; the published files leave out every scenario that has one")
-        if recording.split_gap_m is None:
+        if (parsing.spacing_m(recording.features) or 0.0) > _DENSE_M:
             notes.append("its points were thinned, so it is none of the published files")
         return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
 
@@ -197,7 +197,7 @@ def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
-    """Return numbers of a list of dictionaries, ``[row, key]``; zeros where the first lacks an optional key."""
+    """Return numbers of a list of dictionaries, ``[row, key]``; zeros for an optional key that the first one lacks."""
     try:
         columns = [i for i, key in enumerate(keys) if key not in _OPTIONAL or not rows or key in rows[0]]
         values = np.array([[row[keys[i]] for i in columns] for row in rows], np.float64)

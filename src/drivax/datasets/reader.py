@@ -95,7 +95,7 @@ class Reader(Protocol):
 
     @property
     def companions(self) -> tuple[str, ...]:
-        """File-name patterns of what is read along with those files (maps, poses)."""
+        """File-name patterns of what belongs to those files: maps and poses, which are read, and indices."""
         ...
 
     def recognise(self, path: Path) -> bool:

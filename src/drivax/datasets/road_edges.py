@@ -51,6 +51,7 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
         raise DataError(f"drivable areas cannot be joined ({error})", cure=_AGAIN) from error
     heights = _heights(shapely, rings, np.concatenate(outlines) if outlines else np.zeros((0, 2)))
     split = np.cumsum([len(outline) for outline in outlines])[:-1]
+    # Without outlines ``np.split`` still returns one, empty part.
     return [
         MapFeature(first_id + number, RoadKind.EDGE_BOUNDARY, np.column_stack((outline, z)))
         for number, (outline, z) in enumerate(zip(outlines, np.split(heights, split), strict=False))

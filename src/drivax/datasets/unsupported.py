@@ -30,11 +30,11 @@ _MAGIC = {
         "a shard of a scenario set? name its folder",
     ),
     b"PAR1": (
-        "a parquet file without the columns of Argoverse 2 motion forecasting (WOMD perception v2 has such files)",
+        "a parquet file not named as a scenario of Argoverse 2 (WOMD perception v2 has such files)",
         "use scenario_*.parquet of Argoverse 2, or the motion data set of Waymo (TFRecord)",
     ),
     b"ARROW1": (
-        "a feather file that is not a table of annotations of Argoverse 2",
+        "a feather file not named as annotations of Argoverse 2, annotations.feather",
         "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
     b"SQLite format 3": (
@@ -53,6 +53,10 @@ _JSON = {
     rb'"(lane_segments|drivable_areas)"': (
         "a map of Argoverse 2 without its recording",
         "give the folder that holds the scenario_*.parquet or annotations.feather as well",
+    ),
+    rb'"(first_sample_token|scene_token|sample_token)"': (
+        "a table of nuScenes, but not scene.json with sample.json next to it",
+        "unpack the whole metadata archive (v1.0-*.tgz) and name its folder",
     ),
     rb"": ("JSON of no data set that drivax knows", "give the files of the data set as downloaded"),
 }

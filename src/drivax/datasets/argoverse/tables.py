@@ -118,7 +118,7 @@ def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
     for name in columns:
         if names.count(name) != 1:
             problem = f"has {'several columns' if name in names else 'no column'} {name}"
-            raise DataError(problem, cure="this is another kind of table, or a damaged one")
+            raise DataError(problem, cure="name a table of Argoverse 2, or download it again")
     if not 0 <= rows <= MOST_ROWS:
         raise DataError(f"invalid row count {rows}", cure=_AGAIN)
 

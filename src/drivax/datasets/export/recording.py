@@ -106,7 +106,7 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
     feature, lane, kind = (
         getattr(scenario, f"segment_{name}")[:count].astype(np.int64) for name in ("feature", "lane", "kind")
     )
-    # Without a row in the feature table only kind, lane and ends tell features apart.
+    # Without a row in the feature table only kind, lane and ends tell features apart; numbers above all rows hold both.
     group = np.where(feature >= 0, feature, np.iinfo(np.int16).max + (kind + 1) * 2**16 + lane + 1)
     chains: list[list[int]] = []
     open_ends: dict[tuple[int, bytes], list[int]] = {}

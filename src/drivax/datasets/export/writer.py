@@ -50,6 +50,9 @@ class Export:
 
     def check(self) -> None:
         """Check the options."""
+        for name, choices in (("format", ("set", *_WRITERS)), ("paths", tuple(PATHS))):
+            if (value := getattr(self, name)) not in choices:
+                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(choices)}")
         for name in ("limit", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -82,14 +85,13 @@ def export(
     rows = select_scenarios(scenarios, options.filters, names, options.limit)
     if options.format == "set":
         return write_part(scenarios, rows, out, options.overwrite, progress)
-    write = {"tfexample": _write_examples, "gpudrive": _write_gpudrive}[options.format]
     _refuse_existing(out, options)
     partial = PartialFolder(out)
     partial.open()
     try:
         work = _Work(scenarios, rows, partial.content, out.name, options, progress)
         with explain_full_disk(out):
-            files, lost = write(work)
+            files, lost = _WRITERS[options.format](work)
         write_json(partial.content / NOTE, _note(work, files, +lost))
         _refuse_existing(out, options)  # another process may have written it in the meantime
         partial.publish()
@@ -182,6 +184,12 @@ def _write_gpudrive(work: _Work) -> _Written:
             sync_and_close(file)
         work.report(number)
     return files, Counter()
+
+
+_WRITERS: Mapping[str, Callable[[_Work], _Written]] = {
+    "tfexample": _write_examples,
+    "gpudrive": _write_gpudrive,
+}
 
 
 def _note(work: _Work, files: Sequence[str], lost: Mapping[str, int]) -> dict[str, Any]:

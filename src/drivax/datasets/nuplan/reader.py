@@ -26,7 +26,7 @@ from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
 _NAME = "nuplan"
 #: Tables by which a nuPlan log is recognised among SQLite files.
 _SIGNATURE = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
-#: Tables and columns that are read; a file with all of these tables is a nuPlan log.
+#: Tables and columns that are read; a log that lacks one is refused.
 TABLES: Mapping[str, tuple[str, ...]] = {
     "log": ("logfile", "map_version"),
     "lidar_pc": ("token", "ego_pose_token", "scene_token", "timestamp"),
@@ -52,7 +52,7 @@ EGO_SIZE_M = (5.176, 2.297, 1.777)
 #: From the rear axle, where ego poses are, to the middle of the box: (front 4.049 m - rear 1.127 m) / 2.
 REAR_AXLE_TO_CENTRE_M = 1.461
 EGO_TRACK_ID = 0
-#: More than one missing lidar sweep is a gap; no recording spans a gap.
+#: Two missing lidar sweeps at 20 Hz, or one at 10 Hz, are a gap; no recording spans a gap.
 _GAP_US = 120_000
 #: Longer scenes are read in pieces of this many steps, a multiple of the usual stride of windows.
 _LONGEST_PIECE = 400
@@ -149,7 +149,7 @@ class Piece:
         name: Token of the scene in hexadecimal digits, and a number where a name occurs again.
         scene: Token of the scene.
         sweeps: Rows of the time line, one per step of 0.1 s.
-        scene_sweeps: Rows of the scene or its part alone, first and one past the last.
+        scene_sweeps: Rows of the scene or its part alone, first and one past the last (of 20 Hz perhaps one too many).
     """
 
     name: str

@@ -71,8 +71,8 @@ class NuScenes:
     name: str = "nuscenes"
     patterns: tuple[str, ...] = ("v1.0-*/scene.json",)
     companions: tuple[str, ...] = (
-        *(f"v1.0-*/{table}.json" for table in (*_TABLES[:-1], *_OTHERS)),
-        "maps/*.png", "maps/*.json", "expansion/*.json", "maps/*/*.json", "maps/*/*.png",
+        *(f"v1.0-*/{table}.json" for table in (*_TABLES, *_OTHERS) if table != "scene"),
+        "maps/*.json", "expansion/*.json", "maps/*/*.json",
     )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
@@ -93,12 +93,15 @@ class NuScenes:
         ]
         if not has_annotations(folder):
             notes.append("no annotations (as in the test split): there is nothing to convert")
+            missing.append(f"{folder.name}/sample_annotation.json with annotations")
         flavour, scenes = "tables of 2 Hz keyframes", len(scene_rows(folder))
         return Description("nuScenes", flavour, folder.name, scenes, tuple(notes), tuple(missing))
 
     def count(self, path: Path) -> int:
-        """Return the number of scenes times the windows of a usual one; 0 if the table is unreadable."""
+        """Return the number of scenes times the windows of a usual one; 0 if unreadable or without annotations."""
         try:
+            if not has_annotations(path.parent):
+                return 0
             return len(scene_rows(path.parent)) * windows_of(_SCENE_STEPS)
         except DataError:
             return 0

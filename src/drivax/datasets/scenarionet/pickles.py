@@ -344,7 +344,7 @@ def as_text(value: Any) -> str | None:
 
 
 def as_int(value: Any) -> int | None:
-    """Return an integer, also from a text; None for anything else."""
+    """Return an integer of up to 18 digits, also from a text; None for a negative one and anything else."""
     text = as_text(value)
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else None
 

@@ -61,9 +61,8 @@ class WomdExample(womd.TfRecordReader):
             )
         if "paths" in recording.lost:
             notes.append("path_samples are not used: routes are computed again")
-        version = (
-            "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1" if recording.features else None
-        )
+        has_spacing = parsing.spacing_m(recording.features) is not None
+        version = "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1" if has_spacing else None
         return Description(womd.FULL_NAME, _FLAVOUR, version, count_records(path), tuple(notes))
 
 

@@ -158,6 +158,7 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
             bodies[message.id] = kind, body, blobs
     points = read_table([blob for *_, blobs in bodies.values() for blob in blobs], POINTS)
     ends = np.cumsum([len(blobs) for *_, blobs in bodies.values()], dtype=np.int64)[:-1]
+    # Without features ``np.split`` still returns one, empty part.
     features = tuple(
         _feature(feature_id, kind, body, line.copy())
         for (feature_id, (kind, body, _)), line in zip(bodies.items(), np.split(points, ends), strict=False)
