@@ -214,6 +214,7 @@ def test_training_sets_of_a_planner(tmp_path):
     assert runs.policy_training_sets(trained) == runs.policy_training_sets(f"{trained}@1000") == data
     assert runs.policy_training_sets(str(tmp_path / "judged")) == runs.policy_training_sets("idm") == []
     assert [entry["scenarios"] for entry in runs.policy_training_sets("zoo:aggressive")] == [4096]
+    assert runs.policy_folder(Path("zoo:aggressive")) == runs.policy_folder("zoo:aggressive")
     # What the run learned from whose networks it began with counts too, each set once.
     former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
     RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})

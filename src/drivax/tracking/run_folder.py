@@ -271,7 +271,7 @@ def policy_folder(name: str | Path) -> Path:
     """
     if not str(name).startswith(ZOO):
         return Path(name)
-    if name not in zoo():
+    if str(name) not in zoo():
         raise UsageError(f"no policy {str(name)!r} in the zoo", cure=f"use {', '.join(zoo())}")
     return _ZOO_FOLDER / str(name).removeprefix(ZOO)
 
