@@ -84,6 +84,8 @@ def test_names_in_a_file_may_contain_line_breaks_of_unicode(tmp_path):
         ({"filters": ["type=merge", "place=boston"]}, DataError, "is selected; use fewer filters or other names"),
         ({"filters": ["lights=5"]}, DataError, "no scenario is selected by 'lights=5'; drop this filter"),
         ({"names": ["log-7" * 99]}, DataError, "is not in the set"),  # longer than any path
+        ({"filters": "type=merge"}, UsageError, "filters are the text 'type=merge'; give a list: ['type=merge']"),
+        ({"names": "log-1"}, UsageError, "scenario names are the text 'log-1'; give a list"),
         ({"limit": 0}, UsageError, "--limit 0 leaves no scenario; use 1 or more"),
     ],
 )  # fmt: skip

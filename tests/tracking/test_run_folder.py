@@ -234,5 +234,8 @@ def test_steps_of_runs():
 def test_edited_files_are_a_list(tmp_path: Path, edited: object):
     """The letters of a text would be noted as files."""
     run = RunFolder.create(tmp_path / "run", Config()).note(edited=edited)
-    with allow_edited(), pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type"):
+    with (
+        allow_edited(),
+        pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type list\)"),
+    ):
         RunFolder.open(run.path)

@@ -200,7 +200,7 @@ def _check_info(info: Any) -> None:
         raise ValueError("not a JSON object")
     for name, kind in _ENTRIES.items():
         if not isinstance(info.get(name), kind | None):
-            raise ValueError(f"{name} is not of type {kind}")
+            raise ValueError(f"{name} is not of type {getattr(kind, '__name__', kind)}")
     _check_data(info)
     validation, divergence = info.get("validation"), info.get("divergence")
     for recording in validation["recordings"] if isinstance(validation, dict) else ():

@@ -182,6 +182,7 @@ class Selection:
     @classmethod
     def parse(cls, filters: Sequence[str]) -> Selection:
         """Parse filters such as ``type=turn_left|turn_right`` or ``audit.distance_m>5``."""
+        _refuse_text(filters, "filters")
         return cls(tuple(Filter.parse(text) for text in filters))
 
     def matches(self, entry: Mapping[str, Any]) -> bool:
@@ -242,6 +243,7 @@ def select_scenarios(
     if limit is not None and limit < 1:
         raise UsageError(f"--limit {limit} leaves no scenario", cure="use 1 or more")
     selection = Selection.parse(filters)
+    _refuse_text(names, "scenario names")
     by_name = _rows_by_name(data, names) if names else None
     rows = [row for row in selection.rows(data.entries) if by_name is None or row in by_name]
     if not rows:
@@ -342,6 +344,11 @@ def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float |
     if quantity.words and word not in quantity.words:
         raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
     return word
+
+
+def _refuse_text(items: Sequence[Any], what: str) -> None:
+    if isinstance(items, str):
+        raise UsageError(f"{what} are the text {items!r}", cure=f"give a list: [{items!r}]")
 
 
 def _refusal(text: str, problem: str, cure: str) -> UsageError:
