@@ -221,7 +221,10 @@ def test_training_sets_of_a_planner(tmp_path):
     assert runs.policy_training_sets(trained) == [*data, former[1]]
 
 
-def test_steps_of_runs():
+def test_steps_of_runs(tmp_path):
+    (tmp_path / "me@home").mkdir()
+    for path in (str(tmp_path / "me@home"), "me@host/runs/a"):
+        assert runs.run_and_step(path) == (path, None) and runs.run_and_step(f"{path}@5") == (path, 5)
     assert runs.run_and_step("runs/a") == ("runs/a", None) and runs.run_and_step("runs/a@20") == (
         "runs/a",
         20,

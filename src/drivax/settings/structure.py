@@ -126,7 +126,9 @@ def _to_literal(value: Any, cls: Any) -> Any:
         for literal in options:
             if type(candidate) in (type(literal), Flag) and candidate == literal:
                 return literal
-    near = did_you_mean(str(value), [str(candidate) for candidate in options])
+    names = [str(option) for option in options]
+    quotes = "without quotes" if isinstance(value, str) else "in quotes"
+    near = f"write it {quotes}" if str(value) in names else did_you_mean(str(value), names)
     raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, options))}; {near}")
 
 
