@@ -287,11 +287,11 @@ def _exists(path: str) -> bool:
 def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
     """Return the error for one or more names that are not in the set; it lists the first three."""
     first, others = missing[0], missing[1:]
-    requested_id = first.text.rpartition("\t")[2]
+    scenario_id = first.text.rpartition("\t")[2]
     datasets = sorted(
-        {str(entry["dataset"]) for entry in data.entries if entry["scenario_id"] == requested_id}
+        {str(entry["dataset"]) for entry in data.entries if entry["scenario_id"] == scenario_id}
     )
-    near = difflib.get_close_matches(requested_id, [str(entry["scenario_id"]) for entry in data.entries], n=1)
+    near = difflib.get_close_matches(scenario_id, [str(entry["scenario_id"]) for entry in data.entries], n=1)
     cure = "use ids that drivax inspect --json lists"
     if datasets and not others:
         cure = f"the set has this id in data set {', '.join(datasets)}"
