@@ -54,6 +54,7 @@ class Training:
     network: Network = field(default_factory=Network)
     weights: dict[str, float] = field(default_factory=dict)
     limit: int | str = 3
+    level: Literal["1", 2] = "1"
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,7 @@ def test_scalars_by_the_core_rules(text: str, value: object):
         ("network: {hidden: '256'}", r"^network\.hidden: '256' is not a list"),
         ("network: {hidden: [256, x]}", r"^network\.hidden\[1\]: 'x' is not an integer"),
         ("network: {activation: rleu}", r"^network\.activation: 'rleu' is not one of relu, gelu, tanh; did you mean"),
+        ("level: 1", r"^level: '1' is not one of 1, 2; write it in quotes"),
         ("network: {optimizer: {betas: [0.9]}}", r"^network\.optimizer\.betas: 1 values, not 2"),
         ("network: {optimizer: {lr: true}}", r"^network\.optimizer\.lr: True is not a number"),
         ("optimizer: {lr: 1, kind: rmsprop}", r"^optimizer: unknown kind 'rmsprop'; use one of adam, sgd"),

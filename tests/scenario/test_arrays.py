@@ -119,6 +119,16 @@ def test_missing_sizes_are_defaults_of_ego_and_of_the_class(agents, roads):
     np.testing.assert_allclose(recording_from_arrays("a", agents, roads).tracks.z[:, 40], [0.75, 0.8])
 
 
+def test_a_stop_point_without_height_is_at_the_height_of_its_lane(agents, roads):
+    roads["lanes"][0]["points"] = [(-50, 0, 30.0), (50, 0, 36.0)]
+    agents["z"] = np.full((2, 91), 33.0)
+    states = ["red"] * 91
+    lights = [{"lane": 0, "states": states, "stop_point": p} for p in ((45, 0), (45, 0, 35.0))]
+    lights.append({"lane": 1, "states": states, "stop_point": (60, 0)})
+    recording = recording_from_arrays("a", agents, roads, lights)
+    assert [float(light.stop_point[2]) for light in recording.lights] == [36.0, 35.0, 0.0]
+
+
 def test_long_recordings_are_cut_into_windows(agents, roads):
     long = {name: np.repeat(np.array(agents[name]), 2, axis=1) for name in ("xy", "heading", "valid")}
     long["xy"][0, :, 0] = np.arange(182)
@@ -144,6 +154,13 @@ WRONG = {
     'roads["lanes"][0]["points"] has shape (1, 2)': lambda a, r: r["lanes"][0].update(points=[(0, 0)]),
     'roads["lanes"][2]["points"] is not an array': lambda a, r: r["lanes"][2].update(points="abc"),
     'roads["edges"][0] has a point that is not finite': lambda a, r: r["edges"].insert(0, [(0, 0), (0, np.nan)]),
+    'agents["id"] has a number that is no integer': lambda a, r: a.update(id=[1.2, 1.7]),
+    "agents[\"kind\"] is 'vehicle'": lambda a, r: a.update(kind="vehicle"),
+    'roads["lanes"] is 3': lambda a, r: r.update(lanes=3),
+    'roads["lanes"][0]["points"] is missing': lambda a, r: r["lanes"][0].pop("points"),
+    'roads["lanes"][0]["successors"] is 0.5': lambda a, r: r["lanes"][0].update(successors=0.5),
+    'roads["lanes"][0]["kind"] is <RoadKind.EDGE': lambda a, r: r["lanes"][0].update(kind=RoadKind.EDGE_BOUNDARY),
+    "roads[\"lanes\"][0][\"limit_mps\"] is 'fast'": lambda a, r: r["lanes"][0].update(limit_mps="fast"),
     'roads["stop_signs"][0] names lane 9': lambda a, r: r["stop_signs"][0].update(lanes=[9]),
 }  # fmt: skip
 
@@ -163,6 +180,10 @@ def test_other_errors_name_their_argument(agents, roads):
         scenario_from_arrays("a", agents, roads, route=[7])
     with pytest.raises(UsageError, match=r'lights\[0\]\["states"\] has 3 entries, not 91'):
         scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["red"] * 3}])
+    with pytest.raises(UsageError, match=r'lights\[0\]\["lane"\] is missing'):
+        scenario_from_arrays("a", agents, roads, [{"states": ["red"] * 91}])
+    with pytest.raises(UsageError, match=r'lights\[0\]\["states"\] is .red.; give a list'):
+        scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": "red"}])
     with pytest.raises(UsageError, match=r'lights\[0\]\["lane"\] names 2 lanes'):
         scenario_from_arrays("a", agents, roads, [{"lane": [0, 1], "states": ["red"] * 91}])
     with pytest.raises(UsageError, match=r"lights\[0\].*'blue'"):

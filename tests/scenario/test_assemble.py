@@ -340,9 +340,11 @@ REFUSED = [
     (broken(tracks=unchecked(TRACKS, z=TRACKS.z[:, 1:])), r"tracks.z has shape \(4, 90\), not \(4, 91\)"),
     (with_tracks(kind=at(TRACKS.kind, 0, 77)), "an agent kind is unknown"),
     (with_tracks(track_id=at(TRACKS.track_id, 0, 2**31)), "track ids do not fit"),
-    (broken(ego=9), "a track row out of 4"),
-    (broken(to_predict=(4,)), "a track row out of 4"),
+    (broken(ego=9), "track row 9 of 4 tracks"),
+    (broken(to_predict=(4,)), "track row 4 of 4 tracks"),
     (broken(current_step=91), "current step 91 of 91 steps"),
+    (broken(timestamps_s=np.zeros(0)), "there are no steps"),
+    (broken(features=(unchecked(SIGN, kind=99),)), "feature 41 is of unknown kind 99"),
     (broken(timestamps_s=np.zeros(91)), "timestamps do not increase"),
     (broken(timestamps_s=np.arange(91) * 0.5), "steps of 0.500 s instead of 0.1 s; resample"),
     (broken(scenario_id="a\nb"), r"scenario_id 'a\\nb' is empty or contains control characters"),
@@ -404,6 +406,8 @@ def test_long_recordings_must_be_cut_with_windows():
     assert [len(list(windows(long, stride=stride))) for stride in (1, 91, 109, 110)] == [110, 2, 2, 1]
     short = make_recording()
     assert [w is short for w in windows(short)] == [True]
+    with pytest.raises(UsageError, match="a length of 0 steps"):
+        next(windows(long, length=0))
     assert [w.current_step for w in windows(replace(short, current_step=20))] == [10]
     assert [(w.scenario_id, len(w.timestamps_s)) for w in windows(long, 20, 161)] == [
         ("hand-made@0", 161), ("hand-made@20", 161),

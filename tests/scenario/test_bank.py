@@ -122,6 +122,9 @@ def test_sizes_that_are_too_small_are_refused_by_name():
         small = replace(used, **{name: least - 1})
         with pytest.raises(UsageError, match=rf"too small: {name} {least - 1} < {least}; use Sizes.used"):
             ScenarioBank.from_scenarios([scenario], trim=small)
+    large = Sizes.whole(replace(scenario.capacity, agents=128))
+    with pytest.raises(UsageError, match="too large: agents 128 > 80 of the capacity"):
+        ScenarioBank.from_scenarios([scenario], trim=large)
 
 
 def test_segments_of_lanes_that_do_not_fit_have_no_lane():

@@ -24,7 +24,7 @@ class Set:
     path: Path = Path("sets/made")
     entries: list = field(
         default_factory=lambda: [
-            entry(0, type="straight", place="boston"),
+            entry(0, type="straight", place="boston", lights="yes"),
             entry(1, type="turn_left", place="boston"),
             entry(2, type="turn_left"),
             entry(3, type="merge", place="singapore"),
@@ -62,6 +62,13 @@ def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
     assert select_scenarios(Set(), names=[Path("log-3")]) == [0]
 
 
+def test_names_in_a_file_may_contain_line_breaks_of_unicode(tmp_path):
+    data, name = Set(), "log\u20285"
+    data.entries[2]["scenario_id"] = name
+    (tmp_path / "some.txt").write_text(f"log-3\none\t{name}\n")
+    assert select_scenarios(data, names=[tmp_path / "some.txt"]) == [2, 3]
+
+
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
@@ -75,6 +82,10 @@ def test_names_may_include_a_file_of_names(tmp_path, monkeypatch):
         ({"filters": ["place=bostn"]}, DataError, "no scenario is selected by 'place=bostn'; did you mean 'boston'?"),
         ({"filters": ["type=u_turn"]}, DataError, "by 'type=u_turn'; use one of merge, straight, turn_left"),
         ({"filters": ["type=merge", "place=boston"]}, DataError, "is selected; use fewer filters or other names"),
+        ({"filters": ["lights=5"]}, DataError, "no scenario is selected by 'lights=5'; drop this filter"),
+        ({"names": ["log-7" * 99]}, DataError, "is not in the set"),  # longer than any path
+        ({"filters": "type=merge"}, UsageError, "filters are the text 'type=merge'; give a list: ['type=merge']"),
+        ({"names": "log-1"}, UsageError, "scenario names are the text 'log-1'; give a list"),
         ({"limit": 0}, UsageError, "--limit 0 leaves no scenario; use 1 or more"),
     ],
 )  # fmt: skip

@@ -110,5 +110,9 @@ def test_crowded_runs_are_thinned_and_counted_and_refused_near_the_log():
     assert arranged.segments.middle[:, 0].max() < 301.0  # the nearest ones stay
     with pytest.raises(DataError, match=r"20 road-edge segments .* larger capacity"):
         arrange(segments, np.array([[295.0, 0.0]]), 100.0, tight)
+    # No capacity holds what lies outside the square.
+    long = cut(road_lines([edge(1, line((0, 5), (900, 5)))], np.zeros(3), None))
+    with pytest.raises(DataError, match=r"shorten --future-s: the log leaves the map's square of 640 m"):
+        arrange(long, line((0, 0), (900, 0))[:, :2], 100.0, CAPACITY)
     runs = arranged.grid.runs(np.diff(arranged.edge_start))
     assert runs.max() == 10

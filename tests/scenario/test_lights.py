@@ -46,6 +46,19 @@ def test_a_light_without_its_lane_takes_the_nearest_direction_or_is_counted():
     assert len(placed((), []).z) == 0
 
 
+def test_a_light_without_its_lane_ignores_lanes_on_a_bridge():
+    road, bridge = lane(1, line((0, 0), (40, 0))), lane(2, line((10, 40), (10, -40), z=6.0))
+    far = lane(3, line((0, 60), (40, 60)))
+    below, above = light(77, 10, 1.5, [4]), light(78, 10, 1.5, [4])
+    above.stop_point[2] = 6.0
+    for order in ((road, bridge), (bridge, road)):
+        assert placed(order, [below, above]).heading == pytest.approx([0.0, -np.pi / 2])
+    assert placed((bridge, far), [below]).overflow == {"lights_without_lane": 1}
+    # On a map of one level the height may be that of the lamp.
+    above.stop_point[2] = 5.0
+    assert placed((road,), [above]).heading == [0.0]
+
+
 def test_the_nearest_lights_are_kept():
     features = tuple(lane(i, line((10 * i, 0), (10 * i, 9))) for i in range(5))
     lights = placed(features, [light(i, 10 * i, 0, [4]) for i in (3, 1, 4, 0, 2)], most=3)

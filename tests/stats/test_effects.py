@@ -75,6 +75,8 @@ def test_power_at_its_ends():
         lambda: scenarios_needed(0.0),
         lambda: scenarios_needed(math.nan),
         lambda: scenarios_needed(0.1, 1.0),
+        lambda: power(math.nan, 10),
+        lambda: detectable_effect(100, 1.5),
     ],
 )
 def test_impossible_arguments_are_refused_in_one_line(call):

@@ -205,6 +205,11 @@ def test_coverage_of_clustered_data():
         lambda: bootstrap_mean([1.0, 2.0], resamples=0, seed=0),
         lambda: bootstrap_mean([1.0, 2.0], confidence=0.0, seed=0),
         lambda: paired_bootstrap([1.0], [1.0, 2.0], seed=0),
+        lambda: split_bootstrap([1.0, 2.0], np.array([True, False]), ["a", "a"], seed=0),
+        lambda: per_event(3, 10.0, confidence=95),
+        lambda: per_event(-1, 10.0),
+        lambda: rate(["yes"]),
+        lambda: rate([[1.0], [1.0, 0.0]]),
     ],
 )
 def test_impossible_arguments_are_refused_in_one_line(call):
@@ -218,7 +223,8 @@ def test_interquartile_bootstrap_of_equal_seeds_is_that_of_their_episodes():
     one, alone = interquartile_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
     assert one.mean == pytest.approx(alone.mean)
     assert (one.low, one.high) == pytest.approx((alone.low, alone.high), abs=0.02)
-    # Seeds that differ widen it; without defined values it is undefined.
+    # Seeds that differ widen it; without seeds or defined values it is undefined.
+    assert interquartile_bootstrap([], seed=0).mean is None
     assert interquartile_bootstrap([row - 1, row, row + 1], seed=0).low < one.low - 0.2
     assert interquartile_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
     assert interquartile_bootstrap([[1.0, 2.0]], ["a", "a"], seed=0) == Interval(1.5, None, None, 2)

@@ -76,6 +76,12 @@ def test_invalid_arguments_are_refused():
             measure(SCORES, np.zeros(150, bool))
     with pytest.raises(UsageError, match="two positives and two negatives"):
         auc_interval(SCORES, np.arange(150) == 0)
+    with pytest.raises(UsageError, match="confidence is 95"):
+        auc_interval(SCORES, LABELS, 95)
+    with pytest.raises(UsageError, match="resamples is 0"):
+        bootstrap_intervals(SCORES, LABELS, WEIGHTS, np.arange(150), resamples=0)
+    with pytest.raises(UsageError, match="resamples is 0"):
+        correlation_interval(SCORES, SCORES, np.arange(150), resamples=0)
 
 
 def test_rank_correlation_equals_scipy():

@@ -208,6 +208,13 @@ def test_undefined_scenarios_are_excluded_and_too_few_are_refused():
         crossed_difference(a, b[:, :2])
 
 
+def test_impossible_confidence_and_power_are_refused():
+    effect = crossed_mean(np.array([[1.0, 0.0], [1.0, 1.0]]))
+    for call in (effect.interval, effect.detectable, lambda confidence: effect.power(0.1, confidence)):
+        with pytest.raises(UsageError, match=r"confidence is 95|power 95 is impossible"):
+            call(95)
+
+
 def test_seeds_interval():
     rng = np.random.default_rng(0)
     values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2

@@ -139,6 +139,12 @@ def test_permutation_of_arms_keeps_to_strata():
     assert split_permutation(values, np.ones(4, bool), seed=0).p is None
 
 
+def test_permutation_of_more_than_a_thousand_pairs():
+    x = np.random.default_rng(0).normal(size=1100)
+    result = paired_permutation(x, np.zeros(1100), resamples=50, seed=0)
+    assert result.units == 1100 and not result.exact and 0.0 < result.p < 1.0
+
+
 def test_holm_by_hand():
     # Sorted 0.01, 0.02, 0.03, 0.5 of four: 0.04, 0.06, 0.06, 0.5; None counts for nothing.
     assert holm_adjust([0.03, 0.01, None, 0.5, 0.02]) == pytest.approx(

@@ -163,7 +163,7 @@ def test_files_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
         (tmp_path / name).mkdir()
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.steps() == []
-    with pytest.raises(DataError, match="no checkpoint found; start the training again, without --resume"):
+    with pytest.raises(DataError, match="no checkpoint found; start the training again, with --overwrite"):
         checkpoints.restore({"a": 0})
 
 

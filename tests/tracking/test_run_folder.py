@@ -214,13 +214,17 @@ def test_training_sets_of_a_planner(tmp_path):
     assert runs.policy_training_sets(trained) == runs.policy_training_sets(f"{trained}@1000") == data
     assert runs.policy_training_sets(str(tmp_path / "judged")) == runs.policy_training_sets("idm") == []
     assert [entry["scenarios"] for entry in runs.policy_training_sets("zoo:aggressive")] == [4096]
+    assert runs.policy_folder(Path("zoo:aggressive")) == runs.policy_folder("zoo:aggressive")
     # What the run learned from whose networks it began with counts too, each set once.
     former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
     RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})
     assert runs.policy_training_sets(trained) == [*data, former[1]]
 
 
-def test_steps_of_runs():
+def test_steps_of_runs(tmp_path):
+    (tmp_path / "me@home").mkdir()
+    for path in (str(tmp_path / "me@home"), "me@host/runs/a"):
+        assert runs.run_and_step(path) == (path, None) and runs.run_and_step(f"{path}@5") == (path, 5)
     assert runs.run_and_step("runs/a") == ("runs/a", None) and runs.run_and_step("runs/a@20") == (
         "runs/a",
         20,
@@ -233,5 +237,8 @@ def test_steps_of_runs():
 def test_edited_files_are_a_list(tmp_path: Path, edited: object):
     """The letters of a text would be noted as files."""
     run = RunFolder.create(tmp_path / "run", Config()).note(edited=edited)
-    with allow_edited(), pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type"):
+    with (
+        allow_edited(),
+        pytest.raises(DataError, match=r"run\.json: is damaged \(edited is not of type list\)"),
+    ):
         RunFolder.open(run.path)

@@ -13,7 +13,7 @@ import time
 import pytest
 
 from drivax.datasets import spool
-from drivax.errors import DataError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import CAPACITIES
 from drivax.synthetic import generate
 from drivax.tracking import workers
@@ -121,6 +121,12 @@ def test_closed_terminal_ends_a_pool_silently(tmp_path):
 
 def test_each_task_has_one_core():
     assert sorted(one_core_each(on_which_cores, [3, 1, 2], cores=2)) == [(n, (n, 1)) for n in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("cores", [0, -1])
+def test_no_cores_are_refused(cores):
+    with pytest.raises(UsageError, match=f"the number of cores is {cores}; use 1 or more"):
+        next(one_core_each(on_which_cores, [1], cores))
 
 
 def send_half():

@@ -13,7 +13,16 @@ from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.tracks import DEFAULT_EGO_SIZE, DEFAULT_SIZES
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate, interpolate
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
+from drivax.scenario.schema import (
+    CURRENT_STEP,
+    DT_S,
+    LANE_KINDS,
+    AgentKind,
+    Flag,
+    LightState,
+    RoadKind,
+    Scenario,
+)
 
 Array = np.ndarray[Any, Any]
 
@@ -47,8 +56,8 @@ def recording_from_arrays(
             where they touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional:
             ``crosswalks``, polygons; ``stop_signs``, mappings with ``point`` and ``lanes`` (indices).
         lights: Mappings with ``lane`` (index), ``states``, one per step ("red", "yellow", "green", "unknown", None
-            if unobserved, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``
-            (otherwise the beginning of the lane).
+            if unobserved, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``, x, y or
+            x, y, z (otherwise the beginning of the lane; without z at the height of the lane).
         route: Indices of the lanes of the intended route in order, if known.
         ego: Row of the agent that is driven.
         dt_s: Seconds between steps; resample other steps than 0.1 first (:func:`resample`).
@@ -62,6 +71,7 @@ def recording_from_arrays(
         raise UsageError(f"dt_s is {dt_s}, scenarios have steps of {DT_S} s", cure=cure)
     _check_keys(agents, _AGENT_KEYS, "agents")
     _check_keys(roads, _ROAD_KEYS, "roads")
+    roads = {name: _items(values, f'roads["{name}"]') for name, values in roads.items()}
     features = tuple(_features(roads))
     has_heights = any(feature.points[:, 2].any() for feature in features)
     tracks = _tracks(agents, ego, needs_z=has_heights)
@@ -76,7 +86,9 @@ def recording_from_arrays(
         ego=ego,
         tracks=tracks,
         features=features,
-        lights=tuple(_light(light, f"lights[{i}]", lanes, steps) for i, light in enumerate(lights)),
+        lights=tuple(
+            _light(light, f"lights[{i}]", lanes, steps) for i, light in enumerate(_items(lights, "lights"))
+        ),
         route_lanes=_lane_indices(route, len(lanes), "route"),
         flags=Flag.NONE if "velocity" in agents else Flag.DIFFERENTIATED_VELOCITY,
         tags={"source_format": "arrays"},
@@ -133,6 +145,23 @@ def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
             raise UsageError(f"{what} has no {key!r}", cure=f"use {', '.join(keys)}")
 
 
+def _items(values: Any, what: str) -> list[Any]:
+    """Return the items of a list."""
+    try:
+        if not isinstance(values, str):
+            return list(values)
+    except TypeError:
+        pass
+    raise UsageError(f"{what} is {values!r}", cure="give a list")
+
+
+def _number(value: Any, what: str) -> float | None:
+    try:
+        return None if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{what} is {value!r}", cure="give a number") from error
+
+
 def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
     """Return an array of the agents, of a shape in which None is any size."""
     if name not in agents:
@@ -178,13 +207,15 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_z: bool) -> Tracks:
         # The roads are at z = 0, so the centre of a box is at half its height.
         z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default[:, None]) / 2, valid)
     heading = _zero_invalid(_array(agents, "heading", float, (count, steps)), valid)
-    track_id = _array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count)
-    return Tracks(xy, z, heading, velocity, size, valid, kind, track_id)
+    track_id = _array(agents, "id", float, (count,)) if "id" in agents else np.arange(count)
+    if (track_id != np.floor(track_id)).any():
+        raise UsageError('agents["id"] has a number that is no integer', cure="number the agents")
+    return Tracks(xy, z, heading, velocity, size, valid, kind, track_id.astype(np.int64))
 
 
 def _kinds(agents: Mapping[str, Any], count: int) -> Int8[np.ndarray, " agent"]:
-    kinds = agents.get("kind", ["vehicle"] * count)
-    if isinstance(kinds, str) or len(kinds) != count:
+    kinds = _items(agents.get("kind", ["vehicle"] * count), 'agents["kind"]')
+    if len(kinds) != count:
         raise UsageError(f'agents["kind"] has {len(kinds)} entries, not {count}', cure="give one per agent")
     codes = [_member(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(kinds)]
     return np.array(codes, np.int8)
@@ -241,13 +272,17 @@ def _points(line: Any, what: str, least: int) -> Array:
 
 def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
     _check_keys(lane, _LANE_KEYS, what)
-    limit, width = lane.get("limit_mps"), lane.get("width_m")
+    if "points" not in lane:
+        raise UsageError(f'{what}["points"] is missing', cure="see recording_from_arrays")
+    kind = _member(lane.get("kind", "surface"), _LANE_KINDS, RoadKind, f'{what}["kind"]')
+    if kind not in LANE_KINDS:
+        raise UsageError(f'{what}["kind"] is {kind!r}', cure=f"use {', '.join(map(repr, _LANE_KINDS))}")
     return MapFeature(
         feature_id=number,
-        kind=_member(lane.get("kind", "surface"), _LANE_KINDS, RoadKind, f'{what}["kind"]'),
-        points=_points(lane.get("points"), f'{what}["points"]', 2),
-        limit_mps=None if limit is None else float(limit),
-        width_m=None if width is None else float(width),
+        kind=kind,
+        points=_points(lane["points"], f'{what}["points"]', 2),
+        limit_mps=_number(lane.get("limit_mps"), f'{what}["limit_mps"]'),
+        width_m=_number(lane.get("width_m"), f'{what}["width_m"]'),
         successors=_lane_indices(lane.get("successors", ()), lanes, f'{what}["successors"]'),
         left_neighbours=_lane_indices(lane.get("left", ()), lanes, f'{what}["left"]'),
         right_neighbours=_lane_indices(lane.get("right", ()), lanes, f'{what}["right"]'),
@@ -256,7 +291,7 @@ def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
 
 def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
     """Check one or several indices of lanes, and return a tuple."""
-    rows = [indices] if isinstance(indices, int | np.integer) else list(indices)
+    rows = [indices] if isinstance(indices, int | np.integer) else _items(indices, what)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
             raise UsageError(f"{what} names lane {row!r}, there are {lanes}", cure="count lanes from 0")
@@ -265,13 +300,18 @@ def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
 
 def _light(light: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
     _check_keys(light, _LIGHT_KEYS, what)
-    indices = _lane_indices(light.get("lane", -1), len(lanes), f'{what}["lane"]')
+    for name in ("lane", "states"):
+        if name not in light:
+            raise UsageError(f'{what}["{name}"] is missing', cure="see recording_from_arrays")
+    indices = _lane_indices(light["lane"], len(lanes), f'{what}["lane"]')
     if len(indices) != 1:
         raise UsageError(f'{what}["lane"] names {len(indices)} lanes', cure="give one light per lane")
-    states = list(light.get("states", ()))
+    states = _items(light["states"], f'{what}["states"]')
     if len(states) != steps:
         raise UsageError(f'{what}["states"] has {len(states)} entries, not {steps}', cure="give one per step")
     codes = [_member(state, _COLOURS, LightState, f'{what}["states"]') for state in states]
-    stop = light.get("stop_point")
-    point = lanes[indices[0]].points[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
+    stop, line = light.get("stop_point"), lanes[indices[0]].points
+    point = line[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
+    if stop is not None and len(stop) == 2:
+        point[2] = line[np.hypot(*(line[:, :2] - point[:2]).T).argmin(), 2] + 0.0
     return Light(indices[0], point, np.array(codes, np.int8))

@@ -20,11 +20,13 @@ STEP_TOLERANCE_S = 0.005
 #: Deviation of a step from the median above which a recording is resampled, s; length of a gap, in median steps.
 LATE_S, GAP_STEPS = 0.02, 2.5
 DATASET_BYTES = 16
-#: Largest distance from the ego and largest speed; beyond them a track or file is damaged or its unit is not the metre.
+#: Largest distance from the ego and largest speed, both along an axis; beyond them a track or file is damaged, or its
+#: unit is not the metre.
 EXTENT_M, SPEED_MPS = 100_000.0, 100.0
 #: Default number of steps between the starts of two windows.
 STRIDE = 40
 _UNITS = "repair it, or convert it to metres in the reader"
+_ROAD_KINDS = frozenset(RoadKind)
 #: Fields of tracks with a value per step, and the shape of that value.
 _WIDTHS = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
 #: Problem and cure, None if a check passes.
@@ -139,10 +141,11 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
 
     Raises:
         DataError: A recording that is cut has no window with a valid ego at its current step.
-        UsageError: ``stride`` is below 1.
+        UsageError: ``stride`` or ``length`` is below 1.
     """
-    if stride < 1:
-        raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
+    for name, number in (("stride", stride), ("length", length)):
+        if number < 1:
+            raise UsageError(f"a {name} of {number} steps", cure="choose 1 or more")
     pieces = [_resample(piece) for piece in _split_at_gaps(recording)]
     if len(pieces) == 1 and len(pieces[0][1]) <= length:
         piece, frameless = pieces[0]
@@ -296,6 +299,8 @@ def _cut(recording: Recording, part: slice) -> Recording:
 def with_ego(recording: Recording, row: int) -> Recording:
     """Return the recording with another vehicle as the ego, without route and ``seen``; its id ends with the track's.
 
+    With its own ego it is the recording itself.
+
     Raises:
         UsageError: The track is not a vehicle that is valid at the current step.
     """
@@ -349,7 +354,9 @@ def _check_names(recording: Recording) -> Finding:
 def _check_time(recording: Recording, most_steps: int) -> Finding:
     times = np.asarray(recording.timestamps_s)
     steps = len(times)
-    if steps == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+    if steps == 0:
+        return "there are no steps", "skip the recording"
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         return "timestamps do not increase", "repair the time base in the reader"
     if steps > most_steps:
         return f"{steps} steps, more than {most_steps}", "cut it with windows()"
@@ -375,8 +382,8 @@ def _check_shapes(recording: Recording) -> Finding:
         if actual != shape:
             return f"{name} has shape {actual}, not {shape}", "give every track every step"
     rows = (recording.ego, *recording.to_predict, *recording.of_interest)
-    if any(not 0 <= row < count for row in rows):
-        return f"a track row out of {count} is named in {rows}", "name rows of the track table"
+    if wrong := [row for row in rows if not 0 <= row < count]:
+        return f"track row {wrong[0]} of {count} tracks", "name rows of the track table"
     return None
 
 
@@ -464,7 +471,7 @@ def _check_map(recording: Recording) -> Finding:
             return f"points of feature {feature.feature_id} have shape {shape}", "give (point, 3)"
         if not -(2**63) <= feature.feature_id < 2**63:
             return f"the feature id {feature.feature_id} does not fit into 64 bits", "number the features"
-        if feature.kind not in RoadKind:
+        if feature.kind not in _ROAD_KINDS:
             return f"feature {feature.feature_id} is of unknown kind {feature.kind}", "use a RoadKind"
     if not recording.features:
         return None

@@ -1,7 +1,8 @@
 """Conversion of YAML to plain values, of plain values to configuration records, and back.
 
 Errors name the line, or the dotted path of the wrong value. YAML follows the 1.2 core rules: ``3e-4`` is a number,
-``no`` a string, ``010`` ten. Unlike there, ``0x10`` is a string and ``1_000`` a number; duplicate keys are errors.
+``no`` a string, ``010`` ten. Unlike there, ``0x10`` and ``0o17`` are strings, ``1_000`` is a number and ``None`` null.
+Duplicate keys, and keys that are not strings, are errors.
 """
 
 from __future__ import annotations
@@ -125,7 +126,9 @@ def _to_literal(value: Any, cls: Any) -> Any:
         for literal in options:
             if type(candidate) in (type(literal), Flag) and candidate == literal:
                 return literal
-    near = did_you_mean(str(value), [str(candidate) for candidate in options])
+    names = [str(option) for option in options]
+    quotes = "without quotes" if isinstance(value, str) else "in quotes"
+    near = f"write it {quotes}" if str(value) in names else did_you_mean(str(value), names)
     raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, options))}; {near}")
 
 

@@ -37,11 +37,16 @@ def as_values(values: Any) -> Values:
     """Convert to float64, with NaN for undefined values.
 
     Raises:
-        UsageError: A value is infinite, or the values are not a flat list.
+        UsageError: A value is infinite or no number, or the values are not a flat list.
     """
-    x = np.asarray(values, dtype=np.float64)
-    if x.ndim != 1 or np.isinf(x).any():
-        problem = "values must be a list of finite numbers, NaN or None"
+    problem = "values must be a list of finite numbers, NaN or None"
+    try:
+        x = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(problem, cure="give one number per episode") from error
+    if x.ndim != 1:
+        raise UsageError(problem, cure="give one number per episode")
+    if np.isinf(x).any():
         raise UsageError(problem, cure="replace infinite values by None")
     return x
 

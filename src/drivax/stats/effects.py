@@ -79,9 +79,9 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         confidence: 1 - significance level.
         share: ``w``, the share of the first arm; None for pairs.
     """
-    if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0):
-        cure = "confidence and share lie between 0 and 1, n above 0"
-        raise UsageError("confidence, share or n out of range", cure=cure)
+    if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0) or math.isnan(effect):
+        cure = "confidence and share lie between 0 and 1, n above 0, and the effect is a number"
+        raise UsageError("effect, confidence, share or n out of range", cure=cure)
     dof = n - (1 if share is None else 2)
     if dof <= 0:
         return 0.0
@@ -101,9 +101,9 @@ def scenarios_needed(
     It counts pairs, or the scenarios of both arms, up to about 1e12. Clustered scenarios need ``deff`` times as many.
     Arguments are those of :func:`power`.
     """
-    if not abs(effect) > 0 or not 0 < target < 1:
-        problem = f"no number of scenarios detects an effect of {effect} with power {target}"
-        raise UsageError(problem, cure="give an effect, and a power between 0 and 1")
+    _check_target(target)
+    if not abs(effect) > 0:
+        raise UsageError(f"no number of scenarios detects an effect of {effect}", cure="give an effect")
     low, high = 1, 2
     while power(effect, high, confidence, share) < target and high < _MAX_SCENARIOS:
         low, high = high, 2 * high
@@ -117,6 +117,7 @@ def detectable_effect(
     n: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> float | None:
     """Return the smallest effect that is detected with power ``target``; None if ``n`` is too small for any effect."""
+    _check_target(target)
     low, high = 0.0, 1.0
     while power(high, n, confidence, share) < target:
         if high > 1e6:
@@ -126,3 +127,8 @@ def detectable_effect(
         middle = (low + high) / 2
         low, high = (low, middle) if power(middle, n, confidence, share) >= target else (middle, high)
     return high
+
+
+def _check_target(target: float) -> None:
+    if not 0 < target < 1:
+        raise UsageError(f"power {target} is impossible", cure="give a power between 0 and 1")

@@ -105,8 +105,10 @@ def per_event(events: int, exposure: float, confidence: float = 0.95) -> Interva
     The rate lies between the quantiles of gamma distributions of ``events`` and ``events + 1`` (Garwood, Biometrika
     28, 1936). ``n`` counts events; without events only the lower bound is known.
     """
+    normal_quantile(confidence)  # refuses a confidence outside (0, 1)
     if events < 0 or not exposure > 0.0:
-        raise UsageError(f"{events} events in {exposure} of exposure", cure="use positive exposure")
+        cure = "use 0 or more events and positive exposure"
+        raise UsageError(f"{events} events in {exposure} of exposure", cure=cure)
     tail = (1.0 - confidence) / 2.0
     low = exposure / float(special.gammaincinv(events + 1, 1.0 - tail))
     if events == 0:
@@ -148,14 +150,19 @@ def split_bootstrap(
 
     The arms, which must not share a cluster, are resampled separately, as in :func:`bootstrap_mean` (Efron and
     Tibshirani 1993, section 8.3). ``first`` masks the episodes of the first arm.
+
+    Raises:
+        UsageError: A cluster is in both arms or in two strata.
     """
     check_draws(confidence, resamples)
     x = as_values(values)
-    cluster_labels = dense_labels(clusters, x.size, "cluster")
+    cluster_labels, defined = dense_labels(clusters, x.size, "cluster"), ~np.isnan(x)
+    if np.intersect1d(cluster_labels[first & defined], cluster_labels[~first & defined]).size:
+        raise UsageError("a cluster is in both arms", cure="assign whole clusters")
     stratum_labels = None if strata is None else dense_labels(strata, x.size, "stratum")
     rng, arms = np.random.default_rng(seed), []
     for arm in (first, ~first):
-        included = arm & ~np.isnan(x)
+        included = arm & defined
         arm_values, labels = drop_undefined(x[included], cluster_labels[included])
         if arm_values.size == 0:
             return UNDEFINED
@@ -192,6 +199,8 @@ def interquartile_bootstrap(
     """
     check_draws(confidence, resamples)
     by_seed = [as_values(seed_values) for seed_values in values]
+    if not by_seed:
+        return UNDEFINED
     labels = dense_labels(clusters, by_seed[0].size, "cluster")
     if any(seed_values.size != labels.size for seed_values in by_seed):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")

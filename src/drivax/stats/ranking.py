@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm, rankdata
 
 from drivax.errors import UsageError
-from drivax.stats.intervals import percentiles
+from drivax.stats.intervals import check_draws, normal_quantile, percentiles
 
 Numbers = Float[np.ndarray[Any, Any], " n"]
 Labels = Bool[np.ndarray[Any, Any], " n"]
@@ -27,8 +27,9 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
     """Return the interval of :func:`roc_auc` by DeLong, DeLong and Clarke-Pearson (Biometrics 44, 1988), within [0, 1].
 
     Raises:
-        UsageError: There are fewer than two positives or negatives.
+        UsageError: There are fewer than two positives or negatives, or the confidence is outside (0, 1).
     """
+    normal_quantile(confidence)  # refuses a confidence outside (0, 1)
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
         raise UsageError("an interval needs two positives and two negatives", cure="use a larger set")
@@ -58,6 +59,7 @@ def bootstrap_intervals(
     Clusters with and without positives are drawn separately, so each resample has as many of either (Davison and
     Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
+    check_draws(confidence, resamples)
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)
     has_positive = np.bincount(cluster, labels, len(names)) > 0
@@ -115,6 +117,7 @@ def correlation_interval(
     The interval is (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap
     Methods, 1997, section 3.8).
     """
+    check_draws(confidence, resamples)
     labels = np.unique(np.asarray(clusters), return_inverse=True)[1]
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     rng, samples = np.random.default_rng(0), []

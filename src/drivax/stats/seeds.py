@@ -19,7 +19,7 @@ from scipy import special
 from drivax.errors import UsageError
 from drivax.stats.clusters import Labels, dense_labels
 from drivax.stats.effects import ROUNDING
-from drivax.stats.intervals import Interval, effective_size, wilson
+from drivax.stats.intervals import Interval, effective_size, normal_quantile, wilson
 
 Values = Float64[np.ndarray, "seed scenario"]
 #: Values of another policy, with its own number of seeds.
@@ -88,18 +88,20 @@ class CrossedEffect:
 
     def interval(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
         """Return the confidence interval of the difference."""
-        margin = self._quantile((1.0 + confidence) / 2.0) * self.error
+        margin = self._critical(confidence) * self.error
         return self.difference - margin, self.difference + margin
 
     def detectable(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> float:
         """Return the smallest difference that is detected with probability ``power``."""
-        return self.error * (self._quantile((1.0 + confidence) / 2.0) + self._quantile(power))
+        if not 0.0 < power < 1.0:
+            raise UsageError(f"power {power} is impossible", cure="give a power between 0 and 1")
+        return self.error * (self._critical(confidence) + self._quantile(power))
 
     def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
         """Return the probability of detecting a difference of this size."""
         if self.error == 0.0:
             return float(difference != 0.0)
-        return self._probability(abs(difference) / self.error - self._quantile((1.0 + confidence) / 2.0))
+        return self._probability(abs(difference) / self.error - self._critical(confidence))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
         """Return the smallest number of seeds per policy above the present one that detects this difference, if any."""
@@ -114,6 +116,11 @@ class CrossedEffect:
 
     def _quantile(self, share: float) -> float:
         return float(special.stdtrit(min(self.degrees_of_freedom, _MAX_FREEDOM), share))
+
+    def _critical(self, confidence: float) -> float:
+        """Return the two-sided critical value of t."""
+        normal_quantile(confidence)  # refuses a confidence outside (0, 1)
+        return self._quantile((1.0 + confidence) / 2.0)
 
     def _with_seeds(self, number: int) -> CrossedEffect:
         """Extrapolate to ``number`` seeds of each policy with the same variance."""
@@ -256,7 +263,11 @@ def difference_interval(
 def log_ratio(
     a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
-    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means exist and are positive."""
+    """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means exist and are positive.
+
+    Raises:
+        UsageError: As in :func:`crossed_difference`.
+    """
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None

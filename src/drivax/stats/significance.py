@@ -91,7 +91,7 @@ def paired_permutation(
     # Remove clusters without a difference, which do not change the statistic.
     sums = sums[size > _TIE * size.max()]
     threshold = abs(float(sums.sum())) - _TIE * float(size.sum())
-    if 2.0**sums.size <= resamples:
+    if 2**sums.size <= resamples:
         signs = 1.0 - 2.0 * (np.arange(2**sums.size)[:, None] >> np.arange(sums.size) & 1)
         p = float((np.abs(signs @ sums) >= threshold).mean())
         return SignificanceResult("permutation", p, sums.size, exact=True)

@@ -161,9 +161,8 @@ class Checkpoints:
         if step is None:
             step = max(self.steps(), default=None)
         if step is None:
-            raise DataError(
-                "no checkpoint found", file=self.folder, cure="start the training again, without --resume"
-            )
+            cure = "start the training again, with --overwrite and without --resume"
+            raise DataError("no checkpoint found", file=self.folder, cure=cure)
         about, path = self.about(step), self._path(step)
         stored_leaves = about["leaves"]
         requested_leaves = [

@@ -200,7 +200,7 @@ def _check_info(info: Any) -> None:
         raise ValueError("not a JSON object")
     for name, kind in _ENTRIES.items():
         if not isinstance(info.get(name), kind | None):
-            raise ValueError(f"{name} is not of type {kind}")
+            raise ValueError(f"{name} is not of type {getattr(kind, '__name__', kind)}")
     _check_data(info)
     validation, divergence = info.get("validation"), info.get("divergence")
     for recording in validation["recordings"] if isinstance(validation, dict) else ():
@@ -246,16 +246,18 @@ def _kind(path: Path) -> str | None:
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
-    """Split ``RUN@STEP``; the step of ``RUN`` is None.
+    """Split ``RUN@STEP``; the step of ``RUN``, whose path may contain ``@``, is None.
 
     Raises:
         UsageError: The step is not a number.
     """
-    run, at, step = name.partition("@")
-    if at and not step.isdecimal():
-        cure = "write RUN@STEP, for example runs/a@100000"
-        raise UsageError(f"{step!r} is not a checkpoint step", cure=cure)
-    return run, int(step) if at else None
+    run, at, step = name.rpartition("@")
+    if at and step.isdecimal():
+        return run, int(step)
+    if not at or "/" in step or Path(name).is_dir():
+        return name, None
+    cure = "write RUN@STEP, for example runs/a@100000"
+    raise UsageError(f"{step!r} is not a checkpoint step", cure=cure)
 
 
 def zoo() -> list[str]:
@@ -271,7 +273,7 @@ def policy_folder(name: str | Path) -> Path:
     """
     if not str(name).startswith(ZOO):
         return Path(name)
-    if name not in zoo():
+    if str(name) not in zoo():
         raise UsageError(f"no policy {str(name)!r} in the zoo", cure=f"use {', '.join(zoo())}")
     return _ZOO_FOLDER / str(name).removeprefix(ZOO)
 
@@ -286,7 +288,7 @@ def policy_training_sets(planner: str) -> list[dict[str, Any]]:
 
     Other planners have none.
     """
-    path = policy_folder(planner.partition("@")[0])
+    path = policy_folder(run_and_step(planner)[0])
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
     return training_sets(info) if info.get("kind") in ("training", "policy") else []
 

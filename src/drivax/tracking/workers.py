@@ -95,7 +95,12 @@ def one_core_each(
 
     Parallel tasks neither wait for each other nor affect each other's results. At most ``cores`` cores are used, by
     default all cores of this process.
+
+    Raises:
+        UsageError: ``cores`` is below 1.
     """
+    if cores is not None and cores < 1:
+        raise UsageError(f"the number of cores is {cores}", cure="use 1 or more")
     available = sorted(os.sched_getaffinity(0))[:cores]
     with worker_pool(len(available), available) as pool:
         futures = {pool.submit(call, task): task for task in tasks}

@@ -295,7 +295,8 @@ class ScenarioBank:
         steps after the current one.
 
         Raises:
-            DrivaxError: There are no scenarios, their capacities differ, a log is too short, or sizes are too small.
+            DrivaxError: There are no scenarios, their capacities differ, a log is too short, or sizes are too small or
+                exceed the capacity.
         """
         logs = list(scenarios)
         for scenario in logs:
@@ -313,6 +314,9 @@ class ScenarioBank:
         if small := [f"{name} {has[name]} < {needs[name]}" for name in has if has[name] < needs[name]]:
             cure = "use Sizes.used of all scenarios"
             raise UsageError(f"sizes are too small: {', '.join(small)}", cure=cure)
+        if sizes.agents > (most := logs[0].capacity.agents):
+            problem = f"sizes are too large: agents {sizes.agents} > {most} of the capacity"
+            raise UsageError(problem, cure="use Sizes.used of scenarios of this capacity")
         arrays = _stack(logs, sizes)
         return cls(
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},

@@ -137,12 +137,16 @@ def arrange(
         drop = rows[grid.excess_entries(grid.cell(middle[rows]), distance[rows], getattr(capacity, name))]
         keep[drop] = False
         overflow[name] = len(drop)
-    if count := int((~keep & (block == EDGE_BLOCK) & (distance < UNSAFE_M)).sum()):
+    lost = ~keep & (block == EDGE_BLOCK) & (distance < UNSAFE_M)
+    if count := int(lost.sum()):
         problem = (
             f"{count} road-edge segments within {UNSAFE_M:.0f} m of the ego's log "
             f"do not fit capacity {capacity.name!r}"
         )
-        raise DataError(problem, cure="convert with a larger capacity")
+        cure = "convert with a larger capacity"
+        if not grid.contains(middle[lost]).all():
+            cure = f"shorten --future-s: the log leaves the map's square of {grid.side * grid.cell_m:.0f} m"
+        raise DataError(problem, cure=cure)
     rows = np.flatnonzero(keep)
     cell = grid.cell(middle[rows])
     order = np.lexsort((np.where(block[rows] == REST_BLOCK, 0, cell), block[rows]))

@@ -39,7 +39,7 @@ _DANGLING = {
 }
 #: Half the width of a stop line on a lane of unknown width, metres.
 HALF_WIDTH_M = 1.85
-#: A light without a lane takes the heading of a lane segment within this distance.
+#: A light without a lane takes the heading of a lane segment of its level within this distance.
 LANE_REACH_M = 2.0
 #: Lanes that a record stores per stop sign.
 LANES_PER_STOP = 4
@@ -154,7 +154,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
 
 
 def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Array, " lane"]:
-    """Width of every lane: that of the source, else the gap to a neighbour, else -1."""
+    """Width of every lane: that of the source, else the smaller gap to a neighbour, -1 if neither is plausible."""
     width = np.array([lane.width_m for lane in lanes], dtype=np.float64)
     spacing = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
     return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, spacing)
@@ -400,8 +400,8 @@ def place_lights(
 ) -> Lights:
     """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``.
 
-    Lights near no lane have no direction and are dropped. They are counted in the box of ``path`` widened by
-    ``margin_m``: elsewhere the lanes are cropped too.
+    Lights whose lane is missing and that are near no other lane of their level have no direction and are dropped. They
+    are counted in the box of ``path`` widened by ``margin_m``: elsewhere the lanes are cropped too.
     """
     graph, steps = lane_segments.graph, len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
@@ -432,7 +432,8 @@ def _light_headings(
 ) -> tuple[Float[Array, " light"], Float[Array, " light"]]:
     """Headings of each light's lane at the stop point and at its end.
 
-    A light without a lane (-1) has the heading of the nearest lane segment for both, NaN without one in reach.
+    A light without a lane (-1) has the heading of the nearest lane segment of its level for both, NaN without one in
+    reach.
     """
     graph, heading, exit_heading = lane_segments.graph, np.full(len(lane), np.nan), np.full(len(lane), np.nan)
     known = np.flatnonzero(lane >= 0)
@@ -458,10 +459,17 @@ def _arc_at(
 
 
 def _heading_near(lane_segments: LaneSegments, stop: Float[Array, "3"]) -> float:
-    """Heading of the nearest lane segment, NaN without one in reach."""
-    if len(lane_segments.segments) == 0:
+    """Heading of the nearest lane segment on the level of a stop point, NaN without one in reach.
+
+    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level.
+    """
+    a, b = lane_segments.segments.a, lane_segments.segments.b
+    if len(a) == 0:
         return float("nan")
-    distance, _ = point_to_segment(stop[:2], lane_segments.segments.a[:, :2], lane_segments.segments.b[:, :2])
+    distance, along = point_to_segment(stop[:2], a[:, :2], b[:, :2])
+    z = a[:, 2] + along * (b[:, 2] - a[:, 2])
+    if np.ptp(z) > LEVEL_M:
+        distance = np.where(np.abs(z - stop[2]) <= LEVEL_M, distance, np.inf)
     best = distance.argmin()
     return float(lane_segments.heading[best]) if distance[best] <= LANE_REACH_M else float("nan")
 

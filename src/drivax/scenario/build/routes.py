@@ -361,7 +361,8 @@ def _continuation(lane_segments: LaneSegments, pose: Float[Array, "3"], heading:
 def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     """Arc length of the logged ego along a route at every step, never decreasing, metres; gaps repeat the last value.
 
-    Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
+    The first position, whose value earlier steps have too, is searched on the whole route; each other one no further
+    ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
     """
     rows = np.flatnonzero(ego.valid)
     xy = ego.positions[:, :2]

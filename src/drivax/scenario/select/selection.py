@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import functools
 import math
 import operator
@@ -132,8 +133,10 @@ class Filter:
         quantity = _find_quantity(text, name)
         if not all(words):
             raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
-        if sign in _COMPARISONS and (quantity.kind != "number" or len(words) > 1):
-            raise _refusal(text, f"{name} cannot be compared by {sign}", "use = or != for words and lists")
+        if sign in _COMPARISONS and quantity.kind != "number":
+            raise _refusal(text, f"{name} cannot be compared by {sign}", "use = or !=")
+        if sign in _COMPARISONS and len(words) > 1:
+            raise _refusal(text, f"a list cannot be compared by {sign}", f"give one number after {sign}")
         if name == "flag":
             words = tuple(word.upper() for word in words)
         values = tuple(_value(text, name, quantity, word) for word in words)
@@ -179,6 +182,7 @@ class Selection:
     @classmethod
     def parse(cls, filters: Sequence[str]) -> Selection:
         """Parse filters such as ``type=turn_left|turn_right`` or ``audit.distance_m>5``."""
+        _refuse_text(filters, "filters")
         return cls(tuple(Filter.parse(text) for text in filters))
 
     def matches(self, entry: Mapping[str, Any]) -> bool:
@@ -239,6 +243,7 @@ def select_scenarios(
     if limit is not None and limit < 1:
         raise UsageError(f"--limit {limit} leaves no scenario", cure="use 1 or more")
     selection = Selection.parse(filters)
+    _refuse_text(names, "scenario names")
     by_name = _rows_by_name(data, names) if names else None
     rows = [row for row in selection.rows(data.entries) if by_name is None or row in by_name]
     if not rows:
@@ -249,7 +254,8 @@ def select_scenarios(
 def read_names(file: Path) -> list[_Name]:
     """Read names from a text file, one per line; empty lines are skipped."""
     check_seal(file)
-    lines = read_text(file, "give a file with one scenario id per line").splitlines()
+    # Not splitlines(): ids may contain other line breaks of Unicode.
+    lines = read_text(file, "give a file with one scenario id per line").split("\n")
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 
 
@@ -261,12 +267,21 @@ def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
             rows.setdefault(text, set()).add(row)
     requests: list[_Name] = []
     for name in names:
-        is_id = isinstance(name, str) and (name in rows or not Path(name).exists())
+        is_id = isinstance(name, str) and (name in rows or not _exists(name))
         requests += [_Name(str(name))] if is_id else read_names(Path(name))
     missing = [name for name in requests if name.text not in rows]
     if missing:
         raise _missing(data, missing)
     return set[int]().union(*(rows[name.text] for name in requests))
+
+
+def _exists(path: str) -> bool:
+    try:
+        return Path(path).exists()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # an id may be longer than any path
+            return False
+        raise
 
 
 def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
@@ -295,8 +310,8 @@ def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
     """Return the error for an empty selection; it names the first ``=`` filter that no scenario satisfies, if any."""
     for condition in selection.filters:
         if condition.operator == "=" and not any(condition.matches(entry) for entry in data.entries):
-            tag = condition.name.removeprefix("tag.")
-            words = {word for entry in data.entries for word in tag_words(entry, tag)}
+            tag, has_word = condition.name.removeprefix("tag."), isinstance(condition.values[0], str)
+            words = {word for entry in data.entries for word in tag_words(entry, tag) if has_word}
             cure = did_you_mean(str(condition.values[0]), sorted(words)) if words else "drop this filter"
             return DataError(f"no scenario is selected by {condition.text!r}", file=data.path, cure=cure)
     return DataError("no scenario is selected", file=data.path, cure="use fewer filters or other names")
@@ -331,6 +346,11 @@ def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float |
     if quantity.words and word not in quantity.words:
         raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
     return word
+
+
+def _refuse_text(items: Sequence[Any], what: str) -> None:
+    if isinstance(items, str):
+        raise UsageError(f"{what} are the text {items!r}", cure=f"give a list: [{items!r}]")
 
 
 def _refusal(text: str, problem: str, cure: str) -> UsageError:
