@@ -175,7 +175,10 @@ def test_unusable_experience_is_refused(bank):
     ):
         with pytest.raises(UsageError, match=words):
             ExperienceConfig().of(DRIVING, bank, weights)
-    with pytest.raises(DataError, match="all weights are 0"):
+    with pytest.raises(DataError, match="all weights of usable steps are 0"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
+    blind = replace(bank, agents=bank.agents.at[:, 11:, 0, AgentColumn.VALID].set(0.0))
+    with pytest.raises(DataError, match="no logged step has an expert action; check the set"):
+        ExperienceConfig().of(DRIVING, blind)
     with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

@@ -215,6 +215,8 @@ def test_past_policy_drives_all_but_ego_of_its_groups(environment):
     assert past_policy(Mixture((("log", log), ("own", log)), (0.5, 0.5)), 24) is past_policy(log, 24) is None
     with pytest.raises(UsageError, match=r"self_play.past is 2, self_play.refresh 50; use a share"):
         SelfPlayConfig(past=2.0)
+    with pytest.raises(UsageError, match=r"self_play.vehicles is 9; use 2 to 8"):
+        SelfPlayConfig(vehicles=9)
     with pytest.raises(UsageError, match=r"self_play.past is 0.1 of 4 groups: none; raise it"):
         replace(environment, config=SelfPlayConfig(VEHICLES, past=0.1)).past(COUNT)
 

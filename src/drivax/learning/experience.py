@@ -67,7 +67,7 @@ def sampler(weights: np.ndarray) -> Sampler:
     """
     total = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not total[-1] > 0.0:
-        raise DataError("all weights are 0", cure="give a usable step a weight above 0")
+        raise DataError("all weights of usable steps are 0", cure="give one a weight above 0")
     cumulative = np.floor(total / total[-1] * _MAX_UINT32).astype(np.uint32)
     effective = jnp.asarray(effective_size(weights), jnp.float32)
     return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
@@ -138,7 +138,7 @@ def require_log(environment: Environment) -> LoggedEnvironment:
     """
     if not isinstance(environment, LoggedEnvironment):
         problem = f"{type(environment).__name__} has no logged episodes"
-        raise UsageError(problem, cure="implement `expert_steps`")
+        raise UsageError(problem, cure="implement `expert_steps` and `observe_recorded`")
     return environment
 
 
@@ -191,6 +191,11 @@ class ExperienceConfig:
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
+        if not usable.any():
+            if not expert.usable.any():
+                raise DataError("no logged step has an expert action", cure="check the set")
+            problem = "the expert's action exceeds the bounds at all logged steps"
+            raise DataError(problem, cure="choose an action space with wider bounds")
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)

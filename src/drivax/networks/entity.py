@@ -13,6 +13,7 @@ from drivax.networks.attention import (
     Attention,
     Dtype,
     GroupShape,
+    check_heads,
     concatenate_groups,
     group_rows,
     group_shapes,
@@ -33,7 +34,7 @@ class EntityConfig:
         width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
         heads: Number of attention heads.
         goal: Groups whose mean is added to the query; missing names are ignored, here and in ``context``.
-        context: Groups whose mean is appended to the embedding.
+        context: Groups whose mean is appended to the embedding, unless ``goal`` has them.
         dtype: Type of the attention's matrix products; the rest is float32.
     """
 
@@ -49,8 +50,7 @@ class EntityConfig:
     renamed: ClassVar[dict[str, str]] = {"beside": "context"}
 
     def __post_init__(self) -> None:
-        if self.heads < 1 or self.entity_width < 1 or self.entity_width % self.heads:
-            raise ValueError(f"width {self.entity_width} is not a multiple of {self.heads} heads")
+        check_heads(self.entity_width, self.heads)
 
     @property
     def entity_width(self) -> int:
