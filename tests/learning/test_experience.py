@@ -172,6 +172,7 @@ def test_unusable_experience_is_refused(bank):
         (np.ones((3, 90)), r"weights of shape \(3, 90\) for 3 scenarios of 91 steps"),
         (np.full(shape, -1.0), "step 0 of scenario 0 is -1"),
         (np.full(shape, np.nan), "step 0 of scenario 0 is nan"),
+        (np.full(shape, 1e200), r"is 1e\+200; use numbers from 0 to 1e100"),
     ):
         with pytest.raises(UsageError, match=words):
             ExperienceConfig().of(DRIVING, bank, weights)

@@ -87,7 +87,9 @@ def test_training_is_not_replaced_by_its_policy(run, bank):
 def test_policy_of_the_working_folder_has_its_name(run, bank, monkeypatch):
     (run.path / "inner").mkdir()
     monkeypatch.chdir(run.path)
-    assert load_policy(".", bank)[0].name == policy_traffic(".").name.removeprefix("driven_by_") == run.path.name
+    assert (
+        load_policy(".", bank)[0].name == policy_traffic(".").name.removeprefix("driven_by_") == run.path.name
+    )
     monkeypatch.chdir("inner")
     assert load_policy("..", bank)[0].name == run.path.name
 

@@ -85,17 +85,18 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return weights ``[N, T]`` in double precision.
 
     Raises:
-        UsageError: The shape is wrong, or a weight is negative, infinite or NaN.
+        UsageError: The shape is wrong, or a weight is negative, NaN or above 1e100.
     """
     weights = np.asarray(weights)
     if weights.shape != shape:
         problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
         raise UsageError(problem, cure="make weights for every step of this scenario set")
-    invalid = np.argwhere(~(np.isfinite(weights) & (weights >= 0.0)))
+    # Sums of squares stay finite.
+    invalid = np.argwhere(~((weights >= 0.0) & (weights <= 1e100)))
     if len(invalid):
         scenario, step = invalid[0]
         problem = f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}"
-        raise UsageError(problem, cure="use finite numbers of at least 0")
+        raise UsageError(problem, cure="use numbers from 0 to 1e100")
     return weights.astype(np.float64)
 
 

@@ -26,7 +26,7 @@ class SelfPlayConfig:
     """Settings of the traffic ``self``.
 
     Attributes:
-        vehicles: Largest number of vehicles of a scenario that the policy drives, ego included.
+        vehicles: Largest number of vehicles of a scenario that the policy drives, ego included; 2 to 8.
         past: Share of the groups in which an older copy of the policy drives all vehicles but ego (ppo and bc_ppo).
         refresh: Iterations after which the current policy replaces the older copy.
     """

@@ -33,7 +33,8 @@ class EntityConfig:
         size: Width: 64 if ``published``, 32 if ``small``.
         width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
         heads: Number of attention heads.
-        goal: Groups whose mean is added to the query; missing names are ignored, here and in ``context``.
+        goal: Groups whose mean is added to the query and appended to the embedding; missing names are ignored, here
+            and in ``context``.
         context: Groups whose mean is appended to the embedding, unless ``goal`` has them.
         dtype: Type of the attention's matrix products; the rest is float32.
     """

@@ -95,6 +95,7 @@ class Iql(Offline[IqlConfig]):
             "mean_value": jnp.mean(value),
             "advantage": jnp.mean(advantage),
             "weight": jnp.mean(weights),
+            # With a margin, because exponential and logarithm round.
             "weights_cut": jnp.mean(weights >= 0.999 * config.largest_weight),
             "imitation_error": jnp.mean(jnp.abs(error)),
         }

@@ -183,7 +183,7 @@ class OfflineConfig:
         """Raise UsageError for a grid or mixture policy, whose actions have no gradient in the logits."""
         if self.network.distribution not in REPARAMETRISED:
             problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
-            raise UsageError(problem, cure="use gaussian or beta; iql and bc take any distribution")
+            raise UsageError(problem, cure="use gaussian or beta, or iql or bc with loss: likelihood")
 
 
 @record
