@@ -10,6 +10,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.warm_start import BcSacConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, LoggedEnvironment, transitions
@@ -162,8 +163,12 @@ def test_usable_steps_are_the_drawn_steps(data):
     usable = usable_steps(config, data)
     np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
     assert usable.any() and not usable[:, :10].any()
-    with pytest.raises(UsageError, match="PpoConfig does not learn from logged steps"):
+    with pytest.raises(UsageError, match="PpoConfig does not draw logged steps by weight"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
+    with pytest.raises(
+        UsageError, match=r"BcSacConfig does not draw logged steps by weight; .* sac with demons"
+    ):
+        usable_steps(replace(config, algorithm=BcSacConfig()), data)
 
 
 def test_unusable_experience_is_refused(bank):

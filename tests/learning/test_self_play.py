@@ -71,7 +71,7 @@ def test_self_play_is_an_environment(bank, environment):
     assert isinstance(environment, Environment) and environment.action_size == 2
     with pytest.raises(UsageError, match=r"10 environments of self-play; use a multiple of 3"):
         environment.start(bank, jax.random.key(0), 10)
-    with pytest.raises(UsageError, match=r"vehicles is 1; use 2 or more"):
+    with pytest.raises(UsageError, match=r"vehicles is 1; use 2 to 8"):
         SelfPlayConfig(1)
     with pytest.raises(UsageError, match=r"cannot store states of self-play; set replay.store"):
         environment.stored(())

@@ -175,6 +175,7 @@ def _derivative(
 ) -> Float[Array, " K"]:
     """Differentiate a polynomial fitted to the valid window around each sample; 0 without a valid window."""
     sample = jnp.arange(len(signal))
+    # Ends of the unbroken valid samples around each sample.
     first = jax.lax.cummax(jnp.where(valid, -1, sample)) + 1
     last = jax.lax.cummin(jnp.where(valid, len(signal), sample), reverse=True) - 1
     start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))

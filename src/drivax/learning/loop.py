@@ -94,8 +94,8 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device; algorithms that learn from logged steps draw those of a
-            weighted set by weight.
+        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms and ``sac`` with
+            ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
             of its scenarios (at most 256). None trains on all scenarios without validation.
@@ -184,7 +184,7 @@ def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = 
     ``trust`` is as for :func:`train`.
 
     Raises:
-        UsageError: The algorithm does not learn from logged steps.
+        UsageError: The algorithm does not draw logged steps by weight.
     """
     environment, bank = _environment(config, data, trust)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
