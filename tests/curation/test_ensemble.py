@@ -35,6 +35,8 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import DirectState
+from drivax.tasks.task import Task
 from quick import quick
 from scenes import SMALL, car, straight_road
 
@@ -284,6 +286,12 @@ def test_invalid_settings_are_refused(data, tmp_path, capsys):
         EnsembleConfig(folds=1)
     with pytest.raises(UsageError, match="learn_from is 0"):
         EnsembleConfig(learn_from=0)
+    with pytest.raises(UsageError, match="total_steps is 0; use 1 or more"):
+        EnsembleConfig(total_steps=0)
+    with pytest.raises(UsageError, match="seed is -1; use 0 or more"):
+        EnsembleConfig(seed=-1)
+    with pytest.raises(UsageError, match="policies cannot learn in direct_state"):
+        EnsembleConfig(task=Task(actions=DirectState()))
     call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
     assert main([*call, "--folds", "3"]) == 2
     assert "folds: unknown setting; use one of urgent_s" in capsys.readouterr().err

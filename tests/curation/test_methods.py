@@ -120,8 +120,11 @@ def test_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
 
 
 def test_invalid_arguments_are_refused(data, tmp_path):
-    for name, like in (("random_matched", None), ("uniform", tmp_path / "x.npz")):
-        with pytest.raises(UsageError, match="random_matched needs --like"):
+    for name, like, cure in (
+        ("random_matched", None, "pass --like SCORES"),
+        ("uniform", tmp_path / "x.npz", "leave out --like"),
+    ):
+        with pytest.raises(UsageError, match=f"random_matched needs --like.*; {cure}"):
             curate(name, Request(data, like))
     with pytest.raises(UsageError, match="unknown method 'kinematics'; did you mean 'kinematic'"):
         curate("kinematics", Request(data))

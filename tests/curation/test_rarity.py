@@ -96,5 +96,7 @@ def test_invalid_arguments_are_refused():
     for name, wrong in (("bandwidth", 0.0), ("cells", 1), ("temper", 2.0), ("most", 0.5)):
         with pytest.raises(UsageError, match=name):
             replace(KernelRarity(), **{name: wrong})
+    with pytest.raises(UsageError, match=r"most is 0\.0; use a positive number"):
+        PublishedRarity(most=0.0)
     with pytest.raises(DataError, match="no log has three consecutive steps"):
         rarity_steps(KernelRarity(), np.zeros((1, 3, 2)), np.zeros((1, 3), bool))

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,6 +91,9 @@ def test_count_beyond_the_recordings_is_refused(data, tmp_path, capsys):
     )
     with pytest.raises(UsageError, match=message):
         check_top(data, tmp_path / "top", 6)
+    for count in (0, 7):
+        with pytest.raises(UsageError, match=r"one of each; ask for 1 to 5$"):
+            check_top(data, tmp_path / "top", count)
     check_top(data, tmp_path / "top", 5)
     check_top(data, tmp_path / "top", 6, all_windows=True)
     with pytest.raises(UsageError, match="cannot select 7 of 6 scenarios; ask for 1 to 6"):
@@ -104,7 +108,7 @@ def test_count_beyond_the_recordings_is_refused(data, tmp_path, capsys):
     assert len(ScenarioSet.open(tmp_path / "top")) == 6
 
 
-def test_subset_folder_holds_its_scores(data, tmp_path):
+def test_subset_folder_holds_its_scores(data, tmp_path, monkeypatch):
     table = curate("kinematic", Request(data))
     rows = top_rows(table, 3, recordings_of(data.entries))
     write_top(table, data, 3, tmp_path / "top")
@@ -125,6 +129,11 @@ def test_subset_folder_holds_its_scores(data, tmp_path):
     write_scores(table, tmp_path / "whole.npz")
     with pytest.raises(DataError, match=r"scores belong to another set .*; use .*top/scores\.npz"):
         read_scores(tmp_path / "whole.npz", top)
+    # It does not name the file that was given, however its path is written.
+    write_scores(table, top.path / "scores.npz", overwrite=True)
+    monkeypatch.chdir(top.path)
+    with pytest.raises(DataError, match=r"scores belong to another set .*; run `drivax curate` again"):
+        read_scores(Path("scores.npz"), top)
 
 
 def test_failed_subset_leaves_no_folder(data, tmp_path, monkeypatch):

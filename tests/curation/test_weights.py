@@ -224,5 +224,10 @@ def test_invalid_arguments_are_refused(settings, words):
 def test_zero_weights_are_refused():
     with pytest.raises(UsageError, match="every score is 0"):
         sampling_weights(make_table(np.zeros((2, 5))), plain(), "step")
+    with pytest.raises(UsageError, match="seed is -1; use 0 or more"):
+        permute_scores(make_table(np.ones((2, 5))), -1)
+    control = permute_scores(make_table(np.ones((2, 5))), 0)
+    with pytest.raises(UsageError, match="scores of 'random_matched' have no components to combine"):
+        _ = control.combination
     with pytest.raises(UsageError, match="no step can be drawn"):
         sampling_weights(make_table(np.ones((2, 5)), np.arange(5) % 2 * np.ones((2, 1)) > 0), plain(), "step")

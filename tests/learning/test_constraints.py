@@ -258,8 +258,11 @@ def test_mistakes_are_named():
         UsageError, match=r"'lag' is not a penalty .*; give that term a weight below 0, and no cond"
     ):
         replace(PPO, constraints={"lag": 0.1}).build(Bandit(), (), 1)
-    for wrong in ({"constraints": {"failure": -0.1}}, {"multiplier_rate": -1.0}):
-        with pytest.raises(ValueError, match="at least 0"):
+    for wrong, words in (
+        ({"constraints": {"failure": -0.1}}, "limit of constraint 'failure' is -0.1"),
+        ({"multiplier_rate": -1.0}, "multiplier_rate is -1.0"),
+    ):
+        with pytest.raises(UsageError, match=f"{words}; use 0 or more"):
             replace(PPO, **wrong)
 
 

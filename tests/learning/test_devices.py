@@ -4,7 +4,12 @@ import os
 import subprocess
 import sys
 
+import jax
+import numpy as np
 import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.program import choose_devices
 
 CASES = [
     ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("ppo", "two"), ("sac", "two"),
@@ -12,6 +17,17 @@ CASES = [
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
     ("driving_self_ppo", "two"),
 ]  # fmt: skip
+
+
+def test_cure_names_only_work_that_there_is(monkeypatch):
+    monkeypatch.setattr(jax, "local_devices", lambda: [0, 1])
+    state = {"parameters": np.zeros(3)}
+    for batch, words in (
+        (None, "an algorithm without environments or batches .* use a multiple of 2 seeds, or fewer devices"),
+        (3, "3 steps per batch cannot be .* use a multiple of 2 steps per batch or seeds, or fewer devices"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            choose_devices(2, 1, state, batch)
 
 
 @pytest.mark.slow

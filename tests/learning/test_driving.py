@@ -69,6 +69,8 @@ def test_driving_is_an_environment(bank, driving):
         Driving(driving.simulator, 9)
     with pytest.raises(UsageError, match=r"latest_start is 89; use 10 \(earliest_start\) to 88"):
         Driving(driving.simulator, 89).start(bank, jax.random.key(0), 1)
+    with pytest.raises(UsageError, match="earliest_start is 89; use 0 to 88"):
+        Driving(driving.simulator, 90, 89).start(bank, jax.random.key(0), 1)
 
 
 NETWORK = NetworkConfig(encoder=MlpConfig(rows=(8,), hidden=(8,)), distribution="grid")

@@ -10,6 +10,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.warm_start import BcSacConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, LoggedEnvironment, transitions
@@ -162,8 +163,12 @@ def test_usable_steps_are_the_drawn_steps(data):
     usable = usable_steps(config, data)
     np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
     assert usable.any() and not usable[:, :10].any()
-    with pytest.raises(UsageError, match="PpoConfig does not learn from logged steps"):
+    with pytest.raises(UsageError, match="PpoConfig does not draw logged steps by weight"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
+    with pytest.raises(
+        UsageError, match=r"BcSacConfig does not draw logged steps by weight; .* sac with demons"
+    ):
+        usable_steps(replace(config, algorithm=BcSacConfig()), data)
 
 
 def test_unusable_experience_is_refused(bank):
@@ -172,10 +177,14 @@ def test_unusable_experience_is_refused(bank):
         (np.ones((3, 90)), r"weights of shape \(3, 90\) for 3 scenarios of 91 steps"),
         (np.full(shape, -1.0), "step 0 of scenario 0 is -1"),
         (np.full(shape, np.nan), "step 0 of scenario 0 is nan"),
+        (np.full(shape, 1e200), r"is 1e\+200; use numbers from 0 to 1e100"),
     ):
         with pytest.raises(UsageError, match=words):
             ExperienceConfig().of(DRIVING, bank, weights)
-    with pytest.raises(DataError, match="all weights are 0"):
+    with pytest.raises(DataError, match="all weights of usable steps are 0"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
+    blind = replace(bank, agents=bank.agents.at[:, 11:, 0, AgentColumn.VALID].set(0.0))
+    with pytest.raises(DataError, match="no logged step has an expert action; check the set"):
+        ExperienceConfig().of(DRIVING, blind)
     with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

@@ -1,6 +1,7 @@
 """Training by the loop: cut off by a signal and resumed, bit for bit; what is refused, and what is logged."""
 
 import json
+import math
 import os
 import signal
 from dataclasses import replace
@@ -112,9 +113,17 @@ def test_impossible_settings_are_refused():
         ({"earliest_start": -1}, "earliest_start is -1; use 0 or more"),
         ({"patience": 2}, "patience needs validations; set evaluate_every"),
         ({"total_steps": 0}, "total_steps is 0; use 1 or more"),
-        ({"checkpoint_every": 0}, "checkpoint_every and keep at least 1"),
-        ({"keep": 0}, "checkpoint_every and keep at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every is 0; use 1 or more"),
+        ({"keep": 0}, "keep is 0; use 1 or more"),
+        ({"traffic": {"log": math.nan, "idm": 0.5}}, "shares of traffic are log nan, idm 0.5"),
         ({"task": {"actions": {"kind": "direct_state"}}}, "cannot learn in direct_state"),
+        ({"algorithm": {"kind": "ppo", "target_kl": -0.1}}, "target_kl is -0.1; use more than 0"),
+        ({"algorithm": {"kind": "ppo", "gamma": 1.5}}, "gamma is 1.5; use 0 to 1"),
+        ({"algorithm": {"kind": "ppo", "gradient_norm": 0}}, "gradient_norm is 0.0; use more than 0"),
+        ({"algorithm": {"kind": "sac", "temperature": math.nan}}, "temperature is nan; use more than 0"),
+        ({"algorithm": {"kind": "bc", "learning_rate": -1e-3}}, "learning_rate is -0.001; use 0 or more"),
+        ({"algorithm": {"kind": "iql", "fitted_q": {"batch": 0}}}, "batch is 0; use 1 or more"),
+        ({"algorithm": {"kind": "bc_ppo", "warm_start": {"weight": math.nan}}}, "weight is nan; use 0"),
     ):
         with pytest.raises(UsageError, match=words):
             settings.load(TrainConfig, values)

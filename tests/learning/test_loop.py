@@ -222,7 +222,7 @@ def test_unsuccessful_scenarios_are_split_by_reason():
 
 def test_weights_need_an_offline_algorithm(data, config, tmp_path):
     weighted = WeightedSet(data, np.ones((3, 91)))
-    with pytest.raises(UsageError, match="ToyConfig does not learn from logged steps"):
+    with pytest.raises(UsageError, match="ToyConfig does not draw logged steps by weight"):
         train(config, weighted, tmp_path / "run", validation=None)
     assert not (tmp_path / "run").exists()
     train(config, data, tmp_path / "run", validation=None)

@@ -9,6 +9,7 @@ import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from drivax.errors import UsageError
 from drivax.learning.algorithms.averaging import trained_parameters
 from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.optimisers import chunk_size, clip_per_network, clipped_adam
@@ -189,7 +190,7 @@ def test_networks_are_clipped_by_their_own_norms():
 
 @pytest.mark.parametrize("name", ["environments", "unroll", "epochs", "minibatches"])
 def test_settings_of_zero_are_refused(name):
-    with pytest.raises(ValueError, match="must be at least 1"):
+    with pytest.raises(UsageError, match=f"{name} is 0; use 1 or more"):
         PpoConfig(**{name: 0})
 
 

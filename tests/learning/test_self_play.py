@@ -71,7 +71,7 @@ def test_self_play_is_an_environment(bank, environment):
     assert isinstance(environment, Environment) and environment.action_size == 2
     with pytest.raises(UsageError, match=r"10 environments of self-play; use a multiple of 3"):
         environment.start(bank, jax.random.key(0), 10)
-    with pytest.raises(UsageError, match=r"vehicles is 1; use 2 or more"):
+    with pytest.raises(UsageError, match=r"vehicles is 1; use 2 to 8"):
         SelfPlayConfig(1)
     with pytest.raises(UsageError, match=r"cannot store states of self-play; set replay.store"):
         environment.stored(())
@@ -215,6 +215,8 @@ def test_past_policy_drives_all_but_ego_of_its_groups(environment):
     assert past_policy(Mixture((("log", log), ("own", log)), (0.5, 0.5)), 24) is past_policy(log, 24) is None
     with pytest.raises(UsageError, match=r"self_play.past is 2, self_play.refresh 50; use a share"):
         SelfPlayConfig(past=2.0)
+    with pytest.raises(UsageError, match=r"self_play.vehicles is 9; use 2 to 8"):
+        SelfPlayConfig(vehicles=9)
     with pytest.raises(UsageError, match=r"self_play.past is 0.1 of 4 groups: none; raise it"):
         replace(environment, config=SelfPlayConfig(VEHICLES, past=0.1)).past(COUNT)
 

@@ -79,6 +79,21 @@ def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
     )
 
 
+def test_training_is_not_replaced_by_its_policy(run, bank):
+    with pytest.raises(UsageError, match="contains a run of kind training, not policy"):
+        export_policy(run.path, run.path, bank, overwrite=True)
+
+
+def test_policy_of_the_working_folder_has_its_name(run, bank, monkeypatch):
+    (run.path / "inner").mkdir()
+    monkeypatch.chdir(run.path)
+    assert (
+        load_policy(".", bank)[0].name == policy_traffic(".").name.removeprefix("driven_by_") == run.path.name
+    )
+    monkeypatch.chdir("inner")
+    assert load_policy("..", bank)[0].name == run.path.name
+
+
 def test_failed_export_leaves_the_former_policy(run, bank, tmp_path, monkeypatch):
     """A folder never appears without all of its files."""
     former = export_policy(run.path, tmp_path / "packed", bank)

@@ -219,5 +219,5 @@ def test_mistakes_are_named():
     for kind, scale in (("gaussian", 3.0), ("mixture", (0.3, 1e-4))):
         with pytest.raises(UsageError, match=rf"first_scale of a {kind} is .*; use 0.001 to 2"):
             initial_parameters(kind, Actions(2), scale)
-    with pytest.raises(ValueError, match="levels of 1 numbers for actions of 2"):
+    with pytest.raises(UsageError, match="levels of 1 numbers for actions of 2"):
         Actions(2, ((0.0,),))

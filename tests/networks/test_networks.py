@@ -208,7 +208,11 @@ def test_encoders_in_yaml():
             r"^encoder\.fusion: 'soon' is not one of early, late, hier",
         ),
         ("distribution: normal", r"^distribution: 'normal' is not one of gaussian, beta, grid"),
-        ("first_scale: 0", r"^first_scale is 0(\.0)?; use more than 0"),
+        ("first_scale: 0", r"^first_scale is 0(\.0)?; use one or more numbers above 0"),
+        ("first_scale: []", r"^first_scale is \(\); use one or more"),
+        ("first_scale: .nan", "^first_scale is nan; use one or more"),
+        ("head: [0]", "^head has a layer of width 0; use 1 or more"),
+        ("encoder: {kind: mlp, hidden: [8, -1]}", "^encoder: hidden has a layer of width -1"),
     ],
 )
 def test_mistaken_networks_are_named(text, message):
@@ -226,7 +230,7 @@ def test_policy_explores_by_action_and_never_less_than_a_share():
     policy.head.out.bias[...] = jnp.full(4, -20.0)
     np.testing.assert_allclose(policy({"ego": jnp.zeros(3)}).scale, [0.03, 0.002], rtol=1e-5)
     with pytest.raises(
-        UsageError, match="first_scale has 3 numbers for 2 actions; give one, or one per action"
+        UsageError, match="first_scale has 3 numbers for actions of 2; give one, or one for each number"
     ):
         Policy(replace(config, first_scale=(0.1, 0.1, 0.1)), spec, nnx.Rngs(0))({"ego": jnp.zeros(3)})
 

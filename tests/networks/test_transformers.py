@@ -240,14 +240,17 @@ def test_encoders_accept_sets_only_or_ego_only(name, missing):
     ("make", "words"),
     [
         (lambda: LqConfig(width=10, heads=4), "width 10 is not a multiple of 4 heads"),
-        (lambda: LqConfig(latents=0), "must be at least 1"),
-        (lambda: LqhConfig(local_layers=0), "local_layers must be at least 1"),
-        (lambda: MtrConfig(layers=0), "must be at least 1"),
+        (lambda: LqConfig(latents=0), "latents is 0; use 1 or more"),
+        (lambda: LqhConfig(local_layers=0), "local_layers is 0; use 1 or more"),
+        (lambda: MtrConfig(layers=0), "layers is 0; use 1 or more"),
+        (lambda: LqConfig(embedding=(8, 0)), "embedding has a layer of width 0"),
         (lambda: EntityConfig(width=6), "width 6 is not a multiple of 4 heads"),
+        (lambda: EntityConfig(width=0), "width is 0; use 1 or more"),
+        (lambda: EntityConfig(heads=0), "heads is 0; use 1 or more"),
     ],
 )
 def test_impossible_sizes_are_refused(make, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(UsageError, match=words):
         make()
 
 

@@ -23,6 +23,8 @@ from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
+from drivax.learning.algorithms.checks import check_at_least
+from drivax.learning.config import check_learnable
 from drivax.learning.driving import Driving
 from drivax.learning.experience import (
     Experience,
@@ -88,6 +90,9 @@ class EnsembleConfig:
             raise UsageError(f"{self.folds} folds", cure="use 2 or more: disagreement needs two members")
         if self.learn_from is not None and self.learn_from < 1:
             raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or null")
+        check_at_least(self, 1, "total_steps")
+        check_at_least(self, 0, "seed")
+        check_learnable(self.task.actions)
 
     @property
     def iterations(self) -> int:

@@ -45,7 +45,7 @@ _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 @dataclass(frozen=True)
 class KinematicConfig:
-    """Scales of the components: the values at which they reach 1.
+    """Scales of the components: the values at which they reach 1, unless noted.
 
     Attributes:
         urgent_s: Time to collision; the bound of the metric ``ttc_ok``.
@@ -175,6 +175,7 @@ def _derivative(
 ) -> Float[Array, " K"]:
     """Differentiate a polynomial fitted to the valid window around each sample; 0 without a valid window."""
     sample = jnp.arange(len(signal))
+    # Ends of the unbroken valid samples around each sample.
     first = jax.lax.cummax(jnp.where(valid, -1, sample)) + 1
     last = jax.lax.cummin(jnp.where(valid, len(signal), sample), reverse=True) - 1
     start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))
@@ -206,7 +207,7 @@ def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario)
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """The published kinematic heuristic, for comparison; fields are the values at which its components reach 1.
+    """The published kinematic heuristic, for comparison, and its scales, as those of :class:`KinematicConfig`.
 
     It uses backward differences at 10 Hz, the product of distance and closing speed, and distances to map points (of
     lanes, only those for cars). Noise of 1 cm/s scores like violent driving, and distant traffic like a conflict

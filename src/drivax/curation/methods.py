@@ -91,7 +91,8 @@ def curate(name: str, request: Request) -> ScoreTable:
         raise UsageError(f"unknown method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
     if (request.like is not None) != (name == "random_matched"):
         problem = "random_matched needs --like, a table of the same set, and no other method takes it"
-        raise UsageError(problem, cure="drivax curate random_matched --like SCORES ...")
+        cure = "pass --like SCORES" if request.like is None else "leave out --like"
+        raise UsageError(problem, cure=cure)
     default = METHODS[name].config
     config = default if request.config is None else request.config
     if type(config) is not type(default):

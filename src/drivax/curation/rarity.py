@@ -102,10 +102,13 @@ class PublishedRarity:
     upper bin but looks it up in the lower one, which affects standing still. Here both use the upper bin.
 
     Attributes:
-        most: Weight at which scores are clipped; no cell reaches it.
+        most: Weight at which scores are clipped; no cell reaches 3 while a third of them are empty.
     """
 
     most: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_positive({"most": self.most})
 
     @property
     def edges(self) -> tuple[Values, Values]:

@@ -150,7 +150,10 @@ class ScoreTable:
 
     @property
     def drawable(self) -> Valid:
-        """Steps that can be drawn, at which ego's action is known: it is observed at this and the next step."""
+        """Steps at which ego is observed, also at the next one.
+
+        A training draws fewer: those of :func:`drivax.learning.loop.usable_steps`.
+        """
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
 
     @cached_property
@@ -164,7 +167,14 @@ class ScoreTable:
 
     @property
     def combination(self) -> Combination:
-        """Combination of the components."""
+        """Combination of the components.
+
+        Raises:
+            UsageError: The table has no components.
+        """
+        if "combination" not in self.config:
+            problem = f"scores of {self.method!r} have no components to combine"
+            raise UsageError(problem, cure="leave out weights and aggregators")
         return Combination(**self.config["combination"])
 
     def recombine(self, combination: Combination) -> ScoreTable:
@@ -249,7 +259,8 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
     if set_hash != data.hash:
         subset_scores, short_hash = data.path / OWN_SCORES, str(set_hash)[:12]
         problem = f"scores belong to another set (hash {short_hash}, {data.path} has {data.hash[:12]})"
-        cure = f"use {subset_scores}" if subset_scores.is_file() and subset_scores != file else _RERUN
+        has_own = subset_scores.is_file() and not subset_scores.samefile(file)
+        cure = f"use {subset_scores}" if has_own else _RERUN
         raise DataError(problem, file=file, cure=cure)
 
 

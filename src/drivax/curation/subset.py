@@ -26,7 +26,9 @@ def check_top(
     """
     total, recordings = len(data), len(set(recordings_of(data.entries)))
     if not all_windows and recordings < total and not 1 <= count <= recordings:
-        cure = f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios"
+        cure = f"ask for 1 to {recordings}"
+        if 1 <= count <= total:
+            cure += f", or pass --all-windows to choose among all {total} scenarios"
         problem = f"cannot select {count} scenarios from {recordings} recordings, one of each"
         raise UsageError(problem, cure=cure)
     if not 1 <= count <= total:

@@ -128,7 +128,8 @@ class DrawStatistics:
             1 for uniform weights, 1 / n if one step has all the weight.
         effective_scenarios: The same for the sums of weights of scenarios.
         tilt, largest: 99th percentile and maximum of the weights, over their mean.
-        concentration: Share of the draws from the 5 % of steps with the largest weights; 0.05 for uniform weights.
+        concentration: Share of the draws from the 5 % of steps (at least one) with the largest weights; 0.05 for many
+            steps of uniform weights.
     """
 
     effective: float
@@ -158,8 +159,13 @@ def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | No
     Shifts are cyclic. This keeps the distribution of scores over steps, within scenarios, and among scenarios;
     exactly, if all scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated).
     Permuting single steps would spread large scores over all scenarios, so that the control would sample more
-    scenarios. ``usable`` is as in :func:`sampling_weights`.
+    scenarios. ``usable`` is as in :func:`sampling_weights`; all other steps keep their scores.
+
+    Raises:
+        UsageError: ``seed`` is negative.
     """
+    if seed < 0:
+        raise UsageError(f"seed is {seed}", cure="use 0 or more")
     rng = np.random.default_rng(seed)
     drawable = table.drawable if usable is None else usable
     steps, scenarios = table.steps.copy(), table.scenarios.copy()

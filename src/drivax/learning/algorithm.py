@@ -125,13 +125,14 @@ def training_data(
     ``weights`` are ``[N, T]`` of every logged step, at least 0; None: uniform.
 
     Raises:
-        UsageError: There are weights, but the algorithm does not learn from logged steps.
+        UsageError: There are weights, but the algorithm does not draw logged steps by weight.
     """
     offline = isinstance(config, OfflineAlgorithm)
     experience = config.experience(environment, data, weights) if offline else None
     if experience is not None:
         return experience
     if weights is not None:
-        problem = f"{type(config).__name__} does not learn from logged steps, so weights have no effect"
-        raise UsageError(problem, cure="leave out the weights, or use bc, cql, iql or td3_bc")
+        problem = f"{type(config).__name__} does not draw logged steps by weight"
+        cure = "leave out the weights, or use bc, cql, iql, td3_bc, or sac with demonstrations"
+        raise UsageError(problem, cure=cure)
     return data

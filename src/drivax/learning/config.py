@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.algorithms.offline import OfflineConfig
@@ -25,7 +26,7 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.simulator.types import Traffic
-from drivax.tasks.actions import DirectState, Trajectory
+from drivax.tasks.actions import ActionSpace, DirectState, Trajectory
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 
@@ -88,14 +89,9 @@ class TrainConfig:
     devices: int | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.task.actions, DirectState | Trajectory):
-            kind = kind_of(type(self.task.actions))
-            raise UsageError(f"policies cannot learn in {kind}", cure="choose a space in [-1, 1]")
-        if self.total_steps < 1:
-            raise UsageError(f"total_steps is {self.total_steps}", cure="use 1 or more")
-        if self.evaluate_every < 0 or min(self.checkpoint_every, self.keep) < 1 or self.patience < 0:
-            problem = "evaluate_every and patience are at least 0, checkpoint_every and keep at least 1"
-            raise UsageError(problem, cure="use patience 0 to train to the end")
+        check_learnable(self.task.actions)
+        check_at_least(self, 1, "total_steps", "checkpoint_every", "keep")
+        check_at_least(self, 0, "evaluate_every", "patience")
         if self.patience and not self.evaluate_every:
             raise UsageError("patience needs validations", cure="set evaluate_every")
         fitted_q = isinstance(self.algorithm, OfflineConfig) and self.algorithm.fitted_q.updates > 0
@@ -103,7 +99,7 @@ class TrainConfig:
             cure = "set algorithm.fitted_q.updates of cql, iql or td3_bc"
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
         shares = self.shares.values()
-        if min(shares, default=0.0) <= 0.0 or abs(sum(shares) - 1.0) > _ROUNDING:
+        if not (min(shares, default=0.0) > 0.0 and abs(sum(shares) - 1.0) <= _ROUNDING):
             texts = [f"{name} {share:g}" for name, share in self.shares.items()]
             problem = f"shares of traffic are {', '.join(texts) or 'missing'}"
             raise UsageError(problem, cure="use shares of at least 0 with a sum of 1")
@@ -144,6 +140,13 @@ class TrainConfig:
     def iterations(self) -> int:
         """Number of iterations of the whole run."""
         return -(-self.total_steps // self.algorithm.steps_per_iteration)
+
+
+def check_learnable(actions: ActionSpace) -> None:
+    """Raise UsageError for an action space whose actions are not in [-1, 1]."""
+    if isinstance(actions, DirectState | Trajectory):
+        problem = f"policies cannot learn in {kind_of(type(actions))}"
+        raise UsageError(problem, cure="choose a space in [-1, 1]")
 
 
 def split_traffic(name: str) -> tuple[str | None, str]:

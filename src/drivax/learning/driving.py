@@ -40,7 +40,8 @@ class Driving:
     Attributes:
         simulator: Task, traffic and kind of start.
         latest_start, earliest_start: Episodes begin at a random step of the log between the two, those of
-            :meth:`start` up to the third last; at step 10 if the ego is not valid then, or its log ends earlier.
+            :meth:`start` up to the third last; at step 10 if the ego is not valid then, or if the third last step of
+            its log is before ``earliest_start``.
         egos: Who drives: the recorded ego, or one of the egos of the scenario, with equal odds. Rows of logged steps
             (:data:`~drivax.learning.experience.StepIndex`) are scenarios, or the rows of all egos in the bank.
     """
@@ -107,10 +108,13 @@ class Driving:
         """Reset environments to random steps of their logs, from ``earliest_start`` to the third last.
 
         Raises:
-            UsageError: ``latest_start`` is too late.
+            UsageError: ``earliest_start`` or ``latest_start`` is too late.
         """
-        if self.latest_start > data.steps - 3:
-            cure = f"use {self.earliest_start} (earliest_start) to {data.steps - 3}"
+        last = data.steps - 3
+        if self.earliest_start > last:
+            raise UsageError(f"earliest_start is {self.earliest_start}", cure=f"use 0 to {last}")
+        if self.latest_start > last:
+            cure = f"use {self.earliest_start} (earliest_start) to {last}"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
         state, over = self._reset(data, key, count)
         return Environments(state, over, self.observe_all(data, state.context))

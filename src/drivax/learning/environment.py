@@ -45,7 +45,7 @@ class Outcome:
         cache: :meth:`Environment.cache` of the new state.
         totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
             ``"reward/<name>"`` over steps.
-        terms: Terms of the reward by name, with their weights; none unless the environment has ``penalties``.
+        terms: Terms of the reward by name, with their weights; those of ``Environment.penalties`` are read.
     """
 
     reward: Float[Array, " B"]
@@ -60,9 +60,9 @@ class Outcome:
 class Environment(Protocol):
     """An environment that algorithms train in.
 
-    One whose reward algorithms may constrain has a mapping ``penalties``: the terms of its outcomes that are never
-    positive, with minus their weights. With a method ``past(count) -> PastPolicy`` it has environments that an older
-    copy of the policy drives.
+    One whose reward algorithms may constrain has a mapping ``penalties``: the terms of its outcomes with a constant
+    weight below 0, and minus these weights. With a method ``past(count) -> PastPolicy`` it has environments that an
+    older copy of the policy drives.
     """
 
     @property

@@ -67,7 +67,7 @@ def sampler(weights: np.ndarray) -> Sampler:
     """
     total = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not total[-1] > 0.0:
-        raise DataError("all weights are 0", cure="give a usable step a weight above 0")
+        raise DataError("all weights of usable steps are 0", cure="give one a weight above 0")
     cumulative = np.floor(total / total[-1] * _MAX_UINT32).astype(np.uint32)
     effective = jnp.asarray(effective_size(weights), jnp.float32)
     return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
@@ -85,17 +85,18 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return weights ``[N, T]`` in double precision.
 
     Raises:
-        UsageError: The shape is wrong, or a weight is negative, infinite or NaN.
+        UsageError: The shape is wrong, or a weight is negative, NaN or above 1e100.
     """
     weights = np.asarray(weights)
     if weights.shape != shape:
         problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
         raise UsageError(problem, cure="make weights for every step of this scenario set")
-    invalid = np.argwhere(~(np.isfinite(weights) & (weights >= 0.0)))
+    # Sums of squares stay finite.
+    invalid = np.argwhere(~((weights >= 0.0) & (weights <= 1e100)))
     if len(invalid):
         scenario, step = invalid[0]
         problem = f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}"
-        raise UsageError(problem, cure="use finite numbers of at least 0")
+        raise UsageError(problem, cure="use numbers from 0 to 1e100")
     return weights.astype(np.float64)
 
 
@@ -138,7 +139,7 @@ def require_log(environment: Environment) -> LoggedEnvironment:
     """
     if not isinstance(environment, LoggedEnvironment):
         problem = f"{type(environment).__name__} has no logged episodes"
-        raise UsageError(problem, cure="implement `expert_steps`")
+        raise UsageError(problem, cure="implement `expert_steps` and `observe_recorded`")
     return environment
 
 
@@ -191,6 +192,11 @@ class ExperienceConfig:
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
+        if not usable.any():
+            if not expert.usable.any():
+                raise DataError("no logged step has an expert action", cure="check the set")
+            problem = "the expert's action exceeds the bounds at all logged steps"
+            raise DataError(problem, cure="choose an action space with wider bounds")
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)

@@ -68,7 +68,7 @@ class TrainOptions:
 
     Attributes:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
-        overwrite: Replace an existing run folder.
+        overwrite: Replace an existing run folder; no effect with ``resume``.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
         log: Called with lines about held-out scenarios, memory, pretrained networks and early stopping, and warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
@@ -94,7 +94,8 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device; offline algorithms draw steps of a weighted set by weight.
+        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms and ``sac`` with
+            ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
             of its scenarios (at most 256). None trains on all scenarios without validation.
@@ -178,10 +179,12 @@ def _divide(
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
-    """Return which logged steps ``[N, T]`` an offline training draws from, of any ego; ``trust`` as for :func:`train`.
+    """Return the logged steps ``[N, T]``, of any ego, that a training on a weighted set can draw.
+
+    ``trust`` is as for :func:`train`.
 
     Raises:
-        UsageError: The algorithm is not offline.
+        UsageError: The algorithm does not draw logged steps by weight.
     """
     environment, bank = _environment(config, data, trust)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
@@ -203,7 +206,8 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
     """Return the means to log, given the values of an iteration.
 
     A name with a count ``<name>/n`` is a sum: its mean is logged, or nothing if the count is 0. Sums of
-    ``rollout/reward/*`` are divided by ``rollout/steps``, and logged as ``reward/*``. All others are logged unchanged.
+    ``rollout/reward/*`` are divided by ``rollout/steps``, and logged as ``reward/*``. These counts are not logged; all
+    other values are logged unchanged.
     """
     values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
     steps = values.pop("rollout/steps", 0.0)

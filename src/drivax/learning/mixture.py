@@ -75,7 +75,8 @@ class Mixture:
     def past(self, count: int) -> PastPolicy:
         """Return the environments that an older copy of the policy drives: of the block of self-play, if any."""
         sizes = self.sizes(count)
-        for (_, block), size, first in zip(self.blocks, sizes, accumulate(sizes, initial=0), strict=False):
+        firsts = accumulate(sizes[:-1], initial=0)
+        for (_, block), size, first in zip(self.blocks, sizes, firsts, strict=True):
             if isinstance(block, SelfPlay):
                 past = block.past(size)
                 return past._replace(environments=first + past.environments)

@@ -70,7 +70,8 @@ def load_policy(
         template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
-        name = folder.path.name if step is None else f"{folder.path.name}@{step}"
+        run_name = _name(folder.path)
+        name = run_name if step is None else f"{run_name}@{step}"
         return learner.planner(parameters, name, samples)
 
     exported = folder.path / POLICY_FILE
@@ -82,6 +83,12 @@ def load_policy(
     checkpoints = Checkpoints(folder.checkpoints)
     chosen = checkpoints.best_or_newest() if step is None else step
     return planner(checkpoints.restore(template, chosen, part=".parameters")), config.task
+
+
+def _name(run: str | Path) -> str:
+    """Return the name of a run's folder, also for ``.`` and ``..``."""
+    path = Path(run)
+    return path.name if path.name not in ("", "..") else path.resolve().name
 
 
 def export_policy(
@@ -98,7 +105,7 @@ def export_policy(
         out: Folder to write; its name is that of the policy.
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.
-        overwrite: Replace ``out`` if it is a run folder.
+        overwrite: Replace ``out`` if it is a run folder, but not that of a training.
         trust: As for :func:`load_policy`.
     """
     folder = open_policy(run)
@@ -110,7 +117,7 @@ def export_policy(
     if step is not None:
         about["step"] = step
     config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
-    RunFolder.check(Path(out), overwrite)
+    RunFolder.check(Path(out), overwrite, "policy")
     with replace_folder(Path(out)) as partial_folder:
         exported = RunFolder.create(partial_folder, config, overwrite=True).note(**about)
         pack(partial_folder / POLICY_FILE, planner)
@@ -130,7 +137,7 @@ class PolicyTraffic(PlannerTraffic):
     def name(self) -> str:
         """Name in tables: ``driven_by_RUN``, with the traffic of the other agents unless it is the log."""
         base = "" if self.base.name == "log" else f"+{self.base.name}"
-        return f"driven_by_{Path(self.run).name}{base}"
+        return f"driven_by_{_name(self.run)}{base}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the policy, and with what ``base`` needs."""

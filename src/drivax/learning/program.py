@@ -194,16 +194,17 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     count = len(available) if requested is None else requested
     if count == 1 or seeds % count == 0:
         return available[:count]
-    sizes = {leaf.shape[axis] for leaf, axis in _divisible(state, seeds) if axis is not None}
-    kind = "environments" if sizes else "steps per batch"
-    sizes |= set() if batch is None else {batch}
-    indivisible = [size for size in sizes if size % count]
+    divisible = ((leaf, axis) for leaf, axis in _divisible(state, seeds) if axis is not None)
+    sizes = [(leaf.shape[axis], "environments") for leaf, axis in divisible]
+    sizes += [] if batch is None else [(batch, "steps per batch")]
+    indivisible = [f"{size} {kind}" for size, kind in sizes if size % count]
     if sizes and not indivisible:
         return available[:count]
     if requested is None:
         return available[:1]
-    work = f"{indivisible[0]} {kind}" if indivisible else "an algorithm without environments or batches"
-    cure = f"use a multiple of {count} {kind} or seeds, or fewer devices"
+    work = indivisible[0] if indivisible else "an algorithm without environments or batches"
+    kinds = " or ".join(dict.fromkeys([*(kind for size, kind in sizes if size % count), "seeds"]))
+    cure = f"use a multiple of {count} {kinds}, or fewer devices"
     raise UsageError(f"{work} cannot be divided among {count} devices", cure=cure)
 
 
@@ -227,8 +228,8 @@ def device_count() -> int:
 def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:
     """Return a function's result summed over devices, each with its share of ``divided`` along an axis.
 
-    The sum is taken once, where the compiler would take it in every step of a loop. One device takes all if shares
-    would differ.
+    The sum is taken once, where the compiler would take it in every step of a loop. If shares would differ, nothing is
+    divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):

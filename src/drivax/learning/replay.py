@@ -133,7 +133,7 @@ class ReplayBuffer:
         rows, steps = replay.reward.shape[0], rollout.reward.shape[0]
         if steps > rows:
             problem = f"{steps} steps do not fit a replay buffer of {rows} rows"
-            raise UsageError(problem, cure="raise replay.capacity")
+            raise UsageError(problem, cure=f"set replay.capacity to {steps * replay.reward.shape[1]} or more")
         observation = rollout.observation
         stored = rollout.state if observation is None else _cast(observation, jnp.bfloat16)
         new = {"stored": stored, "action": rollout.raw_action}

@@ -16,6 +16,7 @@ from drivax.learning.driving import Driving, keep
 from drivax.learning.environment import Environments, PastPolicy
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.schema import MOST_EGOS
 from drivax.simulator.simulator import Step, is_driven, map_where
 from drivax.simulator.types import AgentContext, EpisodeStart, SimState
 
@@ -25,7 +26,7 @@ class SelfPlayConfig:
     """Settings of the traffic ``self``.
 
     Attributes:
-        vehicles: Largest number of vehicles of a scenario that the policy drives, ego included.
+        vehicles: Largest number of vehicles of a scenario that the policy drives, ego included; 2 to 8.
         past: Share of the groups in which an older copy of the policy drives all vehicles but ego (ppo and bc_ppo).
         refresh: Iterations after which the current policy replaces the older copy.
     """
@@ -35,8 +36,8 @@ class SelfPlayConfig:
     refresh: int = 50
 
     def __post_init__(self) -> None:
-        if self.vehicles < 2:
-            raise UsageError(f"self_play.vehicles is {self.vehicles}", cure="use 2 or more")
+        if not 2 <= self.vehicles <= MOST_EGOS:
+            raise UsageError(f"self_play.vehicles is {self.vehicles}", cure=f"use 2 to {MOST_EGOS}")
         if not 0.0 <= self.past <= 1.0 or self.refresh < 1:
             problem = f"self_play.past is {self.past:g}, self_play.refresh {self.refresh}"
             raise UsageError(problem, cure="use a share from 0 to 1, and 1 iteration or more")
@@ -57,7 +58,7 @@ class SelfPlay(Driving):
         """Return the environments that an older copy of the policy drives: in the first groups, all but ego's.
 
         Raises:
-            UsageError: The share of ``past`` is less than half a group.
+            UsageError: The share of ``past`` rounds to no group.
         """
         size, number = self.config.vehicles, np.arange(count)
         groups = round(self.config.past * (count // size))
@@ -135,12 +136,12 @@ class SelfPlay(Driving):
         self, bank: ScenarioBank, index: Array, step: Array, key: Array
     ) -> tuple[Int[Array, " K"], Array]:
         """Return the slots of ego and of random further egos whose log has two more steps, then padding; and keys."""
-        moving, further = bank.agents.shape[2], bank.egos[index, 1:]
+        padding, further = bank.agents.shape[2], bank.egos[index, 1:]
         rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
         present = bank.agents[index, step, further, AgentColumn.VALID] > 0
         present &= (further >= 0) & (step <= bank.last_step[rows] - 2)
         rank = jnp.where(present, jax.random.uniform(key, further.shape), jnp.inf)
-        slots = jnp.where(present, further, moving)[jnp.argsort(rank)[: self.config.vehicles - 1]]
+        slots = jnp.where(present, further, padding)[jnp.argsort(rank)[: self.config.vehicles - 1]]
         keys = jax.random.split(jax.random.fold_in(key, 1), self.config.vehicles)
         return jnp.pad(slots, (1, 0)).astype(jnp.int32), keys
 

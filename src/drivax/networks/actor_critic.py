@@ -9,6 +9,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.errors import UsageError
 from drivax.networks.distributions import (
     Actions,
     Distribution,
@@ -26,6 +27,7 @@ from drivax.networks.encoders import (
     Groups,
     GroupSpec,
     MlpConfig,
+    check_widths,
     dense_layers,
 )
 from drivax.networks.entity import EntityConfig
@@ -70,10 +72,11 @@ class NetworkConfig:
     critic_norm: bool = False
 
     def __post_init__(self) -> None:
-        if np.min(self.first_scale) <= 0.0:
-            raise ValueError(f"first_scale is {self.first_scale}; use more than 0")
+        if np.size(self.first_scale) == 0 or not np.min(self.first_scale) > 0.0:
+            raise UsageError(f"first_scale is {self.first_scale}", cure="use one or more numbers above 0")
         if not 0.0 <= self.least_scale <= 1.0:
-            raise ValueError(f"least_scale is {self.least_scale}; use 0 to 1")
+            raise UsageError(f"least_scale is {self.least_scale}", cure="use 0 to 1")
+        check_widths("head", self.head)
 
 
 class _Head(nnx.Module):

@@ -19,12 +19,22 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_names
 
 Dtype = Literal["float32", "bfloat16"]
 
 #: Logit of masked tokens; finite, so that the softmax stays finite if all tokens are masked.
 _MASKED = -1e30
+
+
+def check_heads(width: int, heads: int) -> None:
+    """Raise UsageError unless tokens of this width divide among the heads."""
+    for name, value in (("width", width), ("heads", heads)):
+        if value < 1:
+            raise UsageError(f"{name} is {value}", cure="use 1 or more")
+    if width % heads:
+        raise UsageError(f"width {width} is not a multiple of {heads} heads", cure="change width or heads")
 
 
 class Attention(nnx.Module):

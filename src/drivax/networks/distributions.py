@@ -45,7 +45,8 @@ class Actions:
 
     def __post_init__(self) -> None:
         if self.levels is not None and len(self.levels) != self.size:
-            raise ValueError(f"levels of {len(self.levels)} numbers for actions of {self.size}")
+            problem = f"levels of {len(self.levels)} numbers for actions of {self.size}"
+            raise UsageError(problem, cure="give levels for each number of an action")
 
 
 @runtime_checkable
@@ -297,14 +298,13 @@ def initial_parameters(
     """
     scales = np.atleast_1d(np.asarray(scale, np.float64))
     if len(scales) not in (1, actions.size):
-        problem = f"first_scale has {len(scales)} numbers for {actions.size} actions"
-        raise UsageError(problem, cure="give one, or one per action")
+        problem = f"first_scale has {len(scales)} numbers for actions of {actions.size}"
+        raise UsageError(problem, cure="give one, or one for each number of an action")
     scales = np.broadcast_to(scales, actions.size)
     if kind == "grid":
         return (-0.5 * (combinations(_levels(actions)) / scales) ** 2).sum(axis=-1)
     if kind != "beta" and (scales.min() < _MIN_SCALE or scales.max() > _MAX_SCALE):
-        problem = f"first_scale of a {kind} is {scales.min():g} to {scales.max():g}"
-        raise UsageError(problem, cure=f"use {_MIN_SCALE:g} to {_MAX_SCALE:g}")
+        raise UsageError(f"first_scale of a {kind} is {scale}", cure=f"use {_MIN_SCALE:g} to {_MAX_SCALE:g}")
     spread = np.log(np.expm1(scales))  # The inverse of softplus.
     if kind == "gaussian":
         return np.concatenate([np.zeros(actions.size), spread]).astype(np.float32)

@@ -66,7 +66,8 @@ class MlpConfig:
 
     Attributes:
         rows: Layers shared by the rows of each masked group, before a maximum over rows; empty: rows are flattened.
-        flat: Masked groups whose rows are flattened in any case, because their order counts, as that of route points.
+        flat: Masked groups whose rows are flattened in any case, because their order counts, as that of route points;
+            missing names are ignored.
         hidden: Width of each following layer; the last is the size of the embedding. Empty: no layers.
         activation: Activation after each layer.
     """
@@ -76,6 +77,10 @@ class MlpConfig:
     flat: tuple[str, ...] = ()
     hidden: tuple[int, ...] = (256, 256)
     activation: Activation = "relu"
+
+    def __post_init__(self) -> None:
+        check_widths("rows", self.rows)
+        check_widths("hidden", self.hidden)
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MlpEncoder:
         """Return the encoder with fresh parameters."""
@@ -126,6 +131,12 @@ class MlpEncoder(nnx.Module):
             return row
         # A row is valid if any of its times is; without valid rows the embedding is zero.
         return max_pool(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))
+
+
+def check_widths(name: str, widths: tuple[int, ...]) -> None:
+    """Raise UsageError if a layer of the setting ``name`` has no outputs."""
+    if min(widths, default=1) < 1:
+        raise UsageError(f"{name} has a layer of width {min(widths)}", cure="use 1 or more")
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:

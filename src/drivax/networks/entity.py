@@ -13,6 +13,7 @@ from drivax.networks.attention import (
     Attention,
     Dtype,
     GroupShape,
+    check_heads,
     concatenate_groups,
     group_rows,
     group_shapes,
@@ -32,8 +33,9 @@ class EntityConfig:
         size: Width: 64 if ``published``, 32 if ``small``.
         width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
         heads: Number of attention heads.
-        goal: Groups whose mean is added to the query; missing names are ignored, here and in ``context``.
-        context: Groups whose mean is appended to the embedding.
+        goal: Groups whose mean is added to the query and appended to the embedding; missing names are ignored, here
+            and in ``context``.
+        context: Groups whose mean is appended to the embedding, unless ``goal`` has them.
         dtype: Type of the attention's matrix products; the rest is float32.
     """
 
@@ -49,8 +51,7 @@ class EntityConfig:
     renamed: ClassVar[dict[str, str]] = {"beside": "context"}
 
     def __post_init__(self) -> None:
-        if self.heads < 1 or self.entity_width < 1 or self.entity_width % self.heads:
-            raise ValueError(f"width {self.entity_width} is not a multiple of {self.heads} heads")
+        check_heads(self.entity_width, self.heads)
 
     @property
     def entity_width(self) -> int:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.networks.attention import (
     Dtype,
     Embedding,
@@ -19,11 +20,12 @@ from drivax.networks.attention import (
     ResidualAttention,
     SelfAttention,
     TokenRows,
+    check_heads,
     concatenate_groups,
     group_shapes,
     masked_mean,
 )
-from drivax.networks.encoders import Groups, GroupSpec
+from drivax.networks.encoders import Groups, GroupSpec, check_widths
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,11 @@ class TransformerConfig:
 
     def __post_init__(self) -> None:
         sizes = self.sizes
-        counts = (sizes.width, sizes.heads, sizes.layers, sizes.latents, *sizes.embedding)
-        if min(counts) < 1:
-            raise ValueError(f"encoder sizes must be at least 1, not {counts}")
-        if sizes.width % sizes.heads:
-            raise ValueError(f"width {sizes.width} is not a multiple of {sizes.heads} heads")
+        check_heads(sizes.width, sizes.heads)
+        for name in ("layers", "latents"):
+            if getattr(sizes, name) < 1:
+                raise UsageError(f"{name} is {getattr(sizes, name)}", cure="use 1 or more")
+        check_widths("embedding", sizes.embedding)
 
     @property
     def sizes(self) -> Sizes:
@@ -113,7 +115,7 @@ class LqhConfig(LatentConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.local_layers < 1:
-            raise ValueError(f"local_layers must be at least 1, not {self.local_layers}")
+            raise UsageError(f"local_layers is {self.local_layers}", cure="use 1 or more")
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""
@@ -260,6 +262,8 @@ class LatentEncoder(nnx.Module):
 class MtrEncoder(nnx.Module):
     """Attention over the times of each mover, then over movers and map; the output is the mean over ego's tokens.
 
+    Without groups of ego it is the mean over all movers; without movers, all rows count as movers.
+
     Attributes (names of stored parameters):
         time: Self-attention over the times of a mover.
         among: Attention among movers, by layer.
@@ -272,7 +276,6 @@ class MtrEncoder(nnx.Module):
         self.embedding = Embedding(spec, width, sizes.embedding, rngs, dtype)
         shapes = group_shapes(spec)
         movers = tuple(name for name, shape in shapes.items() if shape.series or not shape.masked)
-        # Without movers, all rows count as movers.
         self.mover_groups = movers or tuple(shapes)
         self.map_groups = tuple(name for name in shapes if name not in self.mover_groups)
         self.ego_groups = tuple(name for name in self.mover_groups if not shapes[name].masked)
@@ -295,7 +298,6 @@ class MtrEncoder(nnx.Module):
             if map_tokens is not None:
                 x = self.around[number](x, *map_tokens)
             x = layer(x)
-        # The embedding is the mean over ego's tokens, or over all movers if no group is ego's.
         output_groups = self.ego_groups or self.mover_groups
         masks = [m if name in output_groups else jnp.zeros_like(m) for name, (_, m) in movers.items()]
         return masked_mean(self.norm(x), jnp.concatenate(masks, axis=-1))

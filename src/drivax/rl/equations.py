@@ -74,6 +74,7 @@ def n_step_returns(
     """
     taken_t = jnp.cumprod(follows_t, axis=0, dtype=jnp.int32)
     decision = np.arange(len(reward_t)) // hold
+    # From the first decision to the state after the last one.
     power = jnp.asarray(gamma ** np.arange(decision[-1] + 2), jnp.float32)
     weight = power[decision].reshape(-1, *[1] * (reward_t.ndim - 1))
     steps = taken_t.sum(axis=0)

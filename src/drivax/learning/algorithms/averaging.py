@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from drivax.errors import UsageError
+
 
 def check_average(decay: float) -> None:
-    """Raise ValueError if the decay of an average is outside [0, 1)."""
+    """Raise UsageError if the decay of an average is outside [0, 1)."""
     if not 0.0 <= decay < 1.0:
-        raise ValueError(f"average is {decay}; choose at least 0 and less than 1")
+        raise UsageError(f"average is {decay}", cure="use 0 or more, and less than 1")
 
 
 def unless_first(state: Any, parameters: Any) -> Any:

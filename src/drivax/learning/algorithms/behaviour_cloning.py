@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
@@ -71,8 +72,9 @@ class Cloning:
     mask_clipped: bool = True
 
     def __post_init__(self) -> None:
-        if self.batch < 1 or self.updates < 1:
-            raise ValueError("batch and updates must be at least 1")
+        check_at_least(self, 1, "batch", "updates")
+        check_at_least(self, 0, "learning_rate", "last_rate")
+        check_above_zero(self, "gradient_norm")
         check_decay_share(self.falling)
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
@@ -133,7 +135,7 @@ class BcConfig(Cloning):
         return self.batch * self.updates
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the data, from which steps are drawn uniformly, or experience drawn by weight."""
+        """Return the data, whose ``demonstrations`` are drawn, or experience drawn by weight."""
         # The loss masks clipped steps, and logs their share.
         config = ExperienceConfig(mask_clipped=False)
         return data if weights is None else config.of(environment, data, weights)

@@ -16,7 +16,7 @@ from drivax.learning.environment import Environment, Rollout
 class Constraints:
     """Limits of costs, and the dual ascent of their multipliers.
 
-    A cost is a penalty of the environment without its weight: 1 at the step of a failure.
+    A cost is a penalty of the environment without its weight; that of a failure is 1 at its step.
 
     Attributes:
         limits: Largest mean sum of a cost per episode.

@@ -13,6 +13,7 @@ import optax
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.off_policy import Trained, squared_error, target_entropy
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
@@ -62,13 +63,12 @@ class CqlConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_gradient()
-        temperature = min(self.temperature, self.penalty_temperature)
-        if min(self.actions, self.backup_actions) < 1 or temperature <= 0.0:
-            problem = "actions, backup_actions or a temperature of CQL is too small"
-            raise UsageError(problem, cure="use more than 0")
-        if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
-            problem = "penalty or imitation is negative, or penalty is 0 with a gap"
-            raise UsageError(problem, cure="use 0 or more, or more than 0 with a gap")
+        check_at_least(self, 1, "actions", "backup_actions")
+        check_above_zero(self, "temperature", "penalty_temperature")
+        check_at_least(self, 0, "penalty", "imitation", "penalty_rate", "temperature_rate")
+        if self.gap is not None and self.penalty == 0.0:
+            problem = "penalty is 0, from which the multiplier of a gap cannot start"
+            raise UsageError(problem, cure="use more than 0, or no gap")
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
         """Return CQL in an environment."""

@@ -13,6 +13,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
@@ -42,9 +43,8 @@ class IqlConfig(OfflineConfig):
         super().__post_init__()
         if not 0.0 < self.expectile < 1.0:
             raise UsageError(f"expectile is {self.expectile:g}", cure="use more than 0 and less than 1")
-        if self.inverse_temperature < 0.0 or self.largest_weight <= 0.0:
-            problem = "inverse_temperature or largest_weight is too small"
-            raise UsageError(problem, cure="use 0 or more, and a largest_weight above 0")
+        check_at_least(self, 0, "inverse_temperature")
+        check_above_zero(self, "largest_weight")
         if self.loss == "mse":
             self.check_gradient()
 
@@ -95,6 +95,7 @@ class Iql(Offline[IqlConfig]):
             "mean_value": jnp.mean(value),
             "advantage": jnp.mean(advantage),
             "weight": jnp.mean(weights),
+            # With a margin, because exponential and logarithm round.
             "weights_cut": jnp.mean(weights >= 0.999 * config.largest_weight),
             "imitation_error": jnp.mean(jnp.abs(error)),
         }

@@ -16,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, squared_error
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
@@ -59,8 +60,10 @@ class FittedQConfig:
     gradient_norm: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.updates < 0 or self.batch < 1:
-            raise UsageError("fitted_q.updates or fitted_q.batch is too small", cure="use 0 updates for none")
+        check_at_least(self, 1, "batch")
+        check_at_least(self, 0, "updates", "rate")
+        check_shares(self, "tau")
+        check_above_zero(self, "gradient_norm")
 
 
 @dataclass(frozen=True)
@@ -154,8 +157,10 @@ class OfflineConfig:
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
 
     def __post_init__(self) -> None:
-        if self.batch < 1 or self.updates < 1:
-            raise ValueError("batch and updates must be at least 1")
+        check_at_least(self, 1, "batch", "updates")
+        check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
+        check_shares(self, "gamma", "tau")
+        check_above_zero(self, "gradient_norm")
         check_decay_share(self.falling)
 
     @property
@@ -178,7 +183,7 @@ class OfflineConfig:
         """Raise UsageError for a grid or mixture policy, whose actions have no gradient in the logits."""
         if self.network.distribution not in REPARAMETRISED:
             problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
-            raise UsageError(problem, cure="use gaussian or beta; iql and bc take any distribution")
+            raise UsageError(problem, cure="use gaussian or beta, or iql or bc with loss: likelihood")
 
 
 @record

@@ -49,7 +49,7 @@ def sum_gradients(
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return jax.lax.scan(add, zeros, samples)[0]
 
-    # Fusions with the surrounding program would round differently in each program.
+    # Without barriers the compiler fuses these sums with the program around them, and each program rounds differently.
     inputs = jax.lax.optimization_barrier((parameters, samples))
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
 
@@ -81,7 +81,7 @@ def clipped_adam(
     """
     schedule = optax.linear_schedule(rate, last * rate, updates) if updates else rate
     adam = optax.adam(schedule, eps=eps)
-    if norm is None:
+    if norm is None:  # ``identity`` gives the state the structure that it has with clipping
         return optax.chain(optax.identity(), adam)
     return optax.chain(clip_per_network(norm) if per_network else optax.clip_by_global_norm(norm), adam)
 

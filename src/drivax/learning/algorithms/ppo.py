@@ -12,8 +12,10 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool
 
+from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters, unless_first
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
 from drivax.learning.algorithms.constraints import Constraints
 from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -81,16 +83,18 @@ class PpoConfig:
     multiplier_rate: float = 0.1
 
     def __post_init__(self) -> None:
-        if min((self.multiplier_rate, *self.constraints.values())) < 0.0:
-            raise ValueError("limits of constraints and multiplier_rate must be at least 0")
+        for name, limit in self.constraints.items():
+            if not limit >= 0.0:
+                raise UsageError(f"the limit of constraint {name!r} is {limit}", cure="use 0 or more")
         check_average(self.average)
-        if min(self.environments, self.unroll, self.epochs, self.minibatches) < 1:
-            raise ValueError("environments, unroll, epochs and minibatches must be at least 1")
+        check_at_least(self, 1, "environments", "unroll", "epochs", "minibatches")
+        check_at_least(self, 0, "learning_rate", "last_rate", "clip", "value_coefficient", "multiplier_rate")
+        check_shares(self, "gamma", "lambda_")
+        check_above_zero(self, "target_kl", "gradient_norm")
         steps, minibatches = self.steps_per_iteration, self.minibatches
         if steps % minibatches:
-            raise ValueError(
-                f"environments x unroll = {steps} is not a multiple of {minibatches} minibatches"
-            )
+            problem = f"environments x unroll = {steps} is not a multiple of {minibatches} minibatches"
+            raise UsageError(problem, cure="change environments, unroll or minibatches")
 
     @property
     def steps_per_iteration(self) -> int:

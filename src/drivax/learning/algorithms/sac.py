@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
+from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
 from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -97,10 +98,10 @@ class SacConfig:
 
     def __post_init__(self) -> None:
         check_average(self.average)
-        if min(self.environments, self.unroll, self.updates_per_step, self.batch, self.steps) < 1:
-            raise ValueError("environments, unroll, updates_per_step, batch and steps must be at least 1")
-        if self.temperature <= 0.0:
-            raise UsageError(f"temperature is {self.temperature}", cure="use more than 0")
+        check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
+        check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
+        check_above_zero(self, "temperature", "gradient_norm")
+        check_shares(self, "gamma", "tau")
         if not 0.0 <= self.demonstrations < 1.0:
             raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
         if self.demonstrations and not 0 < self.logged_batch < self.batch:
@@ -109,7 +110,7 @@ class SacConfig:
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
-            raise UsageError(problem, cure="raise replay.capacity")
+            raise UsageError(problem, cure=f"set replay.capacity to {self.steps_per_iteration} or more")
         if self.unroll < 2 and self.warm_up < 2 * self.environments:
             cure = f"set warm_up to {2 * self.environments} or more"
             raise UsageError("the first update has no step with a successor to sample", cure=cure)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from drivax.errors import UsageError
+from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
@@ -39,9 +39,8 @@ class Td3BcConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_gradient()
-        if min(self.q_weight, self.noise, self.noise_bound) < 0.0 or self.delay < 1:
-            problem = "q_weight, noise, noise_bound or delay is too small"
-            raise UsageError(problem, cure="use 0 or more, and a delay of 1 or more")
+        check_at_least(self, 0, "q_weight", "noise", "noise_bound")
+        check_at_least(self, 1, "delay")
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Td3Bc:
         """Return TD3+BC in an environment."""

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import Cloning, check_loss, require_expert
+from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.ppo import Ppo, PpoConfig
 from drivax.learning.algorithms.sac import Sac, SacConfig
 from drivax.learning.environment import Environment, any_across_learners
@@ -41,8 +42,7 @@ class WarmStart:
     half_life: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.settle, self.half_life) < 0 or self.weight < 0.0:
-            raise UsageError("a setting of warm_start is negative", cure="use 0 or more")
+        check_at_least(self, 0, "iterations", "settle", "weight", "half_life")
 
     def online_iterations(self, iterations: int) -> int:
         """Return the iterations of a run after pretraining.

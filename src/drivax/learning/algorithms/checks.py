@@ -1,0 +1,30 @@
+"""Checks of numeric settings; NaN fails all of them, and None (a setting that is off) passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from drivax.errors import UsageError
+
+
+def check_at_least(config: Any, least: int, *names: str) -> None:
+    """Raise UsageError for the first of these settings that is below ``least``."""
+    _check(config, names, lambda value: value >= least, f"use {least} or more")
+
+
+def check_above_zero(config: Any, *names: str) -> None:
+    """Raise UsageError for the first of these settings that is not above 0."""
+    _check(config, names, lambda value: value > 0, "use more than 0")
+
+
+def check_shares(config: Any, *names: str) -> None:
+    """Raise UsageError for the first of these settings that is outside [0, 1]."""
+    _check(config, names, lambda value: 0 <= value <= 1, "use 0 to 1")
+
+
+def _check(config: Any, names: tuple[str, ...], is_valid: Callable[[Any], bool], cure: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not is_valid(value):
+            raise UsageError(f"{name} is {value}", cure=cure)
