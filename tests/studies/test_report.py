@@ -87,6 +87,7 @@ def test_report_shows_the_results(page):
     assert [[cell.text for cell in row] for row in validations_table(RESULTS, "mean_q").rows] == rows
     assert "seeds with their highest mean_q" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
+    assert "Play those of kinematic and ensemble in <a href=critical.html>" in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
     assert "Better than the matched random control?" in text and "than the baseline?" not in text

@@ -154,7 +154,10 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
 
 
 def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: int) -> EgoMotion:
-    """Return ego's motion; accelerations are backward differences (the first uses the log), yaw rates forward ones."""
+    """Return ego's motion; accelerations are backward differences, yaw rates forward ones.
+
+    The first acceleration uses the log if ego starts at a logged pose after another one, and is 0 otherwise.
+    """
     x, y, heading, speed = motion.T
     previous_step = max(start - 1, 0)
     # The log does not contain the speed before a noisy start.

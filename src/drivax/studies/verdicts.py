@@ -125,7 +125,8 @@ class ClaimResult:
     Attributes:
         claim: The claim.
         effect: The effect to test against 0: the difference, or for a claimed size the log ratio minus its claimed
-            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is 0).
+            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is not
+            positive).
         difference: Arm minus reference; None if fewer than two recordings define the metric.
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).
@@ -193,7 +194,7 @@ def _decide(result: ClaimResult, claims: int) -> ClaimResult:
     if result.effect is None or result.adjusted_p is None:
         needed = "fewer than two recordings define it"
         if result.difference is not None:
-            needed = "the mean of an arm is 0: no ratio"
+            needed = "the mean of an arm is not positive: no ratio"
         return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
         return replace(result, needed=describe_sample_size(result.effect, claims))
