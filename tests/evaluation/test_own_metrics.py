@@ -63,6 +63,7 @@ def test_invalid_metrics_are_refused():
 def test_own_metric_that_is_not_in_a_list_is_kept():
     task = evaluation_task(Task(metrics="own_terms:nearest_other"))
     assert task.metrics == ("full", "own_terms:nearest_other")
+    assert select_metrics(("own_terms:nearest_other",) * 2).names == ("nearest_other",)
 
 
 @pytest.mark.parametrize(

@@ -399,8 +399,10 @@ def test_settings_out_of_range_are_refused(data, tmp_path):
     study = Study(
         LONGTAIL, StudyConfig(total_steps=0), StudySets(data.path, data.path, (data.path,)), tmp_path
     )
-    with pytest.raises(UsageError, match="total_steps is 0"):
-        study.train_config("bc", 0)
+    for steps, words in ((0, "total_steps is 0"), (1, "a training of 1 steps has one iteration")):
+        study = replace(study, config=replace(study.config, total_steps=steps))
+        with pytest.raises(UsageError, match=words):
+            study.train_config("bc", 0)
 
 
 def test_claims_that_no_test_decides_are_refused():

@@ -165,7 +165,10 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``."""
+    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``.
+
+    Codes and counts, which have no mean, are left out.
+    """
     rows = []
     for name in select_metrics(names).names:
         metric = summary["metrics"].get(name)
@@ -276,6 +279,7 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
     present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
+    # A scenario has a row of ``last_step`` per ego; the first row is that of slot 0.
     _check_starts(names, np.asarray(bank.last_step[:: bank.most_egos]) + 1, present, start_step)
     return names
 

@@ -54,7 +54,7 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     """
     requested: list[str] = []
     own: dict[str, Metric] = {}
-    for entry in (names,) if isinstance(names, str) else names:
+    for entry in (names,) if isinstance(names, str) else dict.fromkeys(names):
         if is_dotted(entry):
             name = entry.rpartition(":")[2].rpartition(".")[2]
             own[name] = _own_metric(entry, name, own)

@@ -324,6 +324,9 @@ class Study:
         total_steps = self.config.total_steps
         total_steps = config.total_steps if total_steps is None else total_steps
         config = replace(config, seed=seed, total_steps=total_steps)
+        if config.iterations < 2:
+            problem = f"a training of {total_steps} steps has one iteration, too few for validations"
+            raise UsageError(problem, cure="raise total_steps")
         interval = max(config.iterations // self.config.validations, 1)
         # All checkpoints of the first baseline stay: another rule chooses among them afterwards.
         keep = config.iterations if arm == self.definition.baselines[0] else config.keep

@@ -172,7 +172,7 @@ def rankings_table(results: Results) -> Table:
     rows = [
         (
             " and ".join(pair["methods"]),
-            _interval(pair["rho"], pair["interval"], "+.2f"),
+            MISSING if pair["rho"] is None else _interval(pair["rho"], pair["interval"], "+.2f"),
             f"{pair['overlap']:.0%}",
             _VERDICT_TEXTS[pair["orthogonal"]],
         )
@@ -220,7 +220,8 @@ def _conditions(definition: StudyDefinition, results: Results) -> str:
         "<p>Progress is relative to the expert's, at the best checkpoint. The change of the score is from the third to "
         "the last quarter of the validations. Smallest differences in ordinary traffic that this study detects with a "
         "power of 80 %, at the strictest level of the first group of claims, if all seeds vary like the baseline's: "
-        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained.</p>"
+        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained, unless --anyway "
+        "was passed.</p>"
     )
 
 

@@ -196,12 +196,12 @@ def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) ->
         raise UsageError(
             "contains a study with other settings or scenarios",
             file=study.folder,
-            cure="choose another name",
+            cure="choose another --out",
         )
     # Claims are fixed before the evaluation. Studies of earlier versions do not name their definition.
     if folder.info.get("definition", definition) != definition:
         raise UsageError(
-            "contains a study with another definition", file=study.folder, cure="choose another name"
+            "contains a study with another definition", file=study.folder, cure="choose another --out"
         )
 
 

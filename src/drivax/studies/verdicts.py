@@ -280,13 +280,14 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
     """Compare rankings of scenarios by two methods: rank correlation, overlap of the top 5 %, and a verdict.
 
     Leaves out ``uniform`` and ``oracle``. ``recordings`` has the recording of every scenario; the interval resamples
-    recordings.
+    recordings. The correlation is None if a method gives all scenarios the same score.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
         scores, other_scores = (tables[name].scenarios for name in (first, second))
         count = max(round(_TOP * len(scores)), 1)
         top_sets = [set(top_rows(tables[name], count)) for name in (first, second)]
+        rho = rank_correlation(scores, other_scores)
         low, high = correlation_interval(scores, other_scores, recordings)
         verdict: Verdict = "undecided"
         if max(-low, high) < UNRELATED:
@@ -296,7 +297,7 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
         pairs.append(
             {
                 "methods": [first, second],
-                "rho": rank_correlation(scores, other_scores),
+                "rho": None if math.isnan(rho) else rho,
                 "interval": [low, high],
                 "overlap": len(top_sets[0] & top_sets[1]) / count,
                 "orthogonal": verdict,
