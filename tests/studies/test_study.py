@@ -412,6 +412,8 @@ def test_claims_that_no_test_decides_are_refused():
     metrics = (*LONGTAIL.metrics, "distance")
     with pytest.raises(ValueError, match="names 'distance', which has no better direction"):
         replace(LONGTAIL, metrics=metrics, claims=(replace(claim, metric="distance"),))
+    with pytest.raises(ValueError, match="two different baselines"):
+        replace(LONGTAIL, baselines=("bc", "bc"))
     with pytest.raises(ValueError, match="'idm' is a planner and an arm"):
         replace(LONGTAIL, arms=LONGTAIL.arms | {"idm": LONGTAIL.arms["bc"]})
 

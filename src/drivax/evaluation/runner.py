@@ -200,8 +200,8 @@ class Options(TypedDict, total=False):
 
     ``start_step`` defaults to the current step, and ``seed`` to 0. ``batch`` is the number of stored scenarios loaded
     at a time, by default as many as fit in memory; results do not depend on it. ``sizes`` of the banks default to what
-    the scenarios use; subsets with the sizes of the whole set share its compiled program. ``progress`` is called with
-    (done, total) after every program call.
+    the scenarios use; subsets with the sizes of the whole set share its compiled program. A bank has its own size and
+    sizes. ``progress`` is called with (done, total) after every program call.
     """
 
     start_step: int

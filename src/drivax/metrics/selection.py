@@ -92,7 +92,7 @@ def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     for input_name in metric.inputs:
         if input_name not in METRICS and input_name not in others:
             problem = f"{entry!r}: unknown input {input_name!r}"
-            raise UsageError(problem, cure=did_you_mean(input_name, [*METRICS]))
+            raise UsageError(problem, cure=did_you_mean(input_name, [*METRICS, *others]))
     return metric
 
 

@@ -135,8 +135,8 @@ class StudyDefinition:
     checkpoints_by: str
 
     def __post_init__(self) -> None:
-        if len(self.baselines) < 2:
-            raise ValueError("a study needs two baselines")
+        if len(set(self.baselines[:2])) < 2:
+            raise ValueError("a study needs two different baselines")
         methods = [arm.method for arm in self.arms.values()]
         choices = {
             "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
