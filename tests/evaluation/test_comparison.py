@@ -274,7 +274,10 @@ def test_comparison_is_plain_json():
         ({"about": {"traffic": "idm"}}, "differ in traffic (log and idm)"),
         ({"rows": range(N, 2 * N)}, "no scenario in common"),
         ({"vmax_score": np.full(N, np.nan)}, "in no common scenario"),
-        ({"vmax_score": np.full(N, np.nan), "vmax_score_partial": np.ones(N)}, "every vmax_score is partial"),
+        (
+            {"vmax_score": np.full(N, np.nan), "vmax_score_partial": np.ones(N)},
+            "every vmax_score of two is partial",
+        ),
         ({"name": "one"}, "the same run"),
     ],
 )
@@ -305,6 +308,9 @@ def test_plans_that_do_not_fit_the_runs_are_refused(change, words):
 def test_folders_of_several_planners_are_refused():
     with pytest.raises(UsageError, match=r"several planners \(idm, one\)"):
         compare(PLAN, [table("one"), table("idm", seed=2)], [table("two", seed=3)])
+    in_memory = [dataclasses.replace(table(name), folder=None) for name in ("one", "idm")]
+    with pytest.raises(UsageError, match="pass those of one planner"):
+        compare(PLAN, in_memory, [table("two", seed=3)])
     seeds = [table("seed-0@4"), table("seed-1@4", seed=2)]
     assert compare(PLAN, seeds, [table("two", seed=3)]).decision
     with pytest.raises(UsageError, match=r"several planners \(one@4, one@8\)"):
@@ -315,6 +321,7 @@ def test_folders_of_several_planners_are_refused():
     "change",
     [
         "ratio: 1.0", "confidence: 95", "power: 0", "minimum_scenarios: 1", "resamples: 10", "smallest_difference: 0",
+        "smallest_difference: .inf", "seed: -1",
         "secondary: [offroad, offroad]", "split: halves",
         "{split: random, test: bootstrap}", "minimum: 3",
     ],
@@ -366,3 +373,36 @@ def test_other_starts_are_refused(tmp_path):
     (b / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
     with pytest.raises(UsageError, match=r"differ in noisy_start \(True and False\)"):
         compare(PLAN, [EpisodeTable.read(a)], [EpisodeTable.read(b)])
+
+
+def test_values_out_of_range_are_named():
+    with pytest.raises(UsageError, match=r"^smallest_difference is -0.1; use a number above 0, or null$"):
+        ComparisonPlan(smallest_difference=-0.1)
+    with pytest.raises(UsageError, match=r"^resamples is 10; use 100 or more$"):
+        ComparisonPlan(resamples=10)
+
+
+def test_run_that_is_named_twice_on_one_side_is_refused():
+    with pytest.raises(UsageError, match=r"^runs/one: is named twice"):
+        compare(PLAN, [table("two")], [table("one"), table("one")])
+
+
+def test_metric_that_only_one_planner_defines_is_not_called_partial():
+    halves = np.arange(N) < N / 2
+    a, b = (
+        table(
+            name, vmax_score=np.where(defined, 0.5, np.nan), vmax_score_partial=np.where(defined, np.nan, 0.5)
+        )
+        for name, defined in (("one", halves), ("two", ~halves))
+    )
+    with pytest.raises(UsageError, match="vmax_score is defined for A and B in no common scenario"):
+        compare(PLAN, [a], [b])
+    split = dataclasses.replace(PLAN, split="random")
+    with pytest.raises(UsageError, match="vmax_score is undefined in every scenario of A, or of B"):
+        compare(split, [a], [table("two", vmax_score=np.full(N, np.nan))])
+
+
+def test_own_metric_may_be_called_partial():
+    own = {"own_metrics": {"cost_partial": {"unit": "-", "better": "low", "text": "cost"}}}
+    a, b = (table(name, about=own, cost_partial=np.full(N, k)) for k, name in enumerate(("one", "two")))
+    assert compare(dataclasses.replace(PLAN, primary="cost_partial"), [a], [b]).decision.recommendation == "A"

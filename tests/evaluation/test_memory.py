@@ -29,6 +29,12 @@ def test_this_machine_has_free_memory():
     assert 10**7 < free_memory(device) <= memory_of(device)
 
 
+def test_free_memory_of_a_kernel_that_does_not_tell_it(tmp_path, monkeypatch):
+    (tmp_path / "meminfo").write_text("MemTotal: 5 kB\n")
+    monkeypatch.setattr("drivax.evaluation.memory._MEMORY_INFO", tmp_path / "meminfo")
+    assert free_memory(jax.devices()[0]) > 10**7
+
+
 def test_every_control_group_of_the_process_counts(tmp_path):
     groups, ours = tmp_path / "cgroup", tmp_path / "self"
     job = groups / "batch" / "job-7"

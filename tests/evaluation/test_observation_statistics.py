@@ -19,6 +19,7 @@ from drivax.evaluation.observation_statistics import (
     sample_states,
 )
 from drivax.evaluation.rollout import evaluation_task
+from drivax.evaluation.runner import evaluate
 from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
@@ -144,6 +145,41 @@ def test_other_agents_move_by_the_traffic_model():
 def test_planner_of_another_action_space_is_refused(bank):
     with pytest.raises(UsageError, match="another action space"):
         observation_statistics(Expert(), bank, replace(TASK, actions=Published()), permute=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"), [({"every": 0}, "every 0 steps"), ({}, "needs stored scenarios")]
+)
+def test_impossible_statistics_are_refused(bank, options, words, monkeypatch):
+    if not options:
+        monkeypatch.setattr(PositionPlanner, "prepare", lambda self, scenario_of: None, raising=False)
+    with pytest.raises(UsageError, match=words):
+        observation_statistics(PositionPlanner(), bank, TASK, permute=False, **options)
+
+
+@record
+class AlternatingPlanner(Memoryless):
+    """A planner that accelerates at even steps and brakes at odd ones."""
+
+    actions: Any = static(default=Physical())
+    name: str = static(default="alternating")
+    replays: bool = static(default=False)
+
+    def act(self, carry, bank, state, situation, observation, key):
+        return jnp.stack([jnp.where(state.context.step % 2 == 0, 0.5, -0.5), jnp.zeros(())]), carry
+
+
+@pytest.mark.slow
+def test_held_decisions_are_executed_as_in_an_evaluation():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+    task = replace(TASK, hold=2)
+    speeds = column(
+        observation_statistics(AlternatingPlanner(), bank, task, permute=True), "ego", "velocity ahead"
+    )
+    names = [{"dataset": "d", "scenario_id": "a", "segment": "a"}]
+    episodes = evaluate(AlternatingPlanner(), bank, names, task=task).trajectories
+    assert speeds.high * 15 == pytest.approx(float(episodes.ego[0, :80:10, 3].max()), abs=1e-3)
+    assert episodes.ego[0, 70, 3] > 20
 
 
 def test_statistics_of_hand_made_observations():

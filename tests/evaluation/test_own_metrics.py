@@ -8,8 +8,11 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.evaluation.result_tables import planners_table
+from drivax.evaluation.rollout import evaluation_task
 from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
+from drivax.metrics.catalogue import Metric
 from drivax.metrics.selection import select_metrics
+from drivax.metrics.steps import STEP_VALUES, StepValue
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.report import explanations
 from drivax.report.runs import read_runs
@@ -55,3 +58,34 @@ def test_invalid_metrics_are_refused():
     ):
         with pytest.raises(UsageError, match=words):
             select_metrics(("full", name))
+
+
+def test_own_metric_that_is_not_in_a_list_is_kept():
+    task = evaluation_task(Task(metrics="own_terms:nearest_other"))
+    assert task.metrics == ("full", "own_terms:nearest_other")
+    assert select_metrics(("own_terms:nearest_other",) * 2).names == ("nearest_other",)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"better": "higher"}, "better is 'higher'; use one of low, high, -"),
+        ({"operator": "median"}, "operator is 'median'; use one of any, sum"),
+        (
+            {"step_value": STEP_VALUES["jerk"], "operator": "last"},
+            "'last' does not fit 'jerk', which is delayed",
+        ),
+    ],
+)
+def test_impossible_metrics_are_refused(options, words):
+    metric = Metric("-", "low", "text", step_value=STEP_VALUES["ttc"], operator="max")
+    # In tests the type checker would refuse the values before the class does.
+    for name, value in options.items():
+        object.__setattr__(metric, name, value)
+    with pytest.raises(ValueError, match=words):
+        metric.__post_init__()
+
+
+def test_step_values_that_read_unknown_facts_are_refused():
+    with pytest.raises(ValueError, match="'speed' reads unknown fact 'speed'"):
+        StepValue("speed", "m/s", lambda moment: (moment.facts.speed, True), frozenset({"speed"}))

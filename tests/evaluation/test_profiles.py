@@ -10,6 +10,7 @@ import shapely
 from scipy.sparse.csgraph import connected_components
 
 from drivax.cli import main
+from drivax.errors import DataError
 from drivax.evaluation.episode_table import Crash
 from drivax.evaluation.profiles import (
     TERMS,
@@ -117,6 +118,13 @@ def test_crashed_episodes_score_zero(data, run):
     crash = Crash(table.keys["dataset"][0], "free", 20, "error")
     free, _ = devkit_rows(replace(table, crashes=(crash,)), data)
     assert free.devkit["score"] == 0.0
+
+
+def test_scenario_of_another_set_is_refused(data, run):
+    table, _ = run
+    moved = replace(table, keys={**table.keys, "scenario_id": ("free", "elsewhere")})
+    with pytest.raises(DataError, match="record elsewhere: is not in the scenario set"):
+        devkit_rows(moved, data)
 
 
 def test_judge_writes_and_prints_both_definitions(data, run, capsys):

@@ -182,3 +182,5 @@ def test_sets_of_one_name_are_distinguished():
     ]
     assert set_names(runs) == {"0123456789": "test 012345", "abcdefghij": "test abcdef"}
     assert set_names([run("a", {}, data=None, path="old/test")]) == {"old/test": "test"}
+    unhashed = [run("a", {}, data=None, path=f"/data/{name}/test") for name in ("old", "new")]
+    assert set(set_names(unhashed).values()) == {"test (/data/old/test)", "test (/data/new/test)"}

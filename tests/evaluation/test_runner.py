@@ -257,6 +257,17 @@ def named(recording, name):
     return assemble(replace(recording, scenario_id=name), SMALL)
 
 
+def cut(recording, steps):
+    """The first steps of a recording."""
+    tracks = {
+        field.name: value[:, :steps] if value.ndim > 1 else value
+        for field in fields(recording.tracks)
+        for value in [getattr(recording.tracks, field.name)]
+    }
+    timestamps_s = recording.timestamps_s[:steps]
+    return replace(recording, tracks=replace(recording.tracks, **tracks), timestamps_s=timestamps_s)
+
+
 def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     late = straight_road([car(steps=range(5, 91)), car(30)])
     gap = straight_road([car(steps=[*range(40), *range(50, 91)])])
@@ -264,14 +275,7 @@ def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     for step, message in ((45, "1 of 3 .*'scenario_id!=gap'"), (2, "1 of 3 .*'scenario_id!=late'")):
         with pytest.raises(UsageError, match=rf"not in the log at step {step} in {message}"):
             evaluate(fragile(), logs, start=NoisyStart(), start_step=step)
-    long = straight_road([car()])
-    tracks = {
-        field.name: value[:, :11] if value.ndim > 1 else value
-        for field in fields(long.tracks)
-        for value in [getattr(long.tracks, field.name)]
-    }
-    cut = replace(long, tracks=replace(long.tracks, **tracks), timestamps_s=long.timestamps_s[:11])
-    short = named(cut, "short")
+    short = named(cut(straight_road([car()]), 11), "short")
     assert Flag.NO_FUTURE in short.has
     with pytest.raises(
         DataError, match=r"record short: has 11 steps, fewer than 31.*1 of 4.*flag!=NO_FUTURE"
@@ -303,3 +307,14 @@ def test_disk_space_is_checked_before_the_first_episode(scenarios, tmp_path, mon
 def test_unknown_options_are_refused():
     with pytest.raises(TypeError, match="unexpected keyword argument 'sed'"):
         evaluate(Expert(), [], sed=3)
+
+
+def test_no_scenarios_are_refused():
+    with pytest.raises(UsageError, match="no scenarios to evaluate"):
+        evaluate(Expert(), [])
+
+
+def test_start_at_the_last_step_of_a_log_is_refused():
+    logs = [named(straight_road([car()]), "good"), named(cut(straight_road([car()]), 41), "short")]
+    with pytest.raises(UsageError, match="short: the log has no action after step 40 in 1 of 2"):
+        evaluate(fragile(), logs, start=NoisyStart(), start_step=40)

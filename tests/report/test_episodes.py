@@ -75,7 +75,10 @@ def test_only_equal_scenarios_traffic_and_starts_are_compared(evaluations):
     assert comparable(expert, policy), "of the policy's start nobody told anything"
     (policy.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
     expert, policy = (dataclasses.replace(run) for run in (expert, policy))
-    assert mismatch(expert, policy) == ("differ in start_step (40 and 10)", "evaluate both with the same")
+    assert mismatch(expert, policy) == (
+        "differ in start_step (40 and 10)",
+        "evaluate both with the same --start-step",
+    )
 
 
 def test_failures_of_each_kind_are_selected_in_turn(evaluations):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,3 +116,9 @@ def test_existing_page_is_kept(hand_set, tmp_path):
     assert page.read_text() == "mine"
     with pytest.raises(UsageError, match="is a folder"):
         write_histograms([one], tmp_path)
+
+
+def test_unknown_recordings_count_by_scenario():
+    names = (("a", "r"), ("b", "r"), ("c", ""), ("d", ""))
+    entries = [{"dataset": "d", "scenario_id": name, "segment": segment} for name, segment in names]
+    assert Inspection.recordings.fget(SimpleNamespace(entries=entries)) == 3

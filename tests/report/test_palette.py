@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from drivax.report.pictures.palette import LEGEND, SERIES, THEMES, stroke
+from drivax.errors import UsageError
+from drivax.report.pictures.palette import LEGEND, SERIES, THEMES, stroke, theme_colours
 
 #: Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), table 1, severity 1: how linear RGB is seen.
 VISION = {
@@ -77,3 +78,8 @@ def test_legend_names_every_class_and_light():
     named = {name for name, _ in LEGEND}
     assert {*CLASSES, *LIGHTS, "route", "log", "stop", "goal", "mark"} == named
     assert set(THEMES["light"]) == set(THEMES["dark"])
+
+
+def test_unknown_theme_is_refused():
+    with pytest.raises(UsageError, match="unknown theme 'blue'; use light or dark"):
+        theme_colours("blue")

@@ -1,5 +1,6 @@
 """The page of a long-tail study, of results that are known; in a browser."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.curation.scores import ScoreTable
 from drivax.studies.definition import load_study
-from drivax.studies.report import validations_table, write_report
+from drivax.studies.report import rankings_table, validations_table, write_report
+from drivax.studies.verdicts import compare_rankings
 
 LONGTAIL = load_study("longtail")
 METRICS = LONGTAIL.metrics
@@ -87,6 +89,7 @@ def test_report_shows_the_results(page):
     assert [[cell.text for cell in row] for row in validations_table(RESULTS, "mean_q").rows] == rows
     assert "seeds with their highest mean_q" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
+    assert "Play those of kinematic and ensemble in <a href=critical.html>" in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
     assert "Better than the matched random control?" in text and "than the baseline?" not in text
@@ -110,6 +113,19 @@ def test_rule_may_be_undefined_at_a_validation():
     assert [[cell.text for cell in row] for row in rows[::2]] == [
         ["mean_q, mean over seeds", "–", "2.000", "2.500"], ["seeds with their highest mean_q", "0", "1", "1"]
     ]  # fmt: skip
+
+
+def test_method_without_a_ranking_has_no_correlation():
+    steps = {"heuristic": np.zeros((20, 91)), "kinematic": np.arange(20.0)[:, None] * np.ones(91)}
+    ids = tuple(map(str, range(20)))
+    tables = {
+        name: ScoreTable(name, {}, "x", ids, np.ones((20, 91), bool), scores, scores[:, 0])
+        for name, scores in steps.items()
+    }
+    rankings = compare_rankings(tables, ids)
+    assert json.loads(json.dumps(rankings, allow_nan=False))[0]["rho"] is None
+    ((_, rho, *_),) = rankings_table({"rankings": rankings}).rows
+    assert rho.text == "–"
 
 
 @needs_browser

@@ -389,12 +389,53 @@ def test_invalid_studies_are_refused(data, tmp_path):
     assert not (tmp_path / "study").exists()
 
 
+def test_settings_out_of_range_are_refused(data, tmp_path):
+    for settings_, words in (
+        ({"seeds": 1}, "seeds is 1; use 2 or more"), ({"rare": 0.0}, "rare is 0.0; use a number between 0 and 1"),
+        ({"arms": ("bc", "baseline", "bc")}, "arm 'bc' is named twice"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=words):
+            StudyConfig(**settings_)
+    study = Study(
+        LONGTAIL, StudyConfig(total_steps=0), StudySets(data.path, data.path, (data.path,)), tmp_path
+    )
+    for steps, words in ((0, "total_steps is 0"), (1, "a training of 1 steps has one iteration")):
+        study = replace(study, config=replace(study.config, total_steps=steps))
+        with pytest.raises(UsageError, match=words):
+            study.train_config("bc", 0)
+
+
+def test_claims_that_no_test_decides_are_refused():
+    claim = LONGTAIL.claims[0]
+    with pytest.raises(ValueError, match=r"has the change -1.0; use a number above -1"):
+        replace(claim, change=-1.0)
+    metrics = (*LONGTAIL.metrics, "distance")
+    with pytest.raises(ValueError, match="names 'distance', which has no better direction"):
+        replace(LONGTAIL, metrics=metrics, claims=(replace(claim, metric="distance"),))
+    with pytest.raises(ValueError, match="two different baselines"):
+        replace(LONGTAIL, baselines=("bc", "bc"))
+    with pytest.raises(ValueError, match="'idm' is a planner and an arm"):
+        replace(LONGTAIL, arms=LONGTAIL.arms | {"idm": LONGTAIL.arms["bc"]})
+
+
+def test_study_without_scores_has_no_player(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "write_report", lambda *_: None)
+    study = Study(
+        LONGTAIL,
+        StudyConfig(arms=("bc", "baseline")),
+        StudySets(data.path, data.path, (data.path,)),
+        tmp_path,
+    )
+    runner._write_pages(study, data, {}, {})
+    assert not (tmp_path / "critical.html").exists()
+
+
 def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     sets = StudySets(data.path, data.path, (data.path,))
     runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     runner._open_folder(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
-    with pytest.raises(UsageError, match="contains a study with other arms or claims"):
+    with pytest.raises(UsageError, match="contains a study with another definition"):
         runner._open_folder(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
 
 

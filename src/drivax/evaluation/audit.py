@@ -165,7 +165,7 @@ def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, An
     flags, in_log = scenario.has, series["logged"]
     evaluated = in_log.copy()
     evaluated[0] = False
-    has_map = int(scenario.segment_blocks[2]) > 0
+    has_map = int(scenario.segment_blocks[2]) > 0  # edges and lanes, which come first
     collides, offroad, runs_red = (series[name] & evaluated for name in ("collision", "offroad", "red_light"))
     on_road = in_log & ~series["offroad"] & ~series["left_map"]
     deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)

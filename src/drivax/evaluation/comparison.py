@@ -277,7 +277,7 @@ def compare(
     contrast = _Contrast(plan, *sides, split)
     primary = contrast.compare(plan.primary)
     if min(primary.a.n, primary.b.n) == 0:
-        raise pairing.undefined_metric(plan.primary, (*a, *b))
+        raise pairing.undefined_metric(plan.primary, (*a, *b), paired=split is None)
     primary = primary.with_winner(plan, primary.evidence.p)
     metrics = [contrast.compare(metric) for metric in plan.secondary]
     adjusted_p = significance.holm_adjust([metric.evidence.p for metric in metrics])

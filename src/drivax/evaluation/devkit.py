@@ -478,6 +478,7 @@ def _route(road: Road, points: Points) -> list[list[int]]:
             current = sorted(_current_objects(road, inside))
             on_connector = bool(current) and road.objects[current[0]].connector
             may_stay = on_connector or (not current and in_intersection[sample])
+            # As in the devkit: the second sample cannot stay on the connector of the first.
             last = route[-1] if sample > 1 else []
             if last and road.objects[last[0]].connector and may_stay:
                 point = shapely.points(points[sample])

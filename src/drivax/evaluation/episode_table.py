@@ -72,7 +72,8 @@ class Trajectories:
     """Trajectories of ego and traffic in each scenario's local frame, one episode per row.
 
     Attributes:
-        ego: x, y [m], heading [rad], speed [m/s] from step ``start`` on; repeated after the end of a short log.
+        ego: x, y [m], heading [rad], speed [m/s] from step ``start`` on; the last value is repeated after a crash and
+            after the end of a short log.
         action: Executed actions from step ``start`` on, NaN after a crash and after the end of a short log; without
             columns if unknown.
         start: Step of the log at which the planner takes over.

@@ -43,8 +43,9 @@ def free_memory(device: Any) -> int | None:
     if device.platform != "cpu":
         return None
     free = []
-    if _MEMORY_INFO.is_file():
-        free.append(1024 * _read_numbers(_MEMORY_INFO)["MemAvailable:"])
+    available_kb = _read_numbers(_MEMORY_INFO).get("MemAvailable:") if _MEMORY_INFO.is_file() else None
+    if available_kb is not None:
+        free.append(1024 * available_kb)
     free += [limit - usage for limit, usage in _group_limits()]
     return max(min(free), 0) if free else memory_of(device)
 

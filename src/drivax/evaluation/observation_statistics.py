@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.evaluation.rollout import advance, check_actions, episode_keys, evaluation_task
-from drivax.planners.planner import Planner
+from drivax.planners.planner import Planner, hold
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
@@ -131,12 +132,21 @@ def observation_statistics(
         seed: Seed of the planner, as in an evaluation, and of the permutations.
 
     Raises:
-        UsageError: Planner and task have different action spaces.
+        UsageError: Planner and task have different action spaces, the planner needs stored scenarios, or ``every`` is
+            below 1.
     """
     check_actions(planner, task)
+    if every < 1:
+        raise UsageError(f"every {every} steps", cure="use 1 or more")
+    if hasattr(planner, "prepare"):
+        problem = f"planner {planner.name} needs stored scenarios"
+        raise UsageError(problem, cure="choose another planner")
     traffic = traffic or LogTraffic()
     simulator, bank = Simulator(evaluation_task(task), traffic), prepare_bank(traffic, bank)
-    samples = sample_states(simulator, planner, bank, every, seed)
+    samples = sample_states(simulator, hold(planner, task.hold), bank, every, seed)
+    if task.hold > 1:
+        # Importances are those of decisions, not of actions that repeat an earlier one.
+        samples = replace(samples, carry=samples.carry[0])
     observations = {name: np.asarray(leaf) for name, leaf in samples.observation.items()}
     has_collided, collides = np.asarray(samples.has_collided), np.asarray(samples.collides)
     context = samples.state.context
@@ -206,7 +216,7 @@ def column_statistics(
 def sample_states(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0
 ) -> SampledStates:
-    """Return sampled states of one episode per scenario; an evaluation with this seed has the same episodes."""
+    """Return sampled states of one episode per scenario, up to a crash those of an evaluation with this seed."""
     batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
         scenarios = np.arange(first, min(first + BATCH, len(bank)))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
+from drivax.metrics.catalogue import METRICS
 from drivax.seal import MARK
 from drivax.stats.clusters import cluster_strata, dense_labels
 
@@ -46,7 +47,8 @@ class Pairs:
 def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     """Return problem and cure if the episodes of two runs cannot be paired, else None.
 
-    Paired episodes need the same scenario set, traffic and start. The seed of noisy starts may differ.
+    Paired episodes need the same scenario set, traffic and start, as far as both runs record them. The seed of noisy
+    starts may differ.
     """
     hashes = [str(run.data.get("hash") or "") for run in (a, b)]
     if all(hashes) and hashes[0] != hashes[1]:
@@ -58,7 +60,8 @@ def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     for name in _START_SETTINGS:
         values = [run.settings.get(name) for run in (a, b)]
         if None not in values and values[0] != values[1]:
-            return f"differ in {name} ({values[0]} and {values[1]})", "evaluate both with the same"
+            flag = f"--{name.replace('_', '-')}"
+            return f"differ in {name} ({values[0]} and {values[1]})", f"evaluate both with the same {flag}"
     return None
 
 
@@ -74,8 +77,10 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         UsageError: A run occurs twice, a side contains several planners, or set, traffic or start differ.
     """
     tables = (*a, *b)
-    if len({id(t) if t.folder is None else t.folder.resolve() for t in tables}) < len(tables):
-        raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
+    runs = [id(table) if table.folder is None else table.folder.resolve() for table in tables]
+    if repeated := [table for row, table in enumerate(tables) if runs[row] in runs[:row]]:
+        problem = "A and B are the same run" if len(tables) == 2 else "is named twice"
+        raise UsageError(problem, file=repeated[0].folder, cure="name different runs")
     for side in (a, b):
         # A name ends with the seed's number and the checkpoint. Another checkpoint is another planner.
         names = [table.name.removesuffix(MARK) for table in side]
@@ -83,7 +88,8 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
         if len(planners) > 1:
             problem = f"contains evaluations of several planners ({', '.join(sorted(planners.values()))})"
             folder = side[0].folder
-            raise UsageError(problem, file=folder and folder.parent, cure=f"name one of them, as {folder}")
+            cure = "pass those of one planner" if folder is None else f"name one of them, as {folder}"
+            raise UsageError(problem, file=folder and folder.parent, cure=cure)
     for table in tables[1:]:
         if problem := mismatch(tables[0], table):
             names = [run.folder or run.name for run in (tables[0], table)]
@@ -103,7 +109,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
             raise UsageError(problem, cure=did_you_mean(metric, available))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
-    if metric.endswith("_partial"):
+    if metric in METRICS and metric.endswith("_partial"):
         problem = f"{metric} combines different inputs in different scenarios, so its mean has no meaning"
         raise UsageError(problem, cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs")
     info = tables[0].metric(metric)
@@ -111,13 +117,18 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
         raise UsageError(f"{metric} has no better direction", cure="choose another primary metric")
 
 
-def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
+def undefined_metric(metric: str, tables: Sequence[EpisodeTable], *, paired: bool) -> UsageError:
     """Return the error for a primary metric that is undefined in every pair, or throughout an arm of a split."""
-    partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
-    if any(not np.isnan(values).all() for values in partial):
-        problem = f"every {metric} is partial: one of its inputs is undefined in these scenarios"
-        return UsageError(problem, cure="choose another primary metric, for example success or accuracy")
+    for table in tables:
+        full, partial = (
+            table.metrics.get(name, np.full(1, np.nan)) for name in (metric, f"{metric}_partial")
+        )
+        if np.isnan(full).all() and not np.isnan(partial).all():
+            problem = f"every {metric} of {table.name} is partial: one of its inputs is undefined in these scenarios"
+            return UsageError(problem, cure="choose another primary metric, for example success or accuracy")
     problem = f"{metric} is defined for A and B in no common scenario"
+    if not paired:
+        problem = f"{metric} is undefined in every scenario of A, or of B"
     return UsageError(problem, cure="choose another primary metric")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,11 +59,12 @@ class ComparisonPlan:
             value = getattr(self, name)
             if not 0 < value < 1:
                 raise UsageError(f"{name} is {value}", cure="use a number between 0 and 1")
-        if self.minimum_scenarios < 2 or self.resamples < 100:
-            cure = "use 2 scenarios and 100 resamples or more"
-            raise UsageError("too few scenarios or resamples", cure=cure)
-        if self.smallest_difference is not None and not self.smallest_difference > 0:
-            raise UsageError("the smallest difference that matters is above 0", cure="give its size, or null")
+        for name, least in (("minimum_scenarios", 2), ("resamples", 100), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure=f"use {least} or more")
+        if self.smallest_difference is not None and not 0 < self.smallest_difference < math.inf:
+            problem = f"smallest_difference is {self.smallest_difference}"
+            raise UsageError(problem, cure="use a number above 0, or null")
         if len(set(self.secondary)) < len(self.secondary):
             raise UsageError("a metric is named twice", cure="name each metric once")
         # The primary metric may be one of the default secondary ones.

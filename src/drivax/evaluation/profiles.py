@@ -86,12 +86,15 @@ def devkit_rows(
         progress: Called with (done, total) after every episode.
 
     Raises:
-        DataError: The table lacks a metric that the devkit's terms are compared with.
+        DataError: The table lacks a metric that the devkit's terms are compared with, or the set lacks a scenario.
     """
     if missing := [metric for metric in TERMS.values() if metric not in table.metrics]:
         cure = "run drivax evaluate again"
         raise DataError(f"lacks the metric {missing[0]!r}", file=table.folder, cure=cure)
     indices = {(entry["dataset"], entry["scenario_id"]): index for index, entry in enumerate(data.entries)}
+    if missing := [key for key in table.scenarios if key not in indices]:
+        cure = "pass the set that was evaluated with --data SET"
+        raise DataError("is not in the scenario set", file=data.path, record=missing[0][1], cure=cure)
     sizes, crashes, result = Sizes.used(data), table.crash_by_scenario, []
     for number, key in enumerate(table.scenarios):
         verdict = devkit_episode(data[indices[key]], table.trajectories, number, sizes)
@@ -154,7 +157,10 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
 
 
 def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: int) -> EgoMotion:
-    """Return ego's motion; accelerations are backward differences (the first uses the log), yaw rates forward ones."""
+    """Return ego's motion; accelerations are backward differences, yaw rates forward ones.
+
+    The first acceleration uses the log if ego starts at a logged pose after another one, and is 0 otherwise.
+    """
     x, y, heading, speed = motion.T
     previous_step = max(start - 1, 0)
     # The log does not contain the speed before a noisy start.

@@ -262,7 +262,12 @@ def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     }
     short_names = {key: _set_name(entry) for key, entry in entries.items()}
     names = list(short_names.values())
-    return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in short_names.items()}
+    # Without a hash the key is a path, whose start may be that of another set.
+    suffixes = {key: key[:6] if entry.get("hash") else f"({key})" for key, entry in entries.items()}
+    return {
+        key: name if names.count(name) == 1 else f"{name} {suffixes[key]}"
+        for key, name in short_names.items()
+    }
 
 
 def set_key(entry: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.steps import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
+from drivax.plugins import is_dotted
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -42,8 +43,9 @@ class Episodes:
     Attributes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step on, repeated after the end of a short log.
-        actions: Executed actions, after bounds and actuators, repeated after the end of a short log.
+        motion: x, y, heading, speed of the driven agent from the start step on; the last value is repeated after a
+            crash and after the end of a short log.
+        actions: Executed actions, after bounds and actuators, repeated in the same way.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
@@ -86,7 +88,9 @@ def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Arra
 
 def evaluation_task(task: Task) -> Task:
     """Return the task for evaluation: all metrics, fixed conditions, and episodes that last to the end of the log."""
-    own = task.metrics if isinstance(task.metrics, tuple) else ()
+    own = task.metrics
+    if isinstance(own, str):
+        own = (own,) if is_dotted(own) else ()
     conditions = fix_conditions(task.conditions)
     return replace(task, to_the_end=True, metrics=("full", *own), conditions=conditions)
 
@@ -109,8 +113,8 @@ def drive(
 ) -> Episodes:  # fmt: skip
     """Run a planner on scenarios ``index`` of a bank; ``slot`` is the driven agent.
 
-    The task's episodes must not end early (:func:`evaluation_task`). Each planner type, batch size and start step needs
-    one compilation.
+    The task's episodes must not end early (:func:`evaluation_task`). Each simulator, planner type, start step, batch
+    and bank size needs one compilation.
     """
     step = partial(_step, simulator, planner, bank)
     first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)

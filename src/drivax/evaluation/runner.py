@@ -33,7 +33,7 @@ from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner, hold
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
-from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, STEPS, Scenario
+from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files, mark_edited
@@ -165,7 +165,10 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``."""
+    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``.
+
+    Codes and counts, which have no mean, are left out.
+    """
     rows = []
     for name in select_metrics(names).names:
         metric = summary["metrics"].get(name)
@@ -197,8 +200,8 @@ class Options(TypedDict, total=False):
 
     ``start_step`` defaults to the current step, and ``seed`` to 0. ``batch`` is the number of stored scenarios loaded
     at a time, by default as many as fit in memory; results do not depend on it. ``sizes`` of the banks default to what
-    the scenarios use; subsets with the sizes of the whole set share its compiled program. ``progress`` is called with
-    (done, total) after every program call.
+    the scenarios use; subsets with the sizes of the whole set share its compiled program. A bank has its own size and
+    sizes. ``progress`` is called with (done, total) after every program call.
     """
 
     start_step: int
@@ -224,8 +227,8 @@ def evaluate(
         options: See :class:`Options`.
 
     Raises:
-        UsageError: Planner, task, start and scenarios are incompatible, or an option is invalid (``batch`` below 1,
-            ``sizes`` too small).
+        UsageError: There is no scenario, planner, task, start and scenarios are incompatible, or an option is invalid
+            (``batch`` below 1, ``sizes`` too small).
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """
@@ -235,7 +238,9 @@ def evaluate(
     start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
     if batch is not None and batch < 1:
         raise UsageError(f"batch of {batch} scenarios", cure="use 1 or more")
-    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else _steps_of(scenarios)
+    if not len(scenarios):
+        raise UsageError("no scenarios to evaluate", cure="pass at least one")
+    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else scenarios[0].capacity.steps
     simulator = Simulator(task or Task(), traffic or LogTraffic(), start or LogStart())
     evaluation = _Evaluation.of(simulator, planner, start_step, seed, steps)
     prepare: Callable[[Callable[[int], Scenario]], None] | None = getattr(planner, "prepare", None)
@@ -274,13 +279,9 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
     present = np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0
+    # A scenario has a row of ``last_step`` per ego; the first row is that of slot 0.
     _check_starts(names, np.asarray(bank.last_step[:: bank.most_egos]) + 1, present, start_step)
     return names
-
-
-def _steps_of(scenarios: Sequence[Scenario]) -> int:
-    """Return the step capacity of stored scenarios."""
-    return scenarios[0].capacity.steps if len(scenarios) else STEPS
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
@@ -439,12 +440,16 @@ def _check_starts(
         problem = f"{too_short(int(steps[short[0]]))}; {len(short)} of {len(names)} scenarios are too short"
         cure = "exclude them with --filter flag!=NO_FUTURE"
         raise DataError(problem, record=ids[short[0]], cure=cure)
-    present = present & (start_step < steps - 1)
-    if absent := [name for name, valid in zip(ids, present, strict=True) if not valid]:
-        problem = f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios"
-        exclude = f", or exclude them: --filter 'scenario_id!={'|'.join(absent)}'"
-        cure = "start at another step" + (exclude if len(absent) <= _MAX_NAMED else "")
-        raise UsageError(problem, record=absent[0], cure=cure)
+    has_ended = start_step >= steps - 1
+    for unusable, fact in (
+        (has_ended, "the log has no action after"),
+        (~present, "ego is not in the log at"),
+    ):
+        if rows := np.flatnonzero(unusable).tolist():
+            problem = f"{fact} step {start_step} in {len(rows)} of {len(names)} scenarios"
+            exclude = f", or exclude them: --filter 'scenario_id!={'|'.join(ids[row] for row in rows)}'"
+            cure = "start at another step" + (exclude if len(rows) <= _MAX_NAMED else "")
+            raise UsageError(problem, record=ids[rows[0]], cure=cure)
 
 
 def _check_finite(episodes: Episodes, names: Names) -> None:

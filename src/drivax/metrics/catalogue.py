@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
@@ -20,6 +20,8 @@ from drivax.simulator.contact import TTC_HORIZON_S
 #: How the step values of an episode are reduced: ``any`` and ``first`` look for values above 0, ``worst_second`` is the
 #: largest sum over ten consecutive steps.
 Operator = Literal["any", "sum", "mean", "min", "max", "last", "first", "worst_second"]
+#: Operators for which the step of a value matters; delayed values arrive several at once.
+_ORDERED = ("last", "first", "worst_second")
 #: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: its interval is kept within 0 and 1; ``code``: no mean.
 Kind = Literal["rate", "score", "quantity", "code"]
 Direction = Literal["low", "high", "-"]
@@ -38,6 +40,8 @@ class Column:
         headline: Position in the first table of a report; None if it is not in that table.
         summarised: Whether the mean over episodes is reported.
         fails_on_crash: Whether the value is 0 if the planner crashed.
+
+    Of user-defined metrics, evaluations store unit, direction and definition, and ignore the other attributes.
     """
 
     unit: str
@@ -74,6 +78,13 @@ class Metric(Column):
             raise ValueError("a metric needs step_value and operator together")
         if self.step_value is None and self.compute is None:
             raise ValueError("a metric needs step_value or compute")
+        if self.better not in get_args(Direction):
+            raise ValueError(f"better is {self.better!r}; use one of {', '.join(get_args(Direction))}")
+        if self.operator not in (None, *get_args(Operator)):
+            raise ValueError(f"operator is {self.operator!r}; use one of {', '.join(get_args(Operator))}")
+        if self.step_value is not None and self.step_value.delayed and self.operator in _ORDERED:
+            problem = f"operator {self.operator!r} does not fit {self.step_value.name!r}, which is delayed"
+            raise ValueError(f"{problem}; use any, sum, mean, min or max")
 
 
 @record

@@ -54,7 +54,7 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     """
     requested: list[str] = []
     own: dict[str, Metric] = {}
-    for entry in (names,) if isinstance(names, str) else names:
+    for entry in (names,) if isinstance(names, str) else dict.fromkeys(names):
         if is_dotted(entry):
             name = entry.rpartition(":")[2].rpartition(".")[2]
             own[name] = _own_metric(entry, name, own)
@@ -92,7 +92,7 @@ def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     for input_name in metric.inputs:
         if input_name not in METRICS and input_name not in others:
             problem = f"{entry!r}: unknown input {input_name!r}"
-            raise UsageError(problem, cure=did_you_mean(input_name, [*METRICS]))
+            raise UsageError(problem, cure=did_you_mean(input_name, [*METRICS, *others]))
     return metric
 
 

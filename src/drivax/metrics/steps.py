@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.metrics.comfort import TAIL, ComfortSteps, check_comfort
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
-from drivax.simulator.types import FACTS, Facts, Situation
+from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Situation
 
 
 @record
@@ -67,7 +67,7 @@ class StepValue:
         unit: Unit, ``-`` for booleans and codes.
         read: From a moment to the value, and whether it is defined.
         reads: Names of the facts that ``read`` needs; all facts by default.
-        delayed: Whether the value is computed several steps later, for several steps at once.
+        delayed: Whether the value is computed several steps later, at the end of an episode for several steps at once.
     """
 
     name: str
@@ -75,6 +75,11 @@ class StepValue:
     read: Read
     reads: frozenset[str] = FACTS
     delayed: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.reads:
+            if name not in FACTS | ON_REQUEST:
+                raise ValueError(f"the step value {self.name!r} reads unknown fact {name!r}")
 
 
 def _fact(name: str, unit: str, fact: str, defined: str = "") -> StepValue:

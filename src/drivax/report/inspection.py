@@ -22,6 +22,7 @@ from drivax.report.charts import short
 from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
+from drivax.stats.clusters import recordings_of
 from drivax.table import MISSING, Cell, Column, Table
 
 Array = np.ndarray[Any, Any]
@@ -107,8 +108,8 @@ class Inspection:
 
     @property
     def recordings(self) -> int:
-        """Number of distinct recordings."""
-        return len({(entry["dataset"], entry["segment"]) for entry in self.entries})
+        """Number of distinct recordings; scenarios of unknown recordings count as one each."""
+        return len(set(recordings_of(self.entries)))
 
     @property
     def megabytes(self) -> float:

@@ -45,10 +45,10 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     """
     folders = [seed_folder for folder in folders for seed_folder in seed_folders(folder)]
     paths = [folder.resolve() for folder in folders]
-    if not folders or len(set(paths)) < len(paths):
-        raise UsageError(
-            "give at least one run folder, and each only once", cure="drivax report RUN [RUN ...]"
-        )
+    if not folders:
+        raise UsageError("no run folder is given", cure="drivax report RUN [RUN ...]")
+    if repeated := [folder for row, folder in enumerate(folders) if paths[row] in paths[:row]]:
+        raise UsageError("is named twice", file=repeated[0], cure="name each run once")
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
     tables, charts = dict[str, list[Path]](), dict[str, list[Path]]()

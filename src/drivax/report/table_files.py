@@ -28,8 +28,9 @@ def write_tables(
 ) -> list[Path]:  # fmt: skip
     """Write every table of a report into a folder as ``.csv``, ``.md`` and ``.tex``, and return the files.
 
-    The tables are ``results``, ``differences`` (several runs), ``collisions`` (known kinds of collision), ``by-TAG``
-    (:func:`strata_tables`) and ``transfer-METRIC`` (runs on several data sets).
+    The tables are ``results``, ``differences`` (several runs; columns for those that are comparable with the policy),
+    ``collisions`` (known kinds of collision), ``by-TAG`` (:func:`strata_tables`) and ``transfer-METRIC`` (runs on
+    several data sets).
 
     Args:
         runs: Run folders; the last evaluation is the policy.
@@ -59,7 +60,7 @@ def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> l
     ``extra`` has names of metrics and of sets of metrics. Runs without any of these metrics have all of theirs.
 
     Raises:
-        UsageError: ``extra`` names no set, and no metric that a run has.
+        UsageError: ``extra`` names no set, and no metric of which a run has a mean.
     """
     names = result_tables.sort_metrics(result_tables.metric_names(runs))
     selected = {"progress"}

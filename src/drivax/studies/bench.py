@@ -72,6 +72,11 @@ class BenchConfig:
     traffic: str = "log"
     trust_code: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for name in ("batch", "steps", "repeats"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure="use 1 or more")
+
 
 def use_all_cores() -> None:
     """Make every core of this process a JAX device; has no effect once JAX has started."""
@@ -124,6 +129,11 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
         :data:`BATCHES` has a row only if it is the fastest.
     """
     config = config or BenchConfig()
+    if BATCHES[0] % jax.device_count():
+        problem = f"batches of {BATCHES[0]} cannot be divided among {jax.device_count()} devices"
+        raise UsageError(
+            problem, cure="use a number of cores that divides them, as `taskset -c 0-3 drivax bench`"
+        )
 
     def program(metrics: MetricNames, batch: int) -> Program:
         task = replace(config.task, metrics=metrics)

@@ -5,6 +5,7 @@ A study is declared by a YAML file (:class:`StudyDefinition`); ``configs/studies
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -102,6 +103,10 @@ class Claim:
     rows: Stratum = "ordinary"
     change: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.change is not None and not -1 < self.change < math.inf:
+            raise ValueError(f"the claim {self.words!r} has the change {self.change}; use a number above -1")
+
 
 @dataclass(frozen=True)
 class StudyDefinition:
@@ -130,8 +135,8 @@ class StudyDefinition:
     checkpoints_by: str
 
     def __post_init__(self) -> None:
-        if len(self.baselines) < 2:
-            raise ValueError("a study needs two baselines")
+        if len(set(self.baselines[:2])) < 2:
+            raise ValueError("a study needs two different baselines")
         methods = [arm.method for arm in self.arms.values()]
         choices = {
             "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
@@ -141,6 +146,8 @@ class StudyDefinition:
             for name in names:
                 if name not in available:
                     raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
+        if shared := [name for name in self.planners if name in self.arms]:
+            raise ValueError(f"{shared[0]!r} is a planner and an arm; rename the arm")
         for claim in self.claims:
             claim_choices = (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
@@ -149,6 +156,10 @@ class StudyDefinition:
             for name, available in claim_choices:
                 if name not in available:
                     raise ValueError(f"the claim {claim.words!r} names {name!r}, which the study lacks")
+            if METRICS[claim.metric].better == "-":
+                raise ValueError(
+                    f"the claim {claim.words!r} names {claim.metric!r}, which has no better direction"
+                )
 
 
 @cache
@@ -194,11 +205,13 @@ class StudyConfig:
     rare: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.seeds < 2 or self.validations < 4:
-            raise UsageError(
-                f"{self.seeds} seeds and {self.validations} validations are too few",
-                cure="use at least 2 seeds and 4 validations",
-            )
+        for name, least in (("seeds", 2), ("validations", 4)):
+            if getattr(self, name) < least:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure=f"use {least} or more")
+        if not 0 < self.rare < 1:
+            raise UsageError(f"rare is {self.rare}", cure="use a number between 0 and 1")
+        if repeated := [name for row, name in enumerate(self.arms) if name in self.arms[:row]]:
+            raise UsageError(f"arm {repeated[0]!r} is named twice", cure="name each arm once")
 
 
 @dataclass(frozen=True)
@@ -208,8 +221,8 @@ class StudySets:
     Attributes:
         train: Training set.
         validation: Validation set, for the choice of checkpoints.
-        test: Test sets. If scenarios are labelled, the test has as many with as without an event. The first set has
-            events as often as ordinary traffic.
+        test: Test sets. If some scenarios have a labelled event, the test has equally many with and without. The first
+            set has events as often as ordinary traffic.
     """
 
     train: Path
@@ -308,7 +321,12 @@ class Study:
     def train_config(self, arm: str, seed: int) -> TrainConfig:
         """Return the training configuration of an arm with one seed."""
         config = settings.load(TrainConfig, self.definition.arms[arm].preset, self.config.training)
-        config = replace(config, seed=seed, total_steps=self.config.total_steps or config.total_steps)
+        total_steps = self.config.total_steps
+        total_steps = config.total_steps if total_steps is None else total_steps
+        config = replace(config, seed=seed, total_steps=total_steps)
+        if config.iterations < 2:
+            problem = f"a training of {total_steps} steps has one iteration, too few for validations"
+            raise UsageError(problem, cure="raise total_steps")
         interval = max(config.iterations // self.config.validations, 1)
         # All checkpoints of the first baseline stay: another rule chooses among them afterwards.
         keep = config.iterations if arm == self.definition.baselines[0] else config.keep

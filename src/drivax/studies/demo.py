@@ -134,7 +134,7 @@ def run_demo(
     )
     training = _generate_set(out / "sets" / "train", config.training, _TRAINING_SEED, config)
     held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
-    stages.start("training", "training PPO")
+    stages.start("training", f"training by the preset {config.preset}")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
     # No scenarios are set aside for validation: the held-out set is the test.
     run = train(training_config, training, out / "training" / "policy", validation=None, overwrite=True).path

@@ -22,6 +22,8 @@ from drivax.table import MISSING, Cell, Column, Table
 _STRATA: Mapping[Stratum, str] = {
     "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
 }  # fmt: skip
+#: Methods whose most critical scenarios the player shows, and the number of each.
+PLAYER_METHODS, PLAYER_TOP = ("kinematic", "ensemble", "action_rarity"), 3
 _VERDICT_TEXTS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
 #: Number of cells of the action map along each axis, its size, and the margins for its labels, in pixels.
 _MAP_CELLS, _MAP_SIZE, _MAP_LEFT, _MAP_RIGHT, _MAP_BOTTOM = 48, 336, 30, 10, 30
@@ -100,7 +102,7 @@ def _interval(value: float, bounds: Sequence[float], spec: str) -> str:
 
 
 def conditions_table(results: Results) -> Table:
-    """Return the validation results of every arm, and whether its score has converged."""
+    """Return the validation results of every arm, and whether they are good enough (:class:`ValidationCheck`)."""
     rows = [
         (
             arm["arm"], f"{arm['progress']:.1%}", f"{arm['least']:.1%}", f"{arm['change']:+.3f}",
@@ -170,7 +172,7 @@ def rankings_table(results: Results) -> Table:
     rows = [
         (
             " and ".join(pair["methods"]),
-            _interval(pair["rho"], pair["interval"], "+.2f"),
+            MISSING if pair["rho"] is None else _interval(pair["rho"], pair["interval"], "+.2f"),
             f"{pair['overlap']:.0%}",
             _VERDICT_TEXTS[pair["orthogonal"]],
         )
@@ -218,7 +220,8 @@ def _conditions(definition: StudyDefinition, results: Results) -> str:
         "<p>Progress is relative to the expert's, at the best checkpoint. The change of the score is from the third to "
         "the last quarter of the validations. Smallest differences in ordinary traffic that this study detects with a "
         "power of 80 %, at the strictest level of the first group of claims, if all seeds vary like the baseline's: "
-        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained.</p>"
+        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained, unless --anyway "
+        "was passed.</p>"
     )
 
 
@@ -275,19 +278,21 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
         for name, table in tables.items()
     )
     top_rows = [
-        (name, *(table.scenario_ids[row] for row in table.order[:3]))
+        (name, *(table.scenario_ids[row] for row in table.order[:PLAYER_TOP]))
         for name, table in tables.items()
         if name != "oracle"  # labels do not rank scenarios
     ]
+    shown = " and ".join(name for name in PLAYER_METHODS if name in tables)
+    link = f"<p>Play those of {shown} in <a href=critical.html>critical.html</a>.</p>" if shown else ""
     return (
         f"<div class=charts>{charts}</div>"
         + _table("dense", ("method", "most critical", "second", "third"), top_rows).html()
-        + "<p>Play these scenarios in <a href=critical.html>critical.html</a>.</p>"
+        + link
     )
 
 
 def _action_map(actions: Float[np.ndarray, "n 2"]) -> str:
-    """Return a map of the frequencies of actions: steering to the right, acceleration upwards."""
+    """Return a map of the frequencies of actions: steering along x, acceleration along y, both from -1 to 1."""
     counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_MAP_CELLS, range=((-1, 1), (-1, 1)))
     opacity = np.log1p(counts) / np.log1p(counts.max())
     side = _MAP_SIZE / _MAP_CELLS

@@ -41,7 +41,7 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
 from drivax.seal import allow_edited, edited_files, is_edited_allowed, seal
 from drivax.stats.clusters import recordings_of
 from drivax.studies.definition import Study, StudyConfig
-from drivax.studies.report import write_report
+from drivax.studies.report import PLAYER_METHODS, PLAYER_TOP, write_report
 from drivax.studies.verdicts import (
     Episodes,
     Strata,
@@ -57,8 +57,6 @@ from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.workers import one_core_each
 
 _PROGRESS = "validation/progress_ratio"
-#: Methods whose most critical scenarios the player shows, and the number of each.
-_PLAYER_METHODS, _PLAYER_TOP = ("kinematic", "ensemble", "action_rarity"), 3
 Log = Callable[[str], None]
 
 
@@ -132,7 +130,7 @@ def run_study(
 def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> dict[str, float]:
     """Log the checks of the baselines, which must be met unless ``anyway``; return smallest detectable differences."""
     definition, checks = study.definition, _validation_checks(study, study.definition.baselines)
-    first_group = next(iter(definition.groups))
+    first_group = next(iter(definition.groups), None)
     claim_count = sum(claim.group == first_group for claim in study.claims)
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
     smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
@@ -151,14 +149,16 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
 def _write_pages(
     study: Study, data: ScenarioSet, results: Mapping[str, Any], tables: Mapping[str, ScoreTable]
 ) -> None:
-    """Write the report, and the player of the most critical scenarios."""
+    """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them."""
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
     write_report(study.definition, results, tables, actions, study.folder / "report.html")
     table_of_row: dict[int, ScoreTable] = {}
-    for name in _PLAYER_METHODS:
+    for name in PLAYER_METHODS:
         if name in tables:
-            table_of_row |= dict.fromkeys(top_rows(tables[name], _PLAYER_TOP), tables[name])
+            table_of_row |= dict.fromkeys(top_rows(tables[name], PLAYER_TOP), tables[name])
+    if not table_of_row:
+        return
     write_player(
         [data[row] for row in table_of_row],
         study.folder / "critical.html",
@@ -188,7 +188,7 @@ def _open_folder(study: Study) -> None:
 
 
 def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) -> None:
-    """Check that a folder contains this study of these sets; ``definition`` is the hash of arms and claims."""
+    """Check that a folder contains this study of these sets; ``definition`` is the hash of the definition."""
     folder = RunFolder.open(study.folder)
     sources = [entry["hash"] for entry in folder.info.get("data", [])]
     config = folder.config(StudyConfig, trust=settings.modules_of(study.config))
@@ -196,12 +196,12 @@ def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) ->
         raise UsageError(
             "contains a study with other settings or scenarios",
             file=study.folder,
-            cure="choose another name",
+            cure="choose another --out",
         )
     # Claims are fixed before the evaluation. Studies of earlier versions do not name their definition.
     if folder.info.get("definition", definition) != definition:
         raise UsageError(
-            "contains a study with other arms or claims", file=study.folder, cure="choose another name"
+            "contains a study with another definition", file=study.folder, cure="choose another --out"
         )
 
 

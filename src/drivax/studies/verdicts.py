@@ -125,7 +125,8 @@ class ClaimResult:
     Attributes:
         claim: The claim.
         effect: The effect to test against 0: the difference, or for a claimed size the log ratio minus its claimed
-            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is 0).
+            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is not
+            positive).
         difference: Arm minus reference; None if fewer than two recordings define the metric.
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).
@@ -193,7 +194,7 @@ def _decide(result: ClaimResult, claims: int) -> ClaimResult:
     if result.effect is None or result.adjusted_p is None:
         needed = "fewer than two recordings define it"
         if result.difference is not None:
-            needed = "the mean of an arm is 0: no ratio"
+            needed = "the mean of an arm is not positive: no ratio"
         return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
         return replace(result, needed=describe_sample_size(result.effect, claims))
@@ -279,13 +280,14 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
     """Compare rankings of scenarios by two methods: rank correlation, overlap of the top 5 %, and a verdict.
 
     Leaves out ``uniform`` and ``oracle``. ``recordings`` has the recording of every scenario; the interval resamples
-    recordings.
+    recordings. The correlation is None if a method gives all scenarios the same score.
     """
     pairs = []
     for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
         scores, other_scores = (tables[name].scenarios for name in (first, second))
         count = max(round(_TOP * len(scores)), 1)
         top_sets = [set(top_rows(tables[name], count)) for name in (first, second)]
+        rho = rank_correlation(scores, other_scores)
         low, high = correlation_interval(scores, other_scores, recordings)
         verdict: Verdict = "undecided"
         if max(-low, high) < UNRELATED:
@@ -295,7 +297,7 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
         pairs.append(
             {
                 "methods": [first, second],
-                "rho": rank_correlation(scores, other_scores),
+                "rho": None if math.isnan(rho) else rho,
                 "interval": [low, high],
                 "overlap": len(top_sets[0] & top_sets[1]) / count,
                 "orthogonal": verdict,

@@ -25,7 +25,7 @@ def comparison_text(comparison: Comparison) -> str:
     """Return a comparison as text: planners, conditions, tables of at most 100 columns, recommendation and notes."""
     tables = comparison_tables(comparison)
     arms = zip("AB", comparison.names, comparison.folders, strict=True)
-    lines = [escape_controls(f"{arm}  {name}  ({folder})") for arm, name, folder in arms]
+    lines = [escape_controls(f"{arm}  {name}  ({folder or 'in memory'})") for arm, name, folder in arms]
     lines += [conditions(comparison), "", tables[0].text(*tables[1:]), ""]
     lines += [f"recommendation: {title(comparison)}", *(f"  {reason}" for reason in reasons(comparison))]
     return "\n".join([*lines, *(f"  ({note})" for note in notes(comparison))])
@@ -240,8 +240,11 @@ def _metrics(comparison: Comparison) -> str:
     effect = "d, with the pooled standard deviation"
     if effect_name(comparison) == "d_z":
         effect = "d_z, the mean of the differences over their standard deviation"
+    interval = "over seeds and recordings"
+    if comparison.primary.seeds == 1:
+        interval = "(Wilson's for rates of A and B, else a bootstrap over recordings)"
     note = (
-        f"Mean and {confidence} interval; whole recordings are resampled. n: scenarios where the metric is defined. "
+        f"Mean and {confidence} interval {interval}. n: scenarios where the metric is defined. "
         f"Effect size: Cohen's {effect}. A planner is called better if the two-sided p-value is below {level}; "
         "p-values of secondary metrics are adjusted for their number by Holm's method."
     )
@@ -262,7 +265,7 @@ def _plan(comparison: Comparison) -> str:
 
 def _origin(comparison: Comparison) -> str:
     arms = zip("AB", comparison.names, comparison.folders, strict=True)
-    rows = [(f"{arm}: {name}", [str(folder)]) for arm, name, folder in arms]
+    rows = [(f"{arm}: {name}", [str(folder or "in memory")]) for arm, name, folder in arms]
     numbers = escape(json.dumps(comparison.as_dict(), indent=1, ensure_ascii=False))
     return section(
         "How this was made",

@@ -21,6 +21,7 @@ from drivax.report.inspection import (
 from drivax.report.pages.page import asset, definitions, page, section
 from drivax.report.pictures.palette import stroke
 from drivax.scenario.select.selection import FINDINGS
+from drivax.stats.clusters import recordings_of
 
 #: Tags with more values, such as ids and dates, are not shown.
 _MAX_TAG_VALUES = 16
@@ -43,8 +44,9 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
 
 def _lead(inspections: Sequence[Inspection]) -> str:
     count = sum(map(len, inspections))
-    entries = (entry for inspection in inspections for entry in inspection.entries)
-    recordings = len({(entry["dataset"], entry["segment"]) for entry in entries})
+    recordings = len(
+        set(recordings_of([entry for inspection in inspections for entry in inspection.entries]))
+    )
     hours = sum(inspection.hours for inspection in inspections)
     length = f"{short(hours)} hours" if hours >= 1 else f"{short(60 * hours)} minutes"
     return f"<b>{count:,}</b> scenarios of {recordings:,} recordings, {length} of driving."

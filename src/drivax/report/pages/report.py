@@ -251,7 +251,8 @@ def _player(runs: Sequence[EpisodeTable], packed_episodes: PackedEpisodes) -> st
         )
     return (
         f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
-        f"planners start from the same state at the same time.</p>{caution}"
+        "planners start at the same time, and from the same state unless noisy starts have different seeds.</p>"
+        f"{caution}"
         f"<div class=picker role=group aria-label=Rollouts>{buttons}</div><h3 data-control=title></h3>{player_html()}"
     )
 

@@ -6,9 +6,11 @@ important elements also differ in shape (the ego's arrow, crosses at failures, t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from drivax.errors import UsageError
 from drivax.scenario.schema import AgentKind, LightState, RoadKind
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -64,6 +66,18 @@ DARK = MappingProxyType(
     }
 )  # fmt: skip
 THEMES = MappingProxyType({"light": LIGHT, "dark": DARK})
+
+
+def theme_colours(name: str) -> Mapping[str, str]:
+    """Return the colours of a theme.
+
+    Raises:
+        UsageError: There is no such theme.
+    """
+    if name not in THEMES:
+        raise UsageError(f"unknown theme {name!r}", cure=f"use {' or '.join(THEMES)}")
+    return THEMES[name]
+
 
 #: The legend: name of the colour and words.
 LEGEND = (

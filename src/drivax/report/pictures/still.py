@@ -9,7 +9,7 @@ import numpy as np
 
 from drivax.errors import UsageError, missing_package
 from drivax.report.pictures.drawing import LIGHTS, Drawing, Shape
-from drivax.report.pictures.palette import LEGEND, LIGHT, THEMES
+from drivax.report.pictures.palette import LEGEND, LIGHT, theme_colours
 from drivax.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def draw_scenario(
         legend: Whether to draw a legend below.
 
     Raises:
-        UsageError: The step is outside the scenario, or matplotlib is not installed.
+        UsageError: The step is outside the scenario, the theme is unknown, or matplotlib is not installed.
     """
     if not 0 <= step < int(scenario.steps):
         raise UsageError(f"step {step} is not in the scenario", cure=f"use 0 to {int(scenario.steps) - 1}")
@@ -50,7 +50,7 @@ def draw_scenario(
     centre = scenario.agent_xy[step, 0]
     if path is not None and np.isfinite(path[step]).all():
         centre = path[step, :2]
-    colours, legend_in = THEMES[theme], _LEGEND_IN if legend else 0.0
+    colours, legend_in = theme_colours(theme), _LEGEND_IN if legend else 0.0
     height_in = 7 + legend_in
     figure = Figure(figsize=(7, height_in), dpi=110, facecolor=colours["ground"])
     axes = figure.add_axes((0, legend_in / height_in, 1, 7 / height_in))

@@ -30,7 +30,7 @@ from drivax.report.pictures.drawing import (
     ring,
     surroundings,
 )
-from drivax.report.pictures.palette import LEGEND, THEMES, rgb
+from drivax.report.pictures.palette import LEGEND, rgb, theme_colours
 from drivax.report.runs import read_evaluations
 from drivax.scenario.schema import Scenario
 
@@ -61,7 +61,8 @@ def write_videos(
 
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
-        UsageError: A file exists, ``which`` is invalid, the scenario has no episode, or a package is not installed.
+        UsageError: A file exists, ``which`` or the theme is invalid, the scenario has no episode, or a package is not
+            installed.
     """
     evaluations = read_evaluations(runs)
     groups = _select_episodes(evaluations, which)
@@ -126,7 +127,7 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
         panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in pairs]
         if columns > 1:
             for pane in panes:
-                pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
+                pane[:, -1, :3] = rgb(canvas.colours["lane"])
         yield np.concatenate((_tile(panes, columns), legend))
 
 
@@ -174,7 +175,7 @@ class Canvas:
     """Pixels to draw on: shapes in metres under a camera, texts and bars in pixels from the upper left corner.
 
     Raises:
-        UsageError: matplotlib is not installed.
+        UsageError: The theme is unknown, or matplotlib is not installed.
     """
 
     def __init__(self, width: int, height: int, theme: str) -> None:
@@ -188,7 +189,7 @@ class Canvas:
         # At 72 dots per inch a point of matplotlib is a pixel.
         self._agg = RendererAgg(width, height, 72)
         self._path, self._affine, self._font = Path, Affine2D, FontProperties
-        self.width, self.height, self.colours = width, height, THEMES[theme]
+        self.width, self.height, self.colours = width, height, theme_colours(theme)
         self._camera: Affine2D = Affine2D()
 
     def clear(self) -> None:
