@@ -202,6 +202,7 @@ def test_importance_of_features_to_a_trained_policy(sets, inspect):
         ([], "no scenario set", 2),
         (["ONE", "--draw", "x.png"], "--draw needs --observations", 2),
         (["ONE", "--traffic", "idm"], "--traffic needs --observations", 2),
+        (["ONE", "--trust-code", "own"], "--trust-code needs --observations", 2),
         (["ONE", "ONE", "--observations"], "one set", 2),
         (["ONE", "--observations", "--planner", "nobody"], "unknown planner 'nobody'", 2),
         (["ONE", "--json", "--html", "x.html"], "exclude", 2),

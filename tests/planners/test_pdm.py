@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -312,6 +313,14 @@ def test_invalid_settings_are_refused():
         PdmConfig(scoring=ScoringConfig(ground_every=7))
     with pytest.raises(UsageError, match="10 steps are too few"):
         PdmConfig(steps=10)
+    with pytest.raises(UsageError, match="PDM considers 0 agents"):
+        PdmConfig(agents=0)
+    with pytest.raises(UsageError, match="weights of progress, ttc and comfort are 0, 0, 0"):
+        ScoringConfig(progress=0.0, ttc=0.0, comfort=0.0)
+    with pytest.raises(UsageError, match="within_s is nan"):
+        BrakeConfig(within_s=math.nan)
+    with pytest.raises(UsageError, match="use least_mps2 <= most_mps2"):
+        BrakeConfig(least_mps2=3.0)
 
 
 # The brake -------------------------------------------------------------------------------------------------------

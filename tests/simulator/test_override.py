@@ -134,7 +134,22 @@ def test_gradients_reach_override_actions(bank):
 def test_bank_without_overrides_is_refused(bank):
     with pytest.raises(UsageError, match="no OverrideMotions"):
         SIMULATOR.context(bank, 0, 10)
+    context = Simulator(TASK).context(bank, 0, 10)
+    with pytest.raises(UsageError, match=r"no OverrideMotions; use override\.with_override"):
+        OverrideTraffic().agents(bank, context, 0)
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
+
+
+def test_overrides_of_another_length_are_refused(bank):
+    slots = jnp.asarray([[1]])
+    with pytest.raises(
+        UsageError, match="motion of 1 scenarios and 90 steps; use those of the bank, 1 and 91"
+    ):
+        with_override(bank, slots, jnp.zeros((1, 90, 1, 4)))
+    with pytest.raises(UsageError, match="1 actions from step 91 on, in a log of 91 steps"):
+        motions_of_actions(bank, slots, jnp.zeros((1, 1, 1, 2)), TASK.motion, begin=91)
+    with pytest.raises(UsageError, match="0 actions from step 10 on"):
+        motions_of_actions(bank, slots, jnp.zeros((1, 0, 1, 2)), TASK.motion)
 
 
 def test_traffic_models_are_found_by_name(bank):

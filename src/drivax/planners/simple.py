@@ -103,7 +103,11 @@ class ConstantSpeed(RuleBased):
 
 @record
 class RandomActions(Memoryless):
-    """Draw actions uniformly from the action space, independently at every step."""
+    """Draw every component of an action uniformly from [-1, 1), independently at every step.
+
+    In ``delta_local`` negative draws of the first component do not move. ``direct_state`` and ``trajectory`` have no
+    such bounds: there the draws mean nothing.
+    """
 
     name: str = static(default="random")
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.schema import DT_S
@@ -30,6 +31,10 @@ ACCELERATION, STEERING, RATE = range(3)
 _FIRST_CURVATURE = 1e-10
 #: Steps over which initial acceleration and steering are measured; distance below which they are a standstill, m.
 _RECENT, _STILL_M = 5, 0.5
+#: Settings that cannot be 0: most divide, or keep a divisor away from 0.
+_POSITIVE = (
+    "horizon", "acceleration_weight", "rate_weight", "most_steering", "wheelbase", "curvature_rate_penalty"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,15 @@ class TrackingConfig:
     wheelbase: float = 3.089 / 5.176
     jerk_penalty: float = 1e-4
     curvature_rate_penalty: float = 1e-2
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value < math.inf or (name in _POSITIVE and not value):
+                cure = "use a positive number" if name in _POSITIVE else "use 0 or a positive number"
+                raise UsageError(f"{name} is {value:g}", cure=cure)
+        if self.most_steering >= math.pi / 2:
+            problem = f"most_steering is {self.most_steering:g} rad"
+            raise UsageError(problem, cure="use less than a right angle (1.57)")
 
 
 def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:

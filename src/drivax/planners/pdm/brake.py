@@ -6,6 +6,7 @@ Planning" (CoRL 2023) and its published implementation.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm.forecast import Contacts, Forecast
 from drivax.planners.planner import Planner
@@ -50,6 +52,13 @@ class BrakeConfig:
     gains: tuple[float, float] = (10.0, 0.0)
     slow_gains: tuple[float, float] = (4.0, 1.0)
     slow_mps: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.within_s < math.inf:
+            raise UsageError(f"the brake's within_s is {self.within_s:g}", cure="use 0 or a positive number")
+        if not self.least_mps2 <= self.most_mps2:
+            problem = f"the brake accelerates from {self.least_mps2:g} to {self.most_mps2:g} m/s2"
+            raise UsageError(problem, cure="use least_mps2 <= most_mps2")
 
 
 def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
@@ -105,6 +114,11 @@ class EmergencyBrake:
         """Name of the planner plus ``+brake``."""
         return f"{self.planner.name}+brake"
 
+    @property
+    def prepare(self) -> Any:
+        """Function that hands stored scenarios to the wrapped planner; None if it needs none."""
+        return getattr(self.planner, "prepare", None)
+
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
         """Return the carry of the wrapped planner."""
         return self.planner.init(bank, state, key)
@@ -134,7 +148,8 @@ class EmergencyBrake:
         """Return the motions from now on, with the action held constant or along the planned poses."""
         steps = round(self.config.within_s / DT_S)
         if isinstance(self.actions, Trajectory):
-            poses = replace(self.actions, steps=steps).plan(action.reshape(-1, 3)).reshape(-1, 3)
+            # A trajectory has three steps or more; contacts after ``within_s`` do not trigger the brake.
+            poses = replace(self.actions, steps=max(steps, 3)).plan(action.reshape(-1, 3)).reshape(-1, 3)
             speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
             return jnp.column_stack([poses, jnp.concatenate([motion[MOTION_SPEED:], speeds])])
 

@@ -65,6 +65,12 @@ class IdmTraffic:
     drivers: tuple[tuple[int, IdmParameters], ...] = ((int(AgentKind.VEHICLE), IdmParameters()),)
     name: str = "idm"
 
+    def __post_init__(self) -> None:
+        kinds = [kind for kind, _ in self.drivers]
+        if not kinds or len(set(kinds)) < len(kinds):
+            cure = "name one class or more, each once"
+            raise UsageError(f"IDM traffic with drivers of the classes {list(map(int, kinds))}", cure=cure)
+
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the paths of reacting vehicles; unchanged if it has them."""
         return agent_paths.with_paths(bank, tuple(kind for kind, _ in self.drivers))
