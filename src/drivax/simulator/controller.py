@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
@@ -85,6 +85,13 @@ def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> S
     """Acceleration a that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a`` and desired speed v*, m/s2."""
     q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
     return b * q * (desired - speed) / (b * q * b + r)
+
+
+def speed_command(speed: Scalar, desired: Scalar, config: TrackingConfig) -> tuple[Scalar, Bool[Array, ""]]:
+    """Return the commanded acceleration, m/s2, and whether the car is stopping, in which it does not steer."""
+    is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
+    stopping = config.stopping_gain * (desired - speed)
+    return jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config)), is_stopping
 
 
 def steering_rate(
@@ -167,9 +174,7 @@ def track(
     desired = speeds[min(config.horizon, speeds.shape[0] - 1)]
     curvatures = fit_curvatures(poses, speeds, config)
     curvatures = curvatures[np.minimum(np.arange(config.horizon), speeds.shape[0] - 1)]
-    is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
-    stopping = config.stopping_gain * (desired - speed)
-    acceleration = jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config))
+    acceleration, is_stopping = speed_command(speed, desired, config)
     cos, sin, offset = jnp.cos(poses[0, 2]), jnp.sin(poses[0, 2]), axle - poses[0]
     error = offset[1] * cos - offset[0] * sin, wrap(offset[2]), steering
     speeds_ahead = speed + acceleration * DT_S * np.arange(config.horizon)
