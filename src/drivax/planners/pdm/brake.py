@@ -23,7 +23,7 @@ from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical, Trajectory
+from drivax.tasks.actions import ActionSpace, Physical, Route, Trajectory
 
 #: Number of agents to consider, those nearest to the path, and their largest distance from ego, m.
 _OTHERS, _RADIUS_M = 24, 50.0
@@ -78,7 +78,7 @@ def stop(
     actions: ActionSpace, motion: Motion, acceleration: Scalar, length_m: Scalar,
     config: BrakeConfig = BrakeConfig(),
 ) -> Float[Array, " D"]:  # fmt: skip
-    """Return the action that brakes straight ahead.
+    """Return the action that brakes straight ahead; that of :class:`Physical` for the space ``route``.
 
     In the action space ``trajectory``, the plan has a constant speed, as published: ``1.1 (v + a)`` m/s if ego drives
     faster than ``slow_mps``, else ``a``. A negative speed leads backwards; the car, which cannot reverse, then stops.
@@ -95,8 +95,9 @@ def stop(
 class EmergencyBrake:
     """Wrap a planner: brake if its action leads to an at-fault collision.
 
-    The forecast holds the action constant; in the space ``trajectory``, it follows the plan exactly. Other agents keep
-    their velocities; agents that already touch ego are ignored.
+    The forecast holds the action constant, in the space ``route`` its curvature; in the space ``trajectory``, it
+    follows the plan exactly. In ``direct_state``, where an action is a single motion, it stands there. Other agents
+    keep their velocities; agents that already touch ego are ignored.
 
     Attributes:
         planner: The wrapped planner.
@@ -132,7 +133,10 @@ class EmergencyBrake:
         context, frame = situation.context, situation.surroundings.frame
         motion, box = context.history[-1], frame.box[context.slot]
 
-        path = self._forecast(motion, action, context.action, box[LENGTH])
+        # In the space ``route`` an action is an offset: the forecast holds the curvature to it, the brake none.
+        space = self.actions if isinstance(self.actions, Route) else None
+        steered_action = space.steer(bank, context, action) if space else action
+        path = self._forecast(motion, steered_action, context.action, box[LENGTH])
         is_touching = overlaps(frame, context.slot)
         others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _OTHERS, _RADIUS_M)
         is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
@@ -140,6 +144,7 @@ class EmergencyBrake:
         speed = motion[MOTION_SPEED]
         acceleration = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
         brake_action = stop(self.actions, motion, acceleration, box[LENGTH], self.config)
+        brake_action = space.unsteer(bank, context, brake_action) if space else brake_action
         return jnp.where(is_emergency(fault_s, speed, self.config), brake_action, action), carry
 
     def _forecast(
