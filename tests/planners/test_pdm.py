@@ -358,7 +358,7 @@ def test_any_planner_accepts_the_emergency_brake():
 
 
 def test_emergency_brake_holds_the_curvature_in_the_space_route():
-    """0.5 m left of the route, straight ahead is an offset of 0.5 m: no left turn into who stands beside."""
+    """0.5 m left of the route, straight ahead is an offset of 0.5 m: no left turn into the car alongside."""
     simulator = Simulator(replace(TASK, actions=ROUTE))
     run = jax.jit(partial(first_action, EmergencyBrake(ConstantVelocity(ROUTE), ROUTE), simulator))
     near, beside = (
