@@ -152,6 +152,14 @@ def test_overrides_of_another_length_are_refused(bank):
         motions_of_actions(bank, slots, jnp.zeros((1, 0, 1, 2)), TASK.motion)
 
 
+@pytest.mark.parametrize(("steps", "start_x"), [(range(6), 15.0), (range(30, 91), 40.0)])
+def test_agents_missing_at_the_start_begin_where_they_were_logged(steps, start_x):
+    """At 10 m/s, at x = 20 m at step 10: last logged at step 5, or first at step 30."""
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 10, steps=steps)]))
+    motion = motions_of_actions(bank, jnp.asarray([[1]]), jnp.zeros((1, 1, 1, 2)), TASK.motion)
+    np.testing.assert_allclose(motion[0, 10, 0], [start_x, 3.7, 0.0, 10.0], atol=1e-3)
+
+
 def test_traffic_models_are_found_by_name(bank):
     assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
     assert isinstance(make_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)

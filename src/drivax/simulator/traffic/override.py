@@ -118,8 +118,8 @@ def motions_of_actions(
 
     Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
     action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
-    the log lacks at ``begin`` starts where it was last valid, or first. At most 22 steps before ``begin`` are as
-    logged; before them the earliest motion is repeated.
+    the log lacks at ``begin`` starts where it was last valid, or first. Until ``begin`` it has the 22 steps before its
+    start as logged; before them the earliest motion is repeated.
 
     Raises:
         UsageError: ``begin`` is not a step of the log, or there are no actions.
@@ -133,7 +133,10 @@ def motions_of_actions(
     def drive(index: Array, slot: Array, actions: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         """Return the trajectory of one agent."""
         slot = jnp.maximum(slot, 0)
-        past = logged_history(bank, index, begin, slot)
+        # Rows that are not valid are zero: start from the last valid step until ``begin``, or from the first one.
+        valid, log_steps = bank.agents[index, :, slot, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
+        last = jnp.max(jnp.where(valid & (log_steps <= begin), log_steps, -1))
+        past = logged_history(bank, index, jnp.where(last >= 0, last, jnp.argmax(valid)), slot)
         length_m = bank.length_m(index, slot)
 
         def advance(motion: Array, action: Array) -> tuple[Array, Array]:
