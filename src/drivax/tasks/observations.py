@@ -2,7 +2,7 @@
 
 Each group is an array with features on its last axis; groups with missing rows have a boolean mask over their rows
 (semantics, Observation). Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (road
-pieces by 10 m).
+pieces by 10 m); ``tasks.features`` has the units of the optional features.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class Reactive:
 
 @dataclass(frozen=True)
 class IdmTraffic:
-    """Vehicles that react to ego, to all other agents and to red lights.
+    """Vehicles that react to ego, to all other agents and to red and yellow lights.
 
     A vehicle that travels more than 2 m in the rest of its log, and does not reverse, follows its own path; all other
     agents replay. A vehicle ignores up to two agents that it overlaps when it appears, until they separate.
