@@ -118,7 +118,7 @@ class RandomActions(Memoryless):
 
 @record
 class IdmPlanner(RuleBased):
-    """Follow the leader along the route by IDM, stop for red and yellow lights, slow down in curves, steer by pure pursuit.
+    """Follow the leader along the route by IDM, stop at lights, slow down in curves, steer by pure pursuit.
 
     Reads the true situation, not observations. The desired speed is the speed limit (13.4 m/s if unknown), less before
     curves, and 0 at the end of the route. In a scenario without a route on lanes, ego follows the path of the log.
