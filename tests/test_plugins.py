@@ -92,6 +92,10 @@ def test_dotted_names_have_a_module_and_a_name():
 def test_named_objects_round_trip():
     assert find_named("math:pi") == pytest.approx(3.14159, abs=1e-5)
     assert find_named(f"{HERE}:Square.area") is Square.area
+    with pytest.raises(UsageError, match=f"'{HERE}:Square' has no 'aera'; did you mean 'area'"):
+        find_named(f"{HERE}:Square.aera")
+    with pytest.raises(UsageError, match="'math:pi' has no 'x'; define x there"):
+        find_named("math:pi.x")
     for thing in (ratio, Square, Square.area, len):
         assert find_named(dotted_name(thing)) is thing
     for thing in (lambda x: x, load.__get__(1)):

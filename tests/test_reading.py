@@ -42,6 +42,15 @@ def test_arrays_are_those_of_numpy(tmp_path):
         assert result[name].dtype == array.dtype
 
 
+def test_names_that_become_equal_are_refused(tmp_path):
+    file = tmp_path / "a.npz"
+    with zipfile.ZipFile(file, "w") as archive:
+        for name in ("a", "a.npy"):
+            archive.writestr(name, header("{'descr': '<f8', 'fortran_order': False, 'shape': (0,)}"))
+    with pytest.raises(DataError, match="a name occurs twice"):
+        read_arrays(file, "write it again", 1 << 20)
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -58,13 +58,13 @@ def find_named(name: str, trust: Collection[str] | None = None) -> Any:
     if trust is not None and not is_trusted(name, trust):
         raise UsageError(f"{name!r} is not part of drivax", cure=trust_cure([name]))
     module_name, _, path = name.partition(":")
-    target = _import(module_name, name)
+    target, place = _import(module_name, name), module_name
     for attribute in path.split("."):
         if not hasattr(target, attribute):
-            names = [candidate for candidate in vars(target) if not candidate.startswith("_")]
+            names = [member for member in getattr(target, "__dict__", ()) if not member.startswith("_")]
             cure = did_you_mean(attribute, names, otherwise=f"define {attribute} there")
-            raise UsageError(f"{name!r}: {module_name!r} has no {attribute!r}", cure=cure)
-        target = getattr(target, attribute)
+            raise UsageError(f"{name!r}: {place!r} has no {attribute!r}", cure=cure)
+        target, place = getattr(target, attribute), f"{place}{'.' if ':' in place else ':'}{attribute}"
     if trust is not None and not _may_be_named(target, name):
         raise UsageError(f"{name!r} is not a component of {module_name!r}", cure="do not use this file")
     return target

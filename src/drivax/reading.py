@@ -120,13 +120,13 @@ def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
         members = archive.infolist()
         if (size := sum(member.file_size for member in members)) > most:
             raise ValueError(f"unpacks to {format_bytes(size)}, more than the {format_bytes(most)} expected")
-        if len({member.filename for member in members}) < len(members):
+        names = [member.filename.removesuffix(".npy") for member in members]
+        if len(set(names)) < len(names):
             raise ValueError("a name occurs twice")
         if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
             raise ValueError("compressed by another method than deflate")
-        return {
-            member.filename.removesuffix(".npy"): parse_array(_unpack(archive, member)) for member in members
-        }
+        arrays = (parse_array(_unpack(archive, member)) for member in members)
+        return dict(zip(names, arrays, strict=True))
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:

@@ -31,7 +31,7 @@ class Column:
         heading: Heading, with unit and direction.
         key: Name in CSV files; by default the heading.
         label: Whether its cells are row headings, which are never wrapped.
-        left: Whether to align text left, as labels are.
+        left: Whether to align text left in a terminal, as labels are.
         title: Tooltip in HTML.
         max_width: Maximum width in a terminal, characters.
         picture: Whether its cells are pictures, which only HTML shows.
@@ -158,7 +158,7 @@ class Table:
             for column, cell in zip(self.columns, row, strict=True):
                 if (interval := cell.interval) is not None:
                     row_labels = [row[i].text for i in labels]
-                    row_labels += [] if self.across == "metric" else [column.key]
+                    row_labels += [] if self.across == "metric" else [column.key or column.heading]
                     numbers = (interval.mean, interval.low, interval.high)
                     digits = ("" if value is None else repr(value) for value in numbers)
                     lines.append([*row_labels, cell.metric, *digits, interval.n])

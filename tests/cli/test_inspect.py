@@ -153,7 +153,8 @@ def test_page(sets, inspect, tmp_path):
 @pytest.mark.slow
 def test_observations(sets, inspect, tmp_path):
     """Described as a table and as JSON, and drawn; the task is that of a training configuration."""
-    task = "task: {observation: {agents: 2, steps: 2, road: 20, lights: 1, route: 2}}\n"
+    observation = "{agents: 2, steps: 2, road: 20, lights: 1, route: 2}"
+    task = f"task: {{actions: published, observation: {observation}}}\n"
     (tmp_path / "lean.yaml").write_text(task)
     words = (sets[0], "--observations", "--task", tmp_path / "lean.yaml", "--planner", "constant_velocity")
     out = inspect(*words, "--draw", tmp_path / "seen.png")
@@ -202,6 +203,7 @@ def test_importance_of_features_to_a_trained_policy(sets, inspect):
         ([], "no scenario set", 2),
         (["ONE", "--draw", "x.png"], "--draw needs --observations", 2),
         (["ONE", "--traffic", "idm"], "--traffic needs --observations", 2),
+        (["ONE", "--trust-code", "own"], "--trust-code needs --observations", 2),
         (["ONE", "ONE", "--observations"], "one set", 2),
         (["ONE", "--observations", "--planner", "nobody"], "unknown planner 'nobody'", 2),
         (["ONE", "--json", "--html", "x.html"], "exclude", 2),

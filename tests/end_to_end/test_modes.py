@@ -111,6 +111,7 @@ def test_task_flags_are_refused_for_trained_policies(data, tmp_path, capsys):
     [
         (["--task.action", "published"], "did you mean 'actions'"),
         (["--limt", "1"], "unknown option '--limt'; did you mean '--limit'"),
+        (["--task", "demo"], "unknown option '--task'; did you mean '--task.KEY'"),
         (["extra"], "extra"),
     ],
 )

@@ -94,8 +94,10 @@ def test_planners_unfit_for_traffic_are_refused(bank):
         UsageError, match="route cannot drive others without routes; convert or generate the set"
     ):
         PlannerTraffic(Task(actions=ROUTE)).prepare(bank)
-    with pytest.raises(UsageError, match="cannot drive others"):
+    with pytest.raises(UsageError, match="Memoryless planner that does not replay the log"):
         with_driver(bank, Expert())
+    with pytest.raises(UsageError, match="traffic with 0 driven vehicles"):
+        PlannerTraffic(TASK, count=0)
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
         TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
 

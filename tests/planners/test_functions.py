@@ -7,13 +7,13 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import drive, episode_keys
-from drivax.planners.catalogue import PLANNERS, make_planner
+from drivax.planners.catalogue import PLANNERS, default_task, make_planner
 from drivax.planners.functions import collect_errors, python_actions, python_planner
 from drivax.planners.pdm.brake import EmergencyBrake
-from drivax.planners.planner import Planner
+from drivax.planners.planner import Held, Planner
 from drivax.planners.simple import IdmPlanner
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import Published
+from drivax.tasks.actions import Physical, Published
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from own_drivers import slow_jax, slow_python
@@ -59,6 +59,11 @@ def test_action_space_of_a_wrapper_is_that_of_the_wrapped_planner(monkeypatch):
     planner = make_planner("braking", Published())
     assert planner == EmergencyBrake(IdmPlanner(actions=Published()), actions=Published())
     assert make_planner("braking") == EmergencyBrake(IdmPlanner())
+
+
+def test_default_task_has_the_action_space_of_a_wrapped_planner():
+    assert default_task(Held(IdmPlanner(actions=Published()), 2)).actions == Published()
+    assert default_task(Held(python_planner(lambda *_: 0), 2)).actions == Physical()
 
 
 def test_python_and_jax_planners_agree_batched_or_alone(bank, moments):
@@ -133,4 +138,6 @@ def test_planner_functions_are_loaded_by_name():
         assert isinstance(planner, Planner) and planner.name == name and not planner.replays
     with pytest.raises(UsageError, match=r"takes \(situation, observation\).*put @drivax.python_planner or"):
         make_planner("own_drivers:plain")
+    with pytest.raises(UsageError, match="unknown planner 'ide'; did you mean 'idm'"):
+        make_planner("ide")
     assert make_planner("own_drivers:fragile").name == "fragile"

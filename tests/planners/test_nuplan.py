@@ -30,6 +30,8 @@ from drivax.planners.nuplan.interface import (
 )
 from drivax.planners.nuplan.map import MapApi, SemanticMapLayer
 from drivax.planners.nuplan.planner import Host, NuplanPlanner, View
+from drivax.planners.pdm.brake import EmergencyBrake
+from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
@@ -244,6 +246,9 @@ def test_the_planner_has_its_own_action_space_unless_the_task_gives_one(scenario
     planner = make_planner("nuplan_planners:RouteIdm")
     assert isinstance(planner, NuplanPlanner) and default_task(planner).actions == Trajectory()
     assert make_planner("nuplan_planners:RouteIdm", PHYSICAL).actions == PHYSICAL
+    assert (
+        EmergencyBrake(planner, SPACE).prepare == planner.prepare and EmergencyBrake(Expert()).prepare is None
+    )
     bank = drivax.load(scenarios[:1]).bank
     assert find_planner("nuplan_planners:RouteIdm", bank)[1].actions == Trajectory()
     assert find_planner("nuplan_planners:RouteIdm", bank, task=TASK)[0].actions == SPACE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +26,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import Trajectory
+from drivax.tasks.actions import ROUTE, Trajectory
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.testing.worlds import change_future, scatter_garbage
@@ -312,6 +313,14 @@ def test_invalid_settings_are_refused():
         PdmConfig(scoring=ScoringConfig(ground_every=7))
     with pytest.raises(UsageError, match="10 steps are too few"):
         PdmConfig(steps=10)
+    with pytest.raises(UsageError, match="PDM considers 0 agents"):
+        PdmConfig(agents=0)
+    with pytest.raises(UsageError, match="weights of progress, ttc and comfort are 0, 0, 0"):
+        ScoringConfig(progress=0.0, ttc=0.0, comfort=0.0)
+    with pytest.raises(UsageError, match="within_s is nan"):
+        BrakeConfig(within_s=math.nan)
+    with pytest.raises(UsageError, match="use least_mps2 <= most_mps2"):
+        BrakeConfig(least_mps2=3.0)
 
 
 # The brake -------------------------------------------------------------------------------------------------------
@@ -346,6 +355,18 @@ def test_any_planner_accepts_the_emergency_brake():
     assert near[0] * 6.0 == pytest.approx(-4.05)
     assert far.tolist() == beside.tolist() == [0.0, 0.0]
     assert planner.name == "constant_velocity+brake"
+
+
+def test_emergency_brake_holds_the_curvature_in_the_space_route():
+    """0.5 m left of the route, straight ahead is an offset of 0.5 m: no left turn into the car alongside."""
+    simulator = Simulator(replace(TASK, actions=ROUTE))
+    run = jax.jit(partial(first_action, EmergencyBrake(ConstantVelocity(ROUTE), ROUTE), simulator))
+    near, beside = (
+        np.asarray(run(bank_of(straight_road([car(0, 0.5, 0, 4), other]))))
+        for other in (car(10.8, 0.5, 0, 0), car(10.0, 3.0, 0, 0))
+    )
+    np.testing.assert_allclose(near * [6.0, 3.5], [-4.05, 0.5], atol=1e-3)
+    np.testing.assert_allclose(beside * [6.0, 3.5], [0.0, 0.5], atol=1e-3)
 
 
 def test_emergency_brake_forecasts_along_planned_poses():

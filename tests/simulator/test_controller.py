@@ -294,5 +294,15 @@ def test_the_space_is_selected_by_name():
     assert load(Task, parse_yaml(dump(task))) == task
     with pytest.raises(UsageError, match="a plan of 1 steps is too short"):
         Trajectory(steps=1)
+    for name, value in (
+        ("horizon", 0),
+        ("wheelbase", 0.0),
+        ("stopping_gain", -1.0),
+        ("steering_lag_s", np.nan),
+    ):
+        with pytest.raises(UsageError, match=f"{name} is .*; use "):
+            TrackingConfig(**{name: value})
+    with pytest.raises(UsageError, match="less than a right angle"):
+        TrackingConfig(most_steering=1.6)
     with pytest.raises(UsageError, match="cannot learn in trajectory"):
         load(TrainConfig, {"task": {"actions": "trajectory"}})

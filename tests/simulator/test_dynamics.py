@@ -18,9 +18,11 @@ from drivax.tasks.actions import (
     DISCRETE,
     PHYSICAL,
     PUBLISHED,
+    DeltaLocal,
     Discrete,
     Physical,
     Published,
+    Route,
 )
 from drivax.tasks.task import Task
 
@@ -185,10 +187,30 @@ def test_levels_are_denser_near_zero_and_contain_it():
     np.testing.assert_allclose(snapped, [4 / 9, 1 / 36], rtol=1e-6)
 
 
-@pytest.mark.parametrize("options", [{"accelerations": 6}, {"curvatures": 1}, {"density": 0.5}])
+@pytest.mark.parametrize(
+    "options",
+    [{"accelerations": 6}, {"curvatures": 1}, {"density": 0.5}, {"density": np.nan}, {"steering": 0.0}],
+)
 def test_invalid_levels_are_refused(options):
     with pytest.raises(UsageError):
         Discrete(**options)
+
+
+@pytest.mark.parametrize(
+    ("space", "options", "words"),
+    [
+        (Physical, {"braking_mps2": 0.0}, "braking_mps2 is 0; use a positive number"),
+        (Physical, {"steering": np.nan}, "steering is nan"),
+        (Physical, {"jerk_mps3": -1.0}, "jerk_mps3 is -1"),
+        (Published, {"steering": 1.6}, "steering is 1.6 rad; use less than a right angle"),
+        (Route, {"offset_m": 0.0}, "offset_m is 0"),
+        (DeltaLocal, {"turn_rad": 0.0}, "turn_rad is 0"),
+    ],
+)
+def test_invalid_settings_are_refused(space, options, words):
+    with pytest.raises(UsageError, match=words) as error:
+        space(**options)
+    assert words in str(error.value)
 
 
 def test_actuator_rates_limit_changes():

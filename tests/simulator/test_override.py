@@ -134,7 +134,30 @@ def test_gradients_reach_override_actions(bank):
 def test_bank_without_overrides_is_refused(bank):
     with pytest.raises(UsageError, match="no OverrideMotions"):
         SIMULATOR.context(bank, 0, 10)
+    context = Simulator(TASK).context(bank, 0, 10)
+    with pytest.raises(UsageError, match=r"no OverrideMotions; use override\.with_override"):
+        OverrideTraffic().agents(bank, context, 0)
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
+
+
+def test_overrides_of_another_length_are_refused(bank):
+    slots = jnp.asarray([[1]])
+    with pytest.raises(
+        UsageError, match="motion of 1 scenarios and 90 steps; use those of the bank, 1 and 91"
+    ):
+        with_override(bank, slots, jnp.zeros((1, 90, 1, 4)))
+    with pytest.raises(UsageError, match="1 actions from step 91 on, in a log of 91 steps"):
+        motions_of_actions(bank, slots, jnp.zeros((1, 1, 1, 2)), TASK.motion, begin=91)
+    with pytest.raises(UsageError, match="0 actions from step 10 on"):
+        motions_of_actions(bank, slots, jnp.zeros((1, 0, 1, 2)), TASK.motion)
+
+
+@pytest.mark.parametrize(("steps", "start_x"), [(range(6), 15.0), (range(30, 91), 40.0)])
+def test_agents_missing_at_the_start_begin_where_they_were_logged(steps, start_x):
+    """At 10 m/s, at x = 20 m at step 10: last logged at step 5, or first at step 30."""
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 10, steps=steps)]))
+    motion = motions_of_actions(bank, jnp.asarray([[1]]), jnp.zeros((1, 1, 1, 2)), TASK.motion)
+    np.testing.assert_allclose(motion[0, 10, 0], [start_x, 3.7, 0.0, 10.0], atol=1e-3)
 
 
 def test_traffic_models_are_found_by_name(bank):

@@ -176,6 +176,10 @@ def test_without_a_map_nothing_is_off_the_road():
     assert not np.asarray(value).any() and not np.asarray(slope).any()
 
 
-def test_margin_beyond_the_reach_of_queries_is_refused(road):
+def test_margins_out_of_bounds_are_refused(road):
     with pytest.raises(UsageError, match=r"margin_m is 3\.5"):
         offroad_potential(road, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)
+    with pytest.raises(UsageError, match="margin_m is 0; use more than 0"):
+        offroad_potential(road, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=0.0)
+    with pytest.raises(UsageError, match=r"margin_m is 0\.2; use at least 0\.3"):
+        collision_potential(frame_of_boxes(np.zeros((1, 6))), jnp.int32(0), margin_m=0.2)

@@ -351,6 +351,12 @@ def test_paths_prepared_for_other_classes_are_recomputed():
     assert both.prepare(more) is more
 
 
+@pytest.mark.parametrize("kinds", [(), (1, 1)])
+def test_missing_or_repeated_classes_are_refused(kinds):
+    with pytest.raises(UsageError, match="name one class or more, each once"):
+        IdmTraffic(drivers=tuple((kind, IdmParameters()) for kind in kinds))
+
+
 def test_traffic_with_ego_alone_stays_empty():
     bank = TRAFFIC.prepare(bank_of(straight_road([car(0, 0, 0, 8)])))
     assert int((np.asarray(data_of(bank, AgentPaths).slot) >= 0).sum()) == 1  # ego, when it is not driven

@@ -150,7 +150,9 @@ def test_a_noisy_start_without_a_key_is_refused(open_road):
         NOISY.reset(open_road, 0)
 
 
-@pytest.mark.parametrize("options", [{"steps": HISTORY}, {"steps": 0}, {"strong": 1.5}, {"tries": 0}])
+@pytest.mark.parametrize(
+    "options", [{"steps": HISTORY}, {"steps": 0}, {"strong": 1.5}, {"scale": np.inf}, {"tries": 0}]
+)
 def test_invalid_settings_are_refused(options):
     with pytest.raises(UsageError):
         NoisyStart(**options)

@@ -22,7 +22,7 @@ from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.synthetic.generate import Generation, generate
-from drivax.tasks.conditions import Condition, check_conditions, fix_conditions
+from drivax.tasks.conditions import Condition, check_conditions, fix_conditions, parse_values
 from drivax.tasks.observations import OwnGroup
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
@@ -259,6 +259,8 @@ def test_conditions_are_unique():
         replace(TASK, observation=replace(GLIMPSE, own=(group,)))
     with pytest.raises(UsageError, match=r"value 0\.5 is not in"):
         fix_conditions(CONDITIONS, {"desired_speed": 0.5})
+    with pytest.raises(UsageError, match="condition ttc_s occurs twice"):
+        parse_values(["ttc_s=1", "ttc_s=2"])
     with pytest.raises(UsageError, match="this planner has no conditions"):
         fix_conditions((), {"desired_speed": 0.5})
 

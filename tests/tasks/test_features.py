@@ -271,6 +271,8 @@ def test_presets_by_name_in_yaml():
         ),
         ("{features: {agents: [type, type]}}", "features.agents names 'type' twice"),
         ("{lights: -1}", r"observation\.lights is -1; use 0 or more"),
+        ("{route_step_m: 0}", r"observation\.route_step_m is 0; use a positive number"),
+        ("{road_side_m: .nan}", r"observation\.road_side_m is nan; use 0 or a positive number"),
         ("{road: 12, road_cut: 5}", r"road_cut is 5; use a number that divides road \(12\)"),
         ("{perception: {range_m: 0}}", r"range_m is 0\.0; use a positive number, or null"),
         ("{perception: {noise_m: -1}}", r"noise_m is -1\.0; use 0 or a positive"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from functools import partial
 
@@ -385,6 +386,10 @@ def test_own_terms_get_facts_on_request():
     assert float(config.weigh(BEFORE, facts(gap_m=1.0), around())["alongside"]) == pytest.approx(-0.1)
     with pytest.raises(ValueError, match="reads unknown fact 'gap'"):
         OwnTerm(alongside, -0.1, reads=("gap",))
+    with pytest.raises(ValueError, match="weight of 'alongside' is nan"):
+        OwnTerm(alongside, math.nan)
+    with pytest.raises(ValueError, match="weight of collision is nan; choose a finite number"):
+        RewardConfig(collision=math.nan)
 
 
 def conditioned(rewards, conditions, **now):

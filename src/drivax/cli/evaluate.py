@@ -101,6 +101,8 @@ def _requested_task(overrides: Sequence[str]) -> Task | None:
         return None
     for argument in overrides:
         if argument.startswith("--") and not argument.startswith("--task."):
-            options = [f"--{name.replace('_', '-')}" for name in Evaluate.__dataclass_fields__]
-            raise UsageError(f"unknown option {argument!r}", cure=did_you_mean(argument, options))
+            names = [name for name in Evaluate.__dataclass_fields__ if name != "task"]
+            options = [f"--{name.replace('_', '-')}" for name in names]
+            cure = did_you_mean(argument, [*options, "--task.KEY"])
+            raise UsageError(f"unknown option {argument!r}", cure=cure)
     return settings.load(EvaluationConfig, {"planner": ""}, overrides).task

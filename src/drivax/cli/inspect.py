@@ -118,9 +118,10 @@ def _check_flags(args: Inspect) -> None:
         raise UsageError(
             "--observations takes one set, and writes no page", cure="name one set, without --html"
         )
-    for name in ("planner", "traffic", "task", "draw"):
-        if getattr(args, name) is not None and not args.observations:
-            raise UsageError(f"--{name} needs --observations", cure="add --observations")
+    for name in ("planner", "traffic", "trust_code", "task", "draw"):
+        if getattr(args, name) and not args.observations:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{flag} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
         raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None:
@@ -134,17 +135,13 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.evaluation.observation_statistics import observation_statistics
     from drivax.learning.config import TrainConfig
     from drivax.learning.policies import find_traffic
-    from drivax.planners.simple import Expert
     from drivax.report.pictures.observation import draw_log_observation
     from drivax.scenario.bank.scenario_bank import ScenarioBank
 
     scenarios = list(inspection.sample(_OBSERVED_SCENARIOS))
     bank = ScenarioBank.from_scenarios(scenarios)
     requested_task = None if args.task is None else settings.load(TrainConfig, args.task).task
-    planner, task = find_planner(args.planner or "expert", bank, trust=args.trust_code)
-    task = requested_task or task
-    if args.planner is None:
-        planner = Expert(actions=task.actions)
+    planner, task = find_planner(args.planner or "expert", bank, task=requested_task, trust=args.trust_code)
     traffic = find_traffic(args.traffic or "log", args.trust_code)
     statistics = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
     if args.json:

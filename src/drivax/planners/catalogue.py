@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.planners.nuplan.planner import Host, NuplanPlanner, is_nuplan
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
@@ -33,9 +33,10 @@ def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
     the action space of the planner, and of a planner that it wraps, where it is a field.
 
     Raises:
-        KeyError: Unknown name.
-        UsageError: The dotted name leads to no planner.
+        UsageError: Unknown name, or the dotted name leads to no planner.
     """
+    if not is_dotted(name) and name not in PLANNERS:
+        raise UsageError(f"unknown planner {name!r}", cure=did_you_mean(name, PLANNERS))
     planner = as_planner(find_named(name), name) if is_dotted(name) else PLANNERS[name]()
     return planner if actions is None else _with_actions(planner, actions)
 
@@ -50,7 +51,9 @@ def _with_actions(planner: Any, actions: ActionSpace) -> Any:
 
 
 def default_task(planner: Planner) -> Task:
-    """Return the default task, with the planner's own action space."""
+    """Return the default task, with the action space of the planner, or of a planner that it wraps."""
+    while not hasattr(planner, "actions") and isinstance(getattr(planner, "planner", None), Planner):
+        planner = planner.planner  # type: ignore[attr-defined]
     return Task(actions=getattr(planner, "actions", Task().actions))
 
 

@@ -78,6 +78,10 @@ class PlannerTraffic:
     base: Traffic = field(default_factory=LogTraffic)
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise UsageError(f"traffic with {self.count} driven vehicles", cure="use count=1 or more")
+
     @property
     def name(self) -> str:
         """``driven``, followed by the name of another base than the log (``driven+idm``)."""
@@ -173,10 +177,9 @@ def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
     """Return the bank with the planner that drives agents in :class:`PlannerTraffic`.
 
     Raises:
-        UsageError: The planner has memory, or replays the log.
+        UsageError: The planner is not a :class:`Memoryless` one, or replays the log.
     """
     if not isinstance(driver, Memoryless) or driver.replays:
-        raise UsageError(
-            f"planner {driver.name!r} cannot drive others", cure="use a trained policy, or one without memory"
-        )
+        cure = "use a trained policy, or a Memoryless planner that does not replay the log"
+        raise UsageError(f"planner {driver.name!r} cannot drive others", cure=cure)
     return with_data(bank, TrafficPolicy(driver))

@@ -103,7 +103,11 @@ class ConstantSpeed(RuleBased):
 
 @record
 class RandomActions(Memoryless):
-    """Draw actions uniformly from the action space, independently at every step."""
+    """Draw every component of an action uniformly from [-1, 1), independently at every step.
+
+    In ``delta_local`` negative draws of the first component do not move. ``direct_state`` and ``trajectory`` have no
+    such bounds: there the draws mean nothing.
+    """
 
     name: str = static(default="random")
 
@@ -114,7 +118,7 @@ class RandomActions(Memoryless):
 
 @record
 class IdmPlanner(RuleBased):
-    """Follow the leader along the route by IDM, stop for red lights, slow down in curves, steer by pure pursuit.
+    """Follow the leader along the route by IDM, stop at lights, slow down in curves, steer by pure pursuit.
 
     Reads the true situation, not observations. The desired speed is the speed limit (13.4 m/s if unknown), less before
     curves, and 0 at the end of the route. In a scenario without a route on lanes, ego follows the path of the log.

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.schema import DT_S
@@ -30,6 +31,10 @@ ACCELERATION, STEERING, RATE = range(3)
 _FIRST_CURVATURE = 1e-10
 #: Steps over which initial acceleration and steering are measured; distance below which they are a standstill, m.
 _RECENT, _STILL_M = 5, 0.5
+#: Settings that cannot be 0: most divide, or keep a divisor away from 0.
+_POSITIVE = (
+    "horizon", "acceleration_weight", "rate_weight", "most_steering", "wheelbase", "curvature_rate_penalty"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,11 +71,27 @@ class TrackingConfig:
     jerk_penalty: float = 1e-4
     curvature_rate_penalty: float = 1e-2
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value < math.inf or (name in _POSITIVE and not value):
+                cure = "use a positive number" if name in _POSITIVE else "use 0 or a positive number"
+                raise UsageError(f"{name} is {value:g}", cure=cure)
+        if self.most_steering >= math.pi / 2:
+            problem = f"most_steering is {self.most_steering:g} rad"
+            raise UsageError(problem, cure="use less than a right angle (1.57)")
+
 
 def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:
     """Acceleration a that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a`` and desired speed v*, m/s2."""
     q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
     return b * q * (desired - speed) / (b * q * b + r)
+
+
+def speed_command(speed: Scalar, desired: Scalar, config: TrackingConfig) -> tuple[Scalar, Bool[Array, ""]]:
+    """Return the commanded acceleration, m/s2, and whether the car is stopping, in which it does not steer."""
+    is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
+    stopping = config.stopping_gain * (desired - speed)
+    return jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config)), is_stopping
 
 
 def steering_rate(
@@ -153,9 +174,7 @@ def track(
     desired = speeds[min(config.horizon, speeds.shape[0] - 1)]
     curvatures = fit_curvatures(poses, speeds, config)
     curvatures = curvatures[np.minimum(np.arange(config.horizon), speeds.shape[0] - 1)]
-    is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
-    stopping = config.stopping_gain * (desired - speed)
-    acceleration = jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config))
+    acceleration, is_stopping = speed_command(speed, desired, config)
     cos, sin, offset = jnp.cos(poses[0, 2]), jnp.sin(poses[0, 2]), axle - poses[0]
     error = offset[1] * cos - offset[0] * sin, wrap(offset[2]), steering
     speeds_ahead = speed + acceleration * DT_S * np.arange(config.horizon)

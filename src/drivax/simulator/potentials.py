@@ -22,6 +22,8 @@ from drivax.simulator.types import AgentContext, Frame
 _BLEND_M, _BLEND_TURN = 0.03, 0.01
 #: Reach of edge queries, m.
 _EDGES_M = 3.0
+#: Minimum margin of collisions, m.
+_LEAST_MARGIN_M = 0.3
 
 
 def separation(box: Float[Array, " 6"], others: Float[Array, "S 6"]) -> Float[Array, " S"]:
@@ -49,9 +51,14 @@ def collision_potential(frame: Frame, slot: Integer, margin_m: float = 0.5) -> F
     """Return the potential of every other agent for the agent in ``slot``; gradients flow to all agents.
 
     Positive where the boxes overlap (``contact.overlaps``); zero where a separating axis has a gap of the margin or
-    more (always at a distance of 1.5 margins), for the agent itself, for absent agents and on another level. The
-    margin must be at least 0.3 m, more for boxes longer than 20 m.
+    more (always at a distance of 1.5 margins), for the agent itself, for absent agents and on another level. Boxes
+    longer than 20 m need a margin of more than 0.3 m.
+
+    Raises:
+        UsageError: The margin is below 0.3 m, where the potential of a slight overlap could be zero.
     """
+    if not margin_m >= _LEAST_MARGIN_M:
+        raise UsageError(f"margin_m is {margin_m:g}", cure=f"use at least {_LEAST_MARGIN_M:g}")
     potentials = _squared_hinge(separation(frame.box[slot], frame.box), margin_m)
     return jnp.where(others_on_level(frame, slot), potentials, 0.0)
 
@@ -66,10 +73,10 @@ def offroad_potential(
     zero without a map, and constant further than 3 m beyond every edge.
 
     Raises:
-        UsageError: The margin is wider than 3 m, the reach of edge queries.
+        UsageError: The margin is not positive, or wider than 3 m, the reach of edge queries.
     """
-    if margin_m > _EDGES_M:
-        raise UsageError(f"margin_m is {margin_m:g}", cure=f"use at most {_EDGES_M:g}")
+    if not 0.0 < margin_m <= _EDGES_M:
+        raise UsageError(f"margin_m is {margin_m:g}", cure=f"use more than 0, at most {_EDGES_M:g}")
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
     offroad_m = offroad_distance(bank, index, box[:2], points, near, ground)

@@ -5,6 +5,7 @@ Any step of the log can be the first one (``Simulator.reset(..., step=...)``); a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -86,7 +87,7 @@ class NoisyStart:
     def __post_init__(self) -> None:
         if not 1 <= self.steps < HISTORY:
             raise UsageError(f"a noisy start of {self.steps} steps", cure=f"use 1 to {HISTORY - 1}")
-        if not (0.0 <= self.strong <= 1.0 and self.scale >= 0.0 and self.tries >= 1):
+        if not (0.0 <= self.strong <= 1.0 and 0.0 <= self.scale < math.inf and self.tries >= 1):
             raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
 
     def begin(

@@ -52,6 +52,9 @@ class Physical:
     jerk_mps3: float | None = None
     steering_rate: float | None = None
 
+    def __post_init__(self) -> None:
+        _check_positive(self, "braking_mps2", "acceleration_mps2", "steering", "jerk_mps3", "steering_rate")
+
     def command(self, action: Vector, length_m: Any) -> tuple[Scalar, Scalar]:
         """Return acceleration (m/s2) and curvature (1/m) of an action, clipped to [-1, 1]."""
         acceleration, steering = self._quantities(jnp.clip(action, -1.0, 1.0))
@@ -136,6 +139,11 @@ class Published(Physical):
     braking_mps2: float = 4.0
     acceleration_mps2: float = 2.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steering >= math.pi / 2:
+            raise UsageError(f"steering is {self.steering:g} rad", cure="use less than a right angle (1.57)")
+
     def _curvature(self, steering: Scalar, length_m: Any) -> Scalar:
         return jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, _LEAST_LENGTH_M))
 
@@ -159,11 +167,12 @@ class Discrete(Physical):
     density: float = 2.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         counts = (self.accelerations, self.curvatures)
         if min(counts) < 3 or any(count % 2 == 0 for count in counts):
             problem = f"{self.accelerations} x {self.curvatures} levels"
             raise UsageError(problem, cure="use odd numbers, at least 3")
-        if self.density < 1.0:
+        if not self.density >= 1.0:
             raise UsageError(f"density is {self.density:g}", cure="use 1 (even) or more (denser near zero)")
 
     @property
@@ -204,6 +213,10 @@ class Route(Physical):
 
     offset_m: float = 3.5
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_positive(self, "offset_m")
+
     def steer(self, bank: ScenarioBank, context: AgentContext, action: Vector) -> Vector:
         """Return the action of :class:`Physical` that steers to the offset of an action; only the offset is clipped."""
         offset_m = self.offset_m * jnp.clip(action[1], -1.0, 1.0)
@@ -214,6 +227,14 @@ class Route(Physical):
         """Return the action that :meth:`steer` turns into an action of :class:`Physical`, not clipped."""
         offset_m = offset_to_steer(bank, context, action[1] * self.steering)
         return jnp.stack([action[0], offset_m / self.offset_m])
+
+
+def _check_positive(space: Any, *names: str) -> None:
+    """Check that settings of an action space are positive numbers, or None."""
+    for name in names:
+        value = getattr(space, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is {value:g}", cure="use a positive number")
 
 
 def _levels(count: int, density: float) -> Float[Array, " count"]:
@@ -235,6 +256,9 @@ class DeltaLocal:
     ahead_m: float = 6.0
     left_m: float = 6.0
     turn_rad: float = math.pi
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "ahead_m", "left_m", "turn_rad")
 
     def action(
         self, motion: Motion, acceleration: Scalar, curvature: Scalar, length_m: Any

@@ -126,11 +126,13 @@ def parse_values(assignments: Sequence[str]) -> dict[str, float]:
     """Parse ``NAME=NUMBER`` arguments.
 
     Raises:
-        UsageError: An argument has another form.
+        UsageError: An argument has another form, or a name occurs twice.
     """
-    values = {}
+    values: dict[str, float] = {}
     for assignment in assignments:
         name, _, number = assignment.partition("=")
+        if name in values:
+            raise UsageError(f"condition {name} occurs twice", cure="name it once")
         try:
             values[name] = float(number)
         except ValueError as error:

@@ -126,7 +126,7 @@ def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Floa
     gap = line_m - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
     on_route = arc < NEVER_M
-    counts = on_route & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
+    counts = on_route & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & has_route(bank, context)
     nearest = jnp.argmin(jnp.where(counts, gap, jnp.inf))
     distance = jnp.where(counts.any(), gap[nearest] / POSITION_M, 1.0)
     flags = jnp.stack([counts & is_red(state), counts])[:, nearest].astype(jnp.float32)

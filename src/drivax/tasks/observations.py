@@ -2,11 +2,12 @@
 
 Each group is an array with features on its last axis; groups with missing rows have a boolean mask over their rows
 (semantics, Observation). Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (road
-pieces by 10 m).
+pieces by 10 m); ``tasks.features`` has the units of the optional features.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -120,6 +121,11 @@ class ObservationConfig:
                 raise ValueError(f"observation.{name} is {count}; use 0 or more")
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
+        for name in ("road_ahead_m", "road_behind_m", "road_side_m"):
+            if not 0.0 <= (distance_m := getattr(self, name)) < math.inf:
+                raise ValueError(f"observation.{name} is {distance_m:g}; use 0 or a positive number")
+        if not 0.0 < self.route_step_m < math.inf:
+            raise ValueError(f"observation.route_step_m is {self.route_step_m:g}; use a positive number")
         if self.road_cut < 1 or self.road % self.road_cut:
             cure = f"use a number that divides road ({self.road})"
             raise ValueError(f"observation.road_cut is {self.road_cut}; {cure}")

@@ -292,6 +292,8 @@ class OwnTerm:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", name_of(self.term, self.name))
+        if not math.isfinite(self.weight):
+            raise ValueError(f"rewards.own: weight of {self.name!r} is {self.weight}; choose a finite number")
         for name in self.reads:
             if name not in FACTS | ON_REQUEST:
                 raise ValueError(f"rewards.own: {self.name!r} reads unknown fact {name!r}")
@@ -333,6 +335,9 @@ class RewardConfig(_Weights):
         for name, bound in OPTIONS.items():
             if not 0.0 <= getattr(self, name) <= bound:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {bound:g}")
+        for name in TERMS:
+            if not math.isfinite(getattr(self, name) or 0.0):
+                raise ValueError(f"weight of {name} is {getattr(self, name)}; choose a finite number")
         if not 0.0 < self.scale < math.inf:
             raise ValueError(f"scale is {self.scale}; choose a number above 0")
 

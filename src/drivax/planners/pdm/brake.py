@@ -6,6 +6,7 @@ Planning" (CoRL 2023) and its published implementation.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm.forecast import Contacts, Forecast
 from drivax.planners.planner import Planner
@@ -21,7 +23,7 @@ from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical, Trajectory
+from drivax.tasks.actions import ActionSpace, Physical, Route, Trajectory
 
 #: Number of agents to consider, those nearest to the path, and their largest distance from ego, m.
 _OTHERS, _RADIUS_M = 24, 50.0
@@ -51,6 +53,13 @@ class BrakeConfig:
     slow_gains: tuple[float, float] = (4.0, 1.0)
     slow_mps: float = 0.2
 
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.within_s < math.inf:
+            raise UsageError(f"the brake's within_s is {self.within_s:g}", cure="use 0 or a positive number")
+        if not self.least_mps2 <= self.most_mps2:
+            problem = f"the brake accelerates from {self.least_mps2:g} to {self.most_mps2:g} m/s2"
+            raise UsageError(problem, cure="use least_mps2 <= most_mps2")
+
 
 def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
     """Return whether to brake at a time to an at-fault collision (infinite for none) and a speed (m/s)."""
@@ -69,7 +78,7 @@ def stop(
     actions: ActionSpace, motion: Motion, acceleration: Scalar, length_m: Scalar,
     config: BrakeConfig = BrakeConfig(),
 ) -> Float[Array, " D"]:  # fmt: skip
-    """Return the action that brakes straight ahead.
+    """Return the action that brakes straight ahead; that of :class:`Physical` for the space ``route``.
 
     In the action space ``trajectory``, the plan has a constant speed, as published: ``1.1 (v + a)`` m/s if ego drives
     faster than ``slow_mps``, else ``a``. A negative speed leads backwards; the car, which cannot reverse, then stops.
@@ -86,8 +95,9 @@ def stop(
 class EmergencyBrake:
     """Wrap a planner: brake if its action leads to an at-fault collision.
 
-    The forecast holds the action constant; in the space ``trajectory``, it follows the plan exactly. Other agents keep
-    their velocities; agents that already touch ego are ignored.
+    The forecast holds the action constant, in the space ``route`` its curvature; in the space ``trajectory``, it
+    follows the plan exactly. In ``direct_state``, where an action is a single motion, it stands there. Other agents
+    keep their velocities; agents that already touch ego are ignored.
 
     Attributes:
         planner: The wrapped planner.
@@ -105,6 +115,11 @@ class EmergencyBrake:
         """Name of the planner plus ``+brake``."""
         return f"{self.planner.name}+brake"
 
+    @property
+    def prepare(self) -> Any:
+        """Function that hands stored scenarios to the wrapped planner; None if it needs none."""
+        return getattr(self.planner, "prepare", None)
+
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
         """Return the carry of the wrapped planner."""
         return self.planner.init(bank, state, key)
@@ -118,7 +133,10 @@ class EmergencyBrake:
         context, frame = situation.context, situation.surroundings.frame
         motion, box = context.history[-1], frame.box[context.slot]
 
-        path = self._forecast(motion, action, context.action, box[LENGTH])
+        # In the space ``route`` an action is an offset: the forecast holds the curvature to it, the brake none.
+        space = self.actions if isinstance(self.actions, Route) else None
+        steered_action = space.steer(bank, context, action) if space else action
+        path = self._forecast(motion, steered_action, context.action, box[LENGTH])
         is_touching = overlaps(frame, context.slot)
         others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _OTHERS, _RADIUS_M)
         is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
@@ -126,6 +144,7 @@ class EmergencyBrake:
         speed = motion[MOTION_SPEED]
         acceleration = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
         brake_action = stop(self.actions, motion, acceleration, box[LENGTH], self.config)
+        brake_action = space.unsteer(bank, context, brake_action) if space else brake_action
         return jnp.where(is_emergency(fault_s, speed, self.config), brake_action, action), carry
 
     def _forecast(
@@ -134,7 +153,8 @@ class EmergencyBrake:
         """Return the motions from now on, with the action held constant or along the planned poses."""
         steps = round(self.config.within_s / DT_S)
         if isinstance(self.actions, Trajectory):
-            poses = replace(self.actions, steps=steps).plan(action.reshape(-1, 3)).reshape(-1, 3)
+            # A trajectory has three steps or more; contacts after ``within_s`` do not trigger the brake.
+            poses = replace(self.actions, steps=max(steps, 3)).plan(action.reshape(-1, 3)).reshape(-1, 3)
             speeds = jnp.linalg.norm(jnp.diff(poses[:, :2], axis=0), axis=-1) / DT_S
             return jnp.column_stack([poses, jnp.concatenate([motion[MOTION_SPEED:], speeds])])
 

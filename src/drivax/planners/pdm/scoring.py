@@ -5,12 +5,14 @@ Source: Dauner et al. 2023 and its published implementation, which follows nuPla
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import COS, LENGTH, SIN
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
@@ -51,6 +53,12 @@ class ScoringConfig:
     astray_m: tuple[float, float] = (2.0, 6.0)
     least_progress_m: float = 0.1
     ground_every: int = 5
+
+    def __post_init__(self) -> None:
+        weights = self.progress, self.ttc, self.comfort
+        if not min(weights) >= 0.0 or not 0.0 < sum(weights) < math.inf:
+            problem = f"weights of progress, ttc and comfort are {', '.join(f'{w:g}' for w in weights)}"
+            raise UsageError(problem, cure="use 0 or positive numbers, one of them positive")
 
 
 @record

@@ -22,10 +22,10 @@ from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.controller import (
     Poses,
     TrackingConfig,
-    acceleration_to,
     fit_curvatures,
     fit_speeds,
     propagate,
+    speed_command,
     steering_rate,
 )
 from drivax.simulator.dynamics import bicycle
@@ -97,9 +97,7 @@ def track(
         (x, y, cos, sin), desired, curvatures = target
         car_x, car_y, car_heading, speed = car.motion
         car_x, car_y = car_x - axle_m * jnp.cos(car_heading), car_y - axle_m * jnp.sin(car_heading)
-        is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
-        stopping_acceleration = config.stopping_gain * (desired - speed)
-        acceleration = jnp.where(is_stopping, stopping_acceleration, acceleration_to(speed, desired, config))
+        acceleration, is_stopping = speed_command(speed, desired, config)
         lateral_error = (car_y - y) * cos - (car_x - x) * sin
         heading_error = wrap(car_heading - jnp.arctan2(sin, cos))
         speeds = speed + acceleration * DT_S * np.arange(config.horizon)

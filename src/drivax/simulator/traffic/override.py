@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import around_lanes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -19,6 +20,8 @@ from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_ban
 from drivax.simulator.traffic.log import LogTraffic, agent_rows, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 
+#: Cure of a bank without overrides.
+_CURE = "use override.with_override"
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
 Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"]]
 
@@ -53,7 +56,7 @@ class OverrideTraffic:
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
         """Return the state of ``base``."""
-        data_of(bank, OverrideMotions, "use override.with_override")
+        data_of(bank, OverrideMotions, _CURE)
         return self.base.start(bank, index, step)
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
@@ -62,7 +65,7 @@ class OverrideTraffic:
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Return the rows of ``base``, replaced by those of the override for its agents."""
-        rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
+        rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions, _CURE)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
         key, slot = (context.index, step), override.slot[context.index]
         own_rows = agent_rows(override.motion[key], override.z[key], override.valid[key].astype(jnp.float32))
@@ -78,7 +81,13 @@ def with_override(
     ``motion`` is x, y (m), heading (rad), speed (m/s) at every step of the log, with the mask ``valid`` (by default
     all); ``slots`` are moving agents of each scenario, -1 for none. Heights follow the nearest lane on the level of the
     step before, starting at the agent's first logged height.
+
+    Raises:
+        UsageError: ``motion`` has another number of scenarios or steps than the bank.
     """
+    if motion.shape[:2] != (len(bank), bank.steps):
+        problem = f"motion of {motion.shape[0]} scenarios and {motion.shape[1]} steps"
+        raise UsageError(problem, cure=f"use those of the bank, {len(bank)} and {bank.steps}")
     valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
     slots = jnp.asarray(slots, jnp.int32)
 
@@ -109,16 +118,25 @@ def motions_of_actions(
 
     Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
     action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
-    the log lacks at ``begin`` starts where it was last valid, or first. At most 22 steps before ``begin`` are as
-    logged; before them the earliest motion is repeated.
+    the log lacks at ``begin`` starts where it was last valid, or first. Until ``begin`` it has the 22 steps before its
+    start as logged; before them the earliest motion is repeated.
+
+    Raises:
+        UsageError: ``begin`` is not a step of the log, or there are no actions.
     """
+    if not 0 <= begin < bank.steps or not actions.shape[1]:
+        problem = f"{actions.shape[1]} actions from step {begin} on, in a log of {bank.steps} steps"
+        raise UsageError(problem, cure="give one action or more, from a step of the log on")
     steps = bank.steps - 1 - begin
     action_index = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
 
     def drive(index: Array, slot: Array, actions: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         """Return the trajectory of one agent."""
         slot = jnp.maximum(slot, 0)
-        past = logged_history(bank, index, begin, slot)
+        # Rows that are not valid are zero: start from the last valid step until ``begin``, or from the first one.
+        valid, log_steps = bank.agents[index, :, slot, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
+        last = jnp.max(jnp.where(valid & (log_steps <= begin), log_steps, -1))
+        past = logged_history(bank, index, jnp.where(last >= 0, last, jnp.argmax(valid)), slot)
         length_m = bank.length_m(index, slot)
 
         def advance(motion: Array, action: Array) -> tuple[Array, Array]:

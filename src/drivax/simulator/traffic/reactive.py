@@ -53,7 +53,7 @@ class Reactive:
 
 @dataclass(frozen=True)
 class IdmTraffic:
-    """Vehicles that react to ego, to all other agents and to red lights.
+    """Vehicles that react to ego, to all other agents and to red and yellow lights.
 
     A vehicle that travels more than 2 m in the rest of its log, and does not reverse, follows its own path; all other
     agents replay. A vehicle ignores up to two agents that it overlaps when it appears, until they separate.
@@ -64,6 +64,12 @@ class IdmTraffic:
 
     drivers: tuple[tuple[int, IdmParameters], ...] = ((int(AgentKind.VEHICLE), IdmParameters()),)
     name: str = "idm"
+
+    def __post_init__(self) -> None:
+        kinds = [kind for kind, _ in self.drivers]
+        if not kinds or len(set(kinds)) < len(kinds):
+            cure = "name one class or more, each once"
+            raise UsageError(f"IDM traffic with drivers of the classes {list(map(int, kinds))}", cure=cure)
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the paths of reacting vehicles; unchanged if it has them."""
