@@ -131,10 +131,9 @@ def check_feature(feature: Feature | str) -> None:
 
 def _check_form(what: str, rows: Any) -> None:
     """Check shapes and dtypes while tracing."""
-    is_pair = isinstance(rows, tuple) and len(rows) == 2
-    valid = all(hasattr(part, "dtype") for part in (rows if is_pair else (rows,)))
+    value, mask = rows if isinstance(rows, tuple) and len(rows) == 2 else (rows, None)
+    valid = hasattr(value, "dtype") and (mask is None or hasattr(mask, "dtype"))
     expect(valid, f"{what} gives {type(rows).__name__}", "return an array, or an array and its mask")
-    value, mask = rows if is_pair else (rows, None)
     valid = value.dtype == jnp.float32 and value.ndim >= 1
     cure = "return float32 with features on the last axis"
     expect(valid, f"{what} gives {array_type(value)} for a context", cure)
