@@ -131,6 +131,8 @@ def check_feature(feature: Feature | str) -> None:
 
 def _check_form(what: str, rows: Any) -> None:
     """Check shapes and dtypes while tracing."""
+    value: Any
+    mask: Any
     value, mask = rows if isinstance(rows, tuple) and len(rows) == 2 else (rows, None)
     valid = hasattr(value, "dtype") and (mask is None or hasattr(mask, "dtype"))
     expect(valid, f"{what} gives {type(rows).__name__}", "return an array, or an array and its mask")
