@@ -14,7 +14,7 @@ from drivax.kernels.library import call, in_use
 _WIDTHS = (32, 64)
 
 #: Kernel and bias of both layers.
-Layers = Sequence[tuple[Float[Array, "_ width"], Float[Array, " width"]]]
+Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
 
 def supports(layers: Layers, activation: str) -> bool:
