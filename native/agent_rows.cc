@@ -52,6 +52,7 @@ EACH_TARGET(void observe_agents(const AgentRows& arguments, int64_t first, int64
 
 #ifdef TARGET
 
+#include "order.h"
 #include "overlap.h"
 #include "route.h"
 #include "view.h"
@@ -97,7 +98,7 @@ struct Path {
   const float* route;   // [points, 7]
   int64_t next;         // elements from one point to the next
   int64_t begin, end;   // places that are on the route
-  int32_t number_mask;  // bits that hold the number of a place
+  int number_bits;      // that hold the number of a place
   const AgentScratch* scratch;
 };
 
@@ -113,7 +114,7 @@ INLINE Path read_path(const AgentRows& a, int64_t sample, const AgentScratch& sc
   Path path = {a.routes + number * a.points * kRouteColumns, a.points > 1 ? kRouteColumns : 0};
   path.begin = a.offsets;
   path.scratch = &scratch;
-  while (path.number_mask < a.offsets - 1) path.number_mask = 2 * path.number_mask + 1;
+  path.number_bits = bits_for(a.offsets);
   for (int64_t i = 0; i < a.offsets; i += LANES) {
     const Floats along = a.route_m[sample] + load_first(a.offsets_m + i, a.offsets - i), at = larger(along, Floats{});
     const Ints low = as_ints(smaller(at, splat((float)last)));
@@ -135,13 +136,13 @@ INLINE Path read_path(const AgentRows& a, int64_t sample, const AgentScratch& sc
 
 // Numbers of the places that are nearest to agents; of nearly equal distances the first, as in bank/smallest.py.
 INLINE Ints nearest_place(const Path& path, Floats x, Floats y) {
-  Floats smallest_key = (Floats)((Ints)splat(1e30f) & ~path.number_mask);
+  Floats smallest_key = splat(kInfinity);
   for (int64_t i = path.begin; i < path.end; ++i) {
     const Floats dx = x - path.scratch->xy[2 * i], dy = y - path.scratch->xy[2 * i + 1];
-    const Floats distance = smaller(dx * dx + dy * dy, splat(1e30f)) + 1e-6f;
-    smallest_key = smaller(smallest_key, (Floats)(((Ints)distance & ~path.number_mask) | (int32_t)i));
+    const Floats key = embed_numbers(comparable(dx * dx + dy * dy), splat((int32_t)i), path.number_bits);
+    smallest_key = smaller(smallest_key, key);
   }
-  return (Ints)smallest_key & path.number_mask;
+  return pattern(smallest_key) & ((1 << path.number_bits) - 1);
 }
 
 // A vector of agents.

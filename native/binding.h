@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
+#include <thread>
 #include <type_traits>
 #include <vector>
 
@@ -45,12 +46,6 @@ struct Name {
   XLA_FFI_DEFINE_HANDLER_SYMBOL(drivax_##name, function, ffi::Ffi::Bind() __VA_ARGS__); \
   _Pragma("GCC visibility pop")
 
-// Number of samples in a batch, from an array and the size of one sample.
-template <typename Buffer>
-int64_t batch_of(const Buffer& buffer, int64_t sample) {
-  return sample ? buffer.element_count() / sample : 0;
-}
-
 // Size of an axis that is counted from the last, which is 1.
 template <typename Buffer>
 int64_t axis_from_last(const Buffer& buffer, int number) {
@@ -78,8 +73,7 @@ void divide(ffi::ThreadPool& pool, int64_t count, int64_t part, const Function& 
   };
   for (int64_t i = 0; i < helpers; ++i) pool.Schedule(std::decay_t<decltype(run)>(run));
   run();
-  while (work->done.load() < parts) {
-  }
+  while (work->done.load() < parts) std::this_thread::yield();
 }
 
 }  // namespace drivax

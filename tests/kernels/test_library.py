@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import pytest
 
 from drivax import kernels
-from kernels.compare import needs_kernels
+from drivax.networks.encoders import max_pool
+from kernels.compare import needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -43,10 +44,16 @@ def test_the_target_can_be_lowered():
 
 @needs_kernels
 def test_kernels_are_not_traced_where_they_are_excluded():
-    assert kernels.in_use()
+    layers = [(jnp.ones((3, 32)), jnp.zeros(32)), (jnp.ones((32, 32)), jnp.zeros(32))]
+    rows, valid = jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)
+
+    def program():
+        return jax.jit(lambda: max_pool("relu", layers, rows, valid)).lower().as_text()
+
+    assert "drivax_encode_sets" in program()
     with kernels.without_kernels():
-        assert not kernels.in_use()
-    assert kernels.in_use()
+        assert "drivax_encode_sets" not in program()
+    assert "drivax_encode_sets" in program()
 
 
 DIVIDE = """
@@ -92,28 +99,9 @@ def test_sanitizers_find_no_error_in_the_kernels(repository, tmp_path):
     built = tmp_path / "libdrivax.so"
     command = [sys.executable, str(repository / "native" / "build.py"), "--sanitize", "--out", str(built)]
     subprocess.run(command, check=True)
-    runtime = subprocess.run(
-        ["c++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True
-    )
-    environment = os.environ | {
-        "LD_PRELOAD": runtime.stdout.strip(), "ASAN_OPTIONS": "detect_leaks=0", "DRIVAX_NATIVE_LIBRARY": str(built),
-    }  # fmt: skip
-    tests = repository / "tests" / "kernels"
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "-k",
-        "not sanitizers",
+    paths = [f"-print-file-name={name}.so" for name in ("libasan", "libubsan", "libstdc++")]
+    runtimes = [
+        subprocess.check_output([os.environ.get("CXX", "c++"), path], text=True).strip() for path in paths
     ]
-    done = subprocess.run(
-        [*command, str(tests)], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    assert "passed" in done.stdout
+    variables = {"LD_PRELOAD": ":".join(runtimes), "ASAN_OPTIONS": "detect_leaks=0"}
+    run_tests(repository / "tests" / "kernels", DRIVAX_NATIVE_LIBRARY=str(built), **variables)

@@ -99,7 +99,7 @@ def test_no_start_collides_or_is_off_the_road():
 
 
 def test_episode_starts_as_logged_when_every_draw_fails():
-    # 0.5 m behind a car, and 0.1 m beside a column.
+    # Ego is 0.5 m behind a car and 0.1 m beside a column of cars.
     beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
     bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
     strong = Simulator(Task(), start=NoisyStart(strong=1.0))

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
+from jax.custom_batching import custom_vmap, sequential_vmap
 from jax.sharding import AxisType, PartitionSpec
 
 #: ``make native`` and the wheels for Linux on x86-64 put it here; tests build others.
@@ -128,31 +128,17 @@ def call(
 
     @run.def_vmap
     def run_batch(size: int, is_batched: Any, common: Any, batched: Any) -> tuple[list[Any], list[bool]]:
-        is_common_batched, is_batched = is_batched
         outputs = [True] * len(results)
-        if any(is_common_batched):
-            return _loop(run, (common, batched), (is_common_batched, is_batched)), outputs
+        if any(is_batched[0]):
+            in_axes = tuple([0 if flag else None for flag in flags] for flags in is_batched)
+            return jax.vmap(sequential_vmap(run), in_axes)(common, batched), outputs
         batched = [
             value if is_array_batched else jnp.broadcast_to(value, (size, *value.shape))
-            for value, is_array_batched in zip(batched, is_batched, strict=True)
+            for value, is_array_batched in zip(batched, is_batched[1], strict=True)
         ]
         return call(kernel, results, common, batched, axes + 1, attributes), outputs
 
     return run(list(common), list(batched))
-
-
-def _loop(function: Any, arguments: Any, is_batched: Any) -> Any:
-    """Call a function once for each index of the batched arguments' first axis."""
-    leaves, structure = jax.tree.flatten(arguments)
-    flags = jax.tree.leaves(is_batched)
-
-    def at_index(slices: list[Any]) -> Any:
-        rest = iter(slices)
-        return function(*jax.tree.unflatten(structure, [
-            next(rest) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)
-        ]))  # fmt: skip
-
-    return jax.lax.map(at_index, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
 
 
 def _divide(function: Any, lead: tuple[int, ...]) -> Any:

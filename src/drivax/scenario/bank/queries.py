@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import kernels
 from drivax.geometry.vectors import norm, root
 from drivax.kernels import roads
 from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn, StrandColumn
@@ -333,10 +334,10 @@ def offroad_distance(
     Without an edge within the cut-off the stored side decides, and if that is unknown, whether a lane centre is near;
     the distance is then plus or minus the cut-off.
     """
-    arguments = bank, index, centre, points, points_near_lane, z
+    query = _xla_offroad_distance
     if roads.supports(_edge_grid(bank), points, centre, z):
-        return _native_offroad_distance(*arguments)
-    return _xla_offroad_distance(*arguments)
+        query = kernels.with_reference(_native_offroad_distance, query)
+    return query(bank, index, centre, points, points_near_lane, z)
 
 
 def _xla_offroad_distance(
@@ -352,21 +353,15 @@ def _xla_offroad_distance(
     return jnp.where(is_known, distance, jnp.where(points_near_lane, -EDGE_CUTOFF_M, EDGE_CUTOFF_M))
 
 
-@jax.custom_jvp
 def _native_offroad_distance(
     bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "4 2"],
     points_near_lane: Bool[Array, "4"], z: Scalar,
 ) -> Float[Array, "4"]:  # fmt: skip
-    """Return :func:`offroad_distance` by the native kernel; derivatives are those of XLA."""
+    """Return :func:`offroad_distance` by the native kernel."""
     return roads.query_edges(
         _edge_grid(bank), bank.grid_side, jnp.asarray(index, jnp.int32), centre, points, points_near_lane, z,
         _EDGE_RULES,
     )  # fmt: skip
-
-
-@_native_offroad_distance.defjvp
-def _differentiate_offroad_distance(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return jax.jvp(_xla_offroad_distance, primals, tangents)
 
 
 def _edge_grid(bank: ScenarioBank) -> roads.SegmentGrid:
