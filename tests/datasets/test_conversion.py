@@ -234,11 +234,18 @@ def drivax_process(*call, **options):
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
 
 
+def fill_with_shards(folder, record, count):
+    """``count`` names of one file that has the record 300 times, and nothing else in the folder."""
+    folder.mkdir()
+    (folder / "0.tfrecord").write_bytes(record.read_bytes() * 300)
+    record.unlink()
+    for number in range(1, count):
+        os.link(folder / "0.tfrecord", folder / f"{number}.tfrecord")
+
+
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds child processes in /proc")
 def test_interrupt_that_reaches_workers_first_is_an_interrupt(wire, write_records, tmp_path):
-    shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
-    (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
-    (tmp_path / "src" / "1.tfrecord").write_bytes(shard)
+    fill_with_shards(tmp_path / "src", write_records("record", wire.scenario()), 2)
     process = drivax_process("convert", tmp_path / "src", tmp_path / "set", "--workers", 2)
     workers, deadline = [], time.monotonic() + 30
     while len(workers) < 2 and time.monotonic() < deadline:
@@ -257,10 +264,7 @@ def test_interrupt_that_reaches_workers_first_is_an_interrupt(wire, write_record
 
 def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     """Ctrl-C on a terminal reaches the whole process group, workers included."""
-    shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
-    (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
-    for name in "123":
-        os.link(tmp_path / "src" / "0.tfrecord", tmp_path / "src" / f"{name}.tfrecord")
+    fill_with_shards(tmp_path / "src", write_records("record", wire.scenario()), 4)
     process = drivax_process(
         "convert", tmp_path / "src", tmp_path / "set", "--workers", 2, start_new_session=True
     )
@@ -278,9 +282,7 @@ def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signal_to_the_process_leaves_nothing(wire, write_records, tmp_path, number):
     """A batch system or a closed terminal sends it; workers get none and stop with their parent."""
-    shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
-    for name in "01":
-        (tmp_path / "src" / f"{name}.tfrecord").write_bytes(shard)
+    fill_with_shards(tmp_path / "src", write_records("record", wire.scenario()), 16)
     process = drivax_process("convert", tmp_path / "src", tmp_path / "new" / "set", "--workers", 2)
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("new/.set.partial/spool-*/*")) and time.monotonic() < deadline:
