@@ -175,7 +175,7 @@ def test_scenario_sets_are_referred_to_inspect(tmp_path, capsys):
         ({"dataset_summary.pkl": "x", "dataset_mapping.pkl": "x"}, "without its scenarios"),
         ({"maps/a/map.gpkg": "x", "maps/nuplan-maps-v1.0.json": "{}"}, "maps of nuPlan without logs"),
         ({"readme.md": "hello"}, "none of the 1 files in it is of a known format"),
-        ({}, "none of the 0 files"),
+        ({}, "has no files"),
     ],
 )
 def test_folders_without_recordings(files, words, tmp_path, capsys):

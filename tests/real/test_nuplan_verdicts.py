@@ -14,6 +14,8 @@ from drivax.scenario.schema import DT_S, AgentKind
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 FILE = Path(os.environ.get("DRIVAX_NUPLAN_VERDICTS", SHARED / "nuplan_metrics" / "verdicts.json.gz"))
+SCENES = FILE.parent / "scenes"
+needs_scenes = pytest.mark.skipif(not SCENES.is_dir(), reason=f"{SCENES} is not there")
 pytestmark = pytest.mark.skipif(not FILE.is_file(), reason=f"{FILE} is not there")
 KINDS = {
     "vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST,
@@ -96,7 +98,7 @@ def test_nuplan_verdicts_are_reproduced(scene):
 
 def scene_states(name):
     """Ego's states, box and neighbours of one of the devkit's own scenes; poses are of the rear axle."""
-    scene = json.loads((SHARED / "nuplan_metrics" / "scenes" / name).with_suffix(".json").read_text())
+    scene = json.loads((SCENES / name).with_suffix(".json").read_text())
     states = [scene["ego"], *scene.get("ego_future_states", [])]
     pose = np.array([state["pose"] for state in states])
     time_s = np.array([state["time_us"] for state in states]) / 1e6
@@ -132,6 +134,7 @@ def scene_states(name):
     return ego, tracks, scene["expected"]
 
 
+@needs_scenes
 @pytest.mark.parametrize(
     ("name", "series"),
     [
@@ -148,6 +151,7 @@ def test_series_of_the_devkits_own_scenes_are_reproduced(name, series):
     np.testing.assert_allclose(np.round(values, 2), expected["time_series"]["values"], atol=1e-3)
 
 
+@needs_scenes
 @pytest.mark.parametrize(
     ("name", "faults"),
     [
@@ -164,6 +168,7 @@ def test_faults_of_the_devkits_own_scenes_are_reproduced(name, faults):
     assert (verdict.fault_score == 1.0) == expected["statistics"][0][1]
 
 
+@needs_scenes
 @pytest.mark.parametrize("name", ["ego_stopped", "in_collision", "no_relevant_tracks"])
 def test_times_to_collision_of_the_devkits_own_scenes_are_reproduced(name):
     ego, tracks, expected = scene_states(f"time_to_collision_within_bound/{name}")

@@ -124,9 +124,11 @@ def test_at_most_three_panes_in_a_row():
 
     scenario = make_scenario(0)
     drives = [Rollout(f"planner {i}", logged_motion(scenario), 10, {}, "success") for i in range(5)]
-    sizes = [next(frames(scenario, drives[:count])).shape for count in (1, 2, 4, 5)]
+    pictures = [next(frames(scenario, drives[:count])) for count in (1, 2, 4, 5)]
+    sizes = [picture.shape for picture in pictures]
     assert [size[1] for size in sizes] == [720, 960, 960, 1440], "at most three side by side"
     assert 480 < sizes[1][0] < 600 and 960 < sizes[2][0] < 1100 and all(size[0] % 2 == 0 for size in sizes)
+    assert close(pictures[-1][480:960, 960:], "ground").all(), "the place of a sixth planner is empty"
 
 
 def test_file_names_have_rank_and_scenario(tmp_path):

@@ -117,7 +117,7 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     present: dict[str, Any] = {} if method.config is None else plain(config)
     if method.config is not None:
         try:
-            config_of_table |= _with_present_names(config_of_table, config, present)
+            config_of_table |= _rename_fields(config_of_table, config, present)
         except UsageError as error:
             raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
     if table.components:
@@ -128,11 +128,11 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
             raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
-def _with_present_names(former: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
-    """Return the settings ``names`` among ``former`` ones with the present names of their fields."""
-    values = {name: former[name] for name in names if name in former}
-    present = plain(settings.load(type(config), values, trust=()))
-    return {name: value for name, value in present.items() if name in former}
+def _rename_fields(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
+    """Return the stored settings of a table that are in ``names``; former names of their fields become today's."""
+    values = {name: stored[name] for name in names if name in stored}
+    renamed = plain(settings.load(type(config), values, trust=()))
+    return {name: value for name, value in renamed.items() if name in stored}
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:

@@ -160,12 +160,12 @@ def _is_visible_file(path: Path, folder: Path) -> bool:
     return not any(part.startswith(".") for part in path.relative_to(folder).parts) and path.is_file()
 
 
-def _no_input_error(folder: Path, files: int, readers: tuple[Reader, ...]) -> DataError:
-    """Return the error for a folder with ``files`` files of which none can be read."""
+def _no_input_error(folder: Path, count: int, readers: tuple[Reader, ...]) -> DataError:
+    """Return the error for a folder of ``count`` files, none of which can be read."""
     names = ", ".join(reader.name for reader in readers)
     kind = f"of the format {names}" if len(readers) == 1 else f"of a known format ({names})"
     return unsupported.explain_folder(folder) or DataError(
-        f"none of the {files} files in it is {kind}",
+        f"none of the {count} files in it is {kind}" if count else "has no files",
         file=folder,
-        cure="name the folder that holds the downloaded data; drivax doctor tells more",
+        cure="name the folder that holds the downloaded data",
     )

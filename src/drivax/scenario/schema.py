@@ -352,5 +352,10 @@ class Scenario:
         """Flags of the scenario."""
         return Flag(int(self.record["flags"]))
 
+    @property
+    def has_stop(self) -> Bool[np.ndarray, " sign"]:
+        """Slots of stop signs that are in use: others have no lane and lie at the origin."""
+        return (self.stop_xy != 0).any(axis=1) | (self.stop_lane >= 0).any(axis=1)
+
 
 _OWN_FIELDS = {f.name for f in fields(Scenario)}

@@ -160,7 +160,7 @@ def _links(scenario: Scenario, lane: int) -> dict[str, Any]:
 
 def _stop_signs(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
     """Return stop signs, at the height of the nearest segment."""
-    rows = np.flatnonzero((scenario.stop_xy != 0).any(axis=1) | (scenario.stop_lane >= 0).any(axis=1))
+    rows = np.flatnonzero(scenario.has_stop)
     points = scenario.segment_a[: int(scenario.segment_blocks[3])].astype(np.float64)
     signs = []
     for row in rows:

@@ -74,11 +74,10 @@ class Database:
         return frozenset(str(name) for (name,) in names)
 
     def columns(self, table: str) -> frozenset[str]:
-        """Return the names of a table's columns, none for a missing table or a view."""
-        is_table = (
-            "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
-        )
-        if not self.rows(is_table, (table,)):
+        """Return the names of a table's columns; none for a missing table, a view or a virtual table."""
+        # Virtual tables have the type 'table', too, but run the code of their module.
+        query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
+        if not self.rows(query, (table,)):
             return frozenset()
         names = self.rows("SELECT name FROM pragma_table_info(?)", (table,))
         return frozenset(str(name) for (name,) in names)

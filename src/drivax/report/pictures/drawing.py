@@ -149,7 +149,7 @@ class Drawing:
     @classmethod
     def of(cls, scenario: Scenario, box: Box) -> Drawing:
         """Return the drawing of a scenario within a box (low x, low y, high x, high y)."""
-        signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
+        signs = scenario.stop_xy[scenario.has_stop]
         line, state = _lights(scenario)
         is_near = _within(line[:, 0], box)
         route = scenario.route_xy[0, : int(scenario.route_points[0])]

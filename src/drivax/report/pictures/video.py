@@ -122,19 +122,20 @@ def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light"
     rows = math.ceil(len(rollouts) / _MAX_COLUMNS)
     columns = math.ceil(len(rollouts) / rows)
     legend, dt_s = legend_strip(columns * side, theme), float(scenario.dt_s)
+    canvas.clear()
+    empty = canvas.pixels()
     for step in range(min(rollout.start for rollout in rollouts), int(scenario.steps)):
         pairs = zip(sceneries, rollouts, strict=True)
         panes = [draw_frame(scenery, rollout, step, dt_s) for scenery, rollout in pairs]
         if columns > 1:
             for pane in panes:
                 pane[:, -1, :3] = rgb(canvas.colours["lane"])
-        yield np.concatenate((_tile(panes, columns), legend))
+        yield np.concatenate((_tile(panes, columns, empty), legend))
 
 
-def _tile(panes: Sequence[Picture], columns: int) -> Picture:
-    """Arrange pictures of one size in rows, and pad the last row with empty pictures."""
-    blank = np.full_like(panes[0], panes[0][-1, -1])
-    padded = [*panes, *[blank] * (-len(panes) % columns)]
+def _tile(panes: Sequence[Picture], columns: int, empty: Picture) -> Picture:
+    """Arrange pictures of one size in rows, and pad the last row with the picture ``empty``."""
+    padded = [*panes, *[empty] * (-len(panes) % columns)]
     rows = [np.concatenate(padded[i : i + columns], axis=1) for i in range(0, len(padded), columns)]
     return np.concatenate(rows)
 

@@ -348,7 +348,11 @@ class LaneSegments:
         return LaneSegments(self.graph, self.segments.take(rows), self.lane[rows], self.heading[rows])
 
     def _measure(self, xyz: Array, heading: Array, reach_m: float, turn_rad: float) -> tuple[Array, Array]:
-        """Distance (infinite if reach, turn or level exclude it) and arc length of every pose on every segment."""
+        """Distance and arc length of every pose on every segment.
+
+        The distance is infinite if turn or level exclude the segment or it begins outside the box of the pose, whose
+        half side is ``reach_m + LONGEST_M``: callers compare it with ``reach_m``.
+        """
         segments, most = self.segments, reach_m + LONGEST_M
         shape = (len(xyz), len(segments))
         distance, s = np.full(shape, np.inf), np.zeros(shape)
