@@ -337,7 +337,7 @@ def test_policies_of_useless_settings_are_one_line(folder, data):
     run = write_stranger(
         folder / "run", {"algorithm": {"kind": "ppo", "network": {"encoder": {"hidden": [-1]}}}}
     )
-    with pytest.raises(DataError, match=r"config\.yaml: makes no policy"):
+    with pytest.raises(UsageError, match=r"config\.yaml: .* hidden has a layer of width -1"):
         load_policy(run, drivax.load(data.path).bank)
 
 

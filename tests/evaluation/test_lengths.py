@@ -133,7 +133,7 @@ def test_a_planner_cannot_crash_after_the_end_of_the_log(logs):
 def test_starts_after_the_end_of_the_log_are_refused(logs):
     padded, _, long = logs
     for step, counted in ((SHORT - 1, "2 of 3"), (60, "2 of 3")):
-        with pytest.raises(UsageError, match=rf"not in the log at step {step} in {counted}"):
+        with pytest.raises(UsageError, match=rf"no action after step {step} in {counted}"):
             evaluate(Expert(), [*padded, long[0]], task=TASK, start_step=step)
     assert len(evaluate(Expert(), padded, task=TASK, start_step=SHORT - 2)) == 2
     with pytest.raises(UsageError, match="use 0 to 43"):

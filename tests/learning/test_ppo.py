@@ -232,20 +232,15 @@ def test_settings_of_rate_and_norm_reach_the_optimisers(last):
 def test_updates_are_skipped_beyond_the_target_divergence():
     """At a huge learning rate the first of four updates moves the policy far; the others do not happen."""
     states, shares = {}, {}
-    for name, target in (("none", None), ("far", 1e9), ("near", 1e-3), ("never", -1.0)):
+    for name, target in (("none", None), ("far", 1e9), ("near", 1e-3)):
         config = replace(CONFIG, learning_rate=0.1, target_kl=target)
         learner = config.build(Pendulum(), (), 1)
-        first = learner.init((), jax.random.key(0))
-        states[name], logs = jax.jit(learner.iterate)((), first)
+        states[name], logs = jax.jit(learner.iterate)((), learner.init((), jax.random.key(0)))
         shares[name] = float(logs.get("loss/skipped_share", -1.0))
-    assert shares == {"none": -1.0, "far": 0.0, "near": 0.75, "never": 1.0}
+    assert shares == {"none": -1.0, "far": 0.0, "near": 0.75}
     same = [jax.tree.leaves(states[name].parameters) for name in ("none", "far")]
     for left, right in zip(*same, strict=True):
         np.testing.assert_allclose(left, right, rtol=1e-5, atol=1e-6)
-    for left, right in zip(
-        *map(jax.tree.leaves, (states["never"].parameters, first.parameters)), strict=True
-    ):
-        np.testing.assert_array_equal(left, right)
     assert int(states["near"].optimiser[1][0].count) == 1 and int(states["far"].optimiser[1][0].count) == 4
 
 

@@ -218,5 +218,5 @@ def test_impossible_settings_are_refused():
             replace(CONFIG, demonstrations=share)
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
-    with pytest.raises(UsageError, match=r"raise replay\.capacity"):
+    with pytest.raises(UsageError, match=r"set replay\.capacity to 400"):
         SacConfig(network=NETWORK, environments=4, unroll=100, replay=ReplayConfig(100))

@@ -436,9 +436,12 @@ try:
     checkpoints._save_arrays(path / "failed", arrays)
 except Exception as error:
     print(type(error).__name__)
-logging.getLogger("absl").error("of a late thread")
+loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+for logger in loggers:
+    logger.error("of a late thread")
 time.sleep(checkpoints._LATE_S + 0.5)
-print(logging.getLogger("absl").level < logging.CRITICAL, sys.unraisablehook is sys.__unraisablehook__)
+restored = all(logger.level < logging.CRITICAL for logger in loggers)
+print(restored, sys.unraisablehook is sys.__unraisablehook__)
 """
 
 

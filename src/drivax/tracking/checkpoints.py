@@ -349,20 +349,22 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 
 @contextlib.contextmanager
 def _silence_writers() -> Iterator[None]:
-    """Raise the first error of a write alone: Orbax logs it too, and TensorStore prints one for each array."""
-    logger, report = logging.getLogger("absl"), sys.unraisablehook
-    level = logger.level
+    """Raise the first error of a write alone: Orbax and asyncio log it too, and TensorStore prints each array's."""
+    loggers, report = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
+    levels = [logger.level for logger in loggers]
 
     def report_other(lost: sys.UnraisableHookArgs) -> None:
         if str(lost.exc_value) != "Event loop is closed":
             report(lost)
 
     def restore() -> None:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
         if sys.unraisablehook is report_other:
             sys.unraisablehook = report
 
-    logger.setLevel(logging.CRITICAL)
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
     sys.unraisablehook = report_other
     try:
         yield
