@@ -46,6 +46,17 @@ def test_total_may_become_known():
     assert stream.getvalue() == "x: 5 of 10 files (50 %), 0.5/s, 10.0 s left\n"
 
 
+def test_work_of_earlier_runs_does_not_count_in_the_rate():
+    clock, stream = Clock(), io.StringIO()
+    with Progress("training", "steps", 1000, done=900, stream=stream, clock=clock) as progress:
+        clock.now = 10.0
+        progress.update(950)
+    assert stream.getvalue().splitlines() == [
+        "training: 950 of 1,000 steps (95 %), 5/s, 10.0 s left",
+        "training: 950 steps in 10.0 s, 5/s",
+    ]
+
+
 def test_bar_on_a_terminal():
     class Terminal(io.StringIO):
         def isatty(self) -> bool:

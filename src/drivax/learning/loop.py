@@ -318,8 +318,8 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
-        with Progress("training", "steps", self._steps(config.iterations)) as progress, StopSignal() as stop:
-            progress.update(self._steps(done))
+        total, before = self._steps(config.iterations), self._steps(done)
+        with Progress("training", "steps", total, done=before) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
                 if all(log.stopped for log in self.logs):
                     break

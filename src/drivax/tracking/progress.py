@@ -21,17 +21,18 @@ class Progress:
         work: Name of the work ("converting").
         unit: Counted unit ("scenarios").
         total: Final count; None if unknown.
+        done: Count that earlier runs have done, which is no part of the rate.
         stream: Text file to write to; standard error by default, so that standard output contains only results.
         interval_s: Seconds between two lines if ``stream`` is not a terminal.
         clock: Returns the time in seconds.
     """
 
     def __init__(
-        self, work: str, unit: str, total: int | None = None, *, stream: Any = None,
+        self, work: str, unit: str, total: int | None = None, *, done: int = 0, stream: Any = None,
         interval_s: float = INTERVAL_S, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self.work, self.unit, self.total = escape_controls(work), unit, total
-        self.done = 0
+        self.done = self._done_before = done
         self._stream = sys.stderr if stream is None else stream
         self._interval_s, self._clock = interval_s, clock
         self._start = self._last = clock()
@@ -69,7 +70,7 @@ class Progress:
 
     def rate(self) -> float:
         """Return the rate per second since the start."""
-        return self.done / max(self._clock() - self._start, 1e-9)
+        return (self.done - self._done_before) / max(self._clock() - self._start, 1e-9)
 
     def line(self, note: str = "") -> str:
         """Return the progress as one line."""
@@ -98,7 +99,7 @@ class Progress:
         description, rate, note = map(partial(TextColumn, markup=False), formats)
         columns = (description, BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), note)
         self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
-        self._task = self._bar.add_task(self.work, total=self.total, rate="", note="")
+        self._task = self._bar.add_task(self.work, total=self.total, completed=self.done, rate="", note="")
         self._bar.start()
 
 
