@@ -125,6 +125,9 @@ MEASUREMENTS: dict[str, Repeated | Command] = {
         warm_up=3,
         kernels_goal="2.0 x (3 x)",
     ),
+    "offline training (CQL)": Repeated(
+        "steps/s", _TRAINING + "call = trainer('offline/cql')", "", kernels_goal="2.0 x (3 x)"
+    ),
     "simulator, full, log": Repeated(
         "steps/s",
         """

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 import types
+from multiprocessing import resource_tracker, synchronize
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +257,27 @@ def test_signals_wait_until_orbax_has_closed_its_event_loop():
         time.sleep(5)
         raise AssertionError("SIGTERM was lost")
     assert events == ["read"]
+
+
+def test_signals_wait_until_a_removed_semaphore_is_forgotten(monkeypatch):
+    """Else Python's process that removes semaphores warns of a leaked one."""
+    unlink, unregister, forgotten = synchronize.sem_unlink, resource_tracker.unregister, []
+
+    def unlink_and_stop(name):
+        unlink(name)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def note(name, kind):
+        unregister(name, kind)
+        forgotten.append(kind)
+
+    monkeypatch.setattr(synchronize, "sem_unlink", unlink_and_stop)
+    monkeypatch.setattr(resource_tracker, "unregister", note)
+    with pytest.raises(cli.Stopped), cli._stop_at_signals():
+        multiprocessing.get_context("spawn").Lock()
+        time.sleep(5)
+        raise AssertionError("SIGTERM was lost")
+    assert forgotten == ["semaphore"]
 
 
 def test_import_that_never_ends_is_interrupted(tmp_path, monkeypatch):

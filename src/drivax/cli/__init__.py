@@ -56,7 +56,8 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 _COLUMNS = 100
 #: Ends of the paths of Python files whose functions no exception may interrupt.
 _BAD_MOMENTS = (
-    "<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py", "orbax/checkpoint/_src/asyncio_utils.py",
+    "<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py", "multiprocessing/resource_tracker.py",
+    "multiprocessing/synchronize.py", "orbax/checkpoint/_src/asyncio_utils.py",
 )  # fmt: skip
 #: Delay until a signal that came at a bad moment is sent again, and time after which it is obeyed at any moment, s.
 _RESEND_S, _PATIENCE_S = 0.01, 10.0
@@ -166,8 +167,9 @@ class _SignalHandler:
     """Raises :class:`Stopped`, or KeyboardInterrupt at Ctrl-C, when an exception does no harm.
 
     A signal waits until an import is done, because modules of C++ crash when an exception interrupts their
-    initialisation, until a worker process has its arguments, and until Orbax has closed an event loop, which would
-    print errors of its own; but not longer than 10 s.
+    initialisation, until a worker process has its arguments, until a semaphore is created and known to Python's
+    process that removes them, or removed and forgotten there, and until Orbax has closed an event loop; those two would
+    print errors of their own. It waits 10 s at most.
     """
 
     def __init__(self, signals: Sequence[signal.Signals]) -> None:
