@@ -36,8 +36,8 @@ from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, traini
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
-    "validation": ("was validated on other scenarios", "--validation"),
-    "weights": ("was trained with other weights", "weights"),
+    "validation": ("was validated on other scenarios or none", "--validation"),
+    "weights": ("was trained with other weights or none", "weights"),
     "data": ("was trained on other scenarios", "--data"),
 }
 
@@ -94,11 +94,12 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms and ``sac`` with
+        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms, and ``sac`` and ``bc_sac`` with
             ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
         out: Run folder.
-        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
-            of its scenarios (at most 256). None trains on all scenarios without validation.
+        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
+            its scenarios (and 256), else the smallest recording; none of a set of one recording. None trains on all
+            scenarios without validation.
         options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
     Raises:

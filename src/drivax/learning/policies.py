@@ -44,7 +44,9 @@ def open_policy(run: str | Path) -> RunFolder:
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+        # A process that was killed at its start may not have created any.
+        cure = f"name one, as {inside[0]}" if inside else "continue the training with --resume"
+        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=cure)
     return folder
 
 
@@ -101,7 +103,7 @@ def export_policy(
     commit and hashes of data sets. Only the command, and a run named as ``traffic``, may contain paths of the machine.
 
     Args:
-        run: As for :func:`load_policy`, with its errors.
+        run: As for :func:`load_policy`, with its errors; the traffic of its training must still exist.
         out: Folder to write; its name is that of the policy.
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.

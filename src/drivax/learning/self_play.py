@@ -135,7 +135,7 @@ class SelfPlay(Driving):
     def _slots(
         self, bank: ScenarioBank, index: Array, step: Array, key: Array
     ) -> tuple[Int[Array, " K"], Array]:
-        """Return the slots of ego and of random further egos whose log has two more steps, then padding; and keys."""
+        """Return the slots of ego and of random further egos in the log for two more steps, then padding; and keys."""
         padding, further = bank.agents.shape[2], bank.egos[index, 1:]
         rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
         present = bank.agents[index, step, further, AgentColumn.VALID] > 0

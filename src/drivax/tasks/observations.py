@@ -41,9 +41,10 @@ from drivax.tasks.perception import (
 
 #: Block size of :func:`running_count`.
 _BLOCK = 8
-#: Stop lines further behind ego than this are omitted, m. Added to the distance of lights off the route, m.
+#: Stop lines that ego is past by more than this, in the direction of their lane, are omitted, m. Added to the distance
+#: of lights off the route, m.
 _BEHIND_M, _OFF_ROUTE_M = 5.0, 1e4
-#: Agent kinds in the order of the columns of ``type``.
+#: Agent kinds in the order of the columns of ``type``, which are all 0 for ``AgentKind.STATIC``.
 _TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
 Observation = dict[str, Array]
 #: Names of the groups of this module.

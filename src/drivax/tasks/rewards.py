@@ -95,7 +95,7 @@ def _event_term(name: str, fact: str) -> None:
 
 @reward_term("collision", option="collision_margin_m")
 def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_m: float = 0.0) -> Scalar:
-    """1 while the agent touches another, or is closer than the margin."""
+    """1 while the agent touches another, or is closer than the margin; ignored overlaps do not count."""
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
