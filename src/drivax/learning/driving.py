@@ -283,7 +283,7 @@ class Driving:
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """Return the expert's action within bounds and rates (``route``: bounds), and whether it exceeded the bounds."""
+        """Return the expert's action within bounds and rates (``route``: bounds), and whether it exceeded bounds."""
         space = self.task.actions
         action = expert_action(bank, context, space)
         # In the space ``route`` the executed action is another one than that which a policy requests.
