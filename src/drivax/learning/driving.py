@@ -199,7 +199,8 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        At a step where the ego is not valid, step 10 is taken instead.
+        At a step where the ego is not valid, step 10 is taken instead. A later motion that the log lacks counts as the
+        present one; :meth:`expert_steps` leaves such steps out.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:

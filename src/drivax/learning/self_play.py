@@ -64,7 +64,7 @@ class SelfPlay(Driving):
         groups = round(self.config.past * (count // size))
         if self.config.past and not groups:
             problem = f"self_play.past is {self.config.past:g} of {count // size} groups: none"
-            raise UsageError(problem, cure="raise it, or algorithm.environments")
+            raise UsageError(problem, cure="raise it, or environments")
         is_past = (number // size < groups) & (number % size > 0)
         return PastPolicy(np.flatnonzero(is_past), self.config.refresh)
 

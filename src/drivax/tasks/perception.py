@@ -115,8 +115,8 @@ def in_view(
 ) -> Bool[Array, " S"]:
     """Return a mask of the agents whose centre or a corner is visible from a point.
 
-    Boxes in ``blocks`` occlude lines of sight through their interior, but not along their sides. No box occludes
-    itself, and a box around the eye occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
+    Boxes in ``blocks`` occlude lines of sight through their interior. No box occludes itself, and a box around the eye
+    occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
     dx, dy = eye[0] - box[:, X], eye[1] - box[:, Y]
     along, across = dx * box[:, COS] + dy * box[:, SIN], dy * box[:, COS] - dx * box[:, SIN]

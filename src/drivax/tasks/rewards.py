@@ -204,15 +204,15 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane that ends, or joins
-# the new lane, within 100 m (``scenario.bank.queries.lane_passage``).
+# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane which, within 100 m,
+# ends or joins the new lane (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
 
 @reward_term("late_m", "early_m", softened=True)
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
-    """Adherence to the log's schedule along the route, in [0, 1].
+    """Adherence to the log's schedule along the route, or along the log's path without one, in [0, 1].
 
     1 between the log's present position and that a second later. Behind, 1 / (1 + late / 2 m), which rewards catching
     up from any distance; ahead, exp(-early / 8 m) after the first metre.
