@@ -23,6 +23,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
@@ -97,8 +98,8 @@ class Driving:
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""
-        # Starts change no shape; the logged start is the fastest to trace.
-        simulator = replace(self.simulator, start=LogStart())
+        # Traffic and start change no shape; those of the log need no prepared bank.
+        simulator = replace(self.simulator, traffic=LogTraffic(), start=LogStart())
         observation = jax.eval_shape(
             lambda bank: simulator.observe(bank, simulator.context(bank, 0, CURRENT_STEP)), data
         )
