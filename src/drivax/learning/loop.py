@@ -104,7 +104,8 @@ def train(
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
-        DataError: The run to fine-tune is not a training run, its networks do not fit, or no checkpoint can be read.
+        DataError: No logged step is usable, the run to fine-tune is not a training run, its networks do not fit, or no
+            checkpoint can be read.
         DivergenceError: Rewards, losses, parameters or actions of a seed are not finite; other seeds were trained.
         DrivaxError: Memory ran out.
         Preempted: SIGTERM stopped it, after a checkpoint.

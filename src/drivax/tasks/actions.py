@@ -100,7 +100,7 @@ class Physical:
         return self._curvature(jnp.asarray(self.steering), length_m)
 
     def first(self, history: History, length_m: Any) -> Vector:
-        """Return the last action at the start of an episode: zero, or with actuator rates that of the history."""
+        """Return the last action at the start of an episode: zero, or with rates that of the history's last step."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
         command = command_between(history[-2], history[-1])
