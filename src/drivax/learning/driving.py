@@ -313,7 +313,7 @@ def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
 
 
 def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:
-    """Return ``function(bank, index, step, slot, ...)`` of one drawn agent, with slot 0 for None."""
+    """Return ``function`` with its first argument bound to the bank; a slot of None becomes 0."""
 
     def call(index: Array, step: Array, slot: Any, *rest: Array) -> Any:
         return function(bank, index, step, 0 if slot is None else slot, *rest)

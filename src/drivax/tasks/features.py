@@ -79,7 +79,8 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 
-#: Frame of all agents 0 to 15 steps ago; the number is static. A second argument selects slots.
+#: Frame of all agents 0 to 15 steps ago (reactive vehicles: older than 9 steps repeats 9); the number is static. A
+#: second argument selects slots.
 Frames = Callable[..., Frame]
 
 
