@@ -173,8 +173,8 @@ def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
     plus sign: ``zoo:NAME+idm``. ``trust`` is that of :func:`load_policy`.
 
     Raises:
-        UsageError: There is no such traffic.
-        DataError: The folder is no training run.
+        UsageError: There is no such traffic, or the run in the folder is no training.
+        DataError: It is not a run folder.
     """
     run, base = split_traffic(name)
     return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base), trust=trust)
