@@ -420,7 +420,10 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
 def _lights(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, state: Int[Array, " L"]
 ) -> Observation:
-    """Return the group ``lights``: those on the route first, then the others, each by distance."""
+    """Return the group ``lights``: those on the route first, then the others, each by distance.
+
+    Without a route on lanes they are those on the path that the bank stores instead (``ahead.has_route``).
+    """
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_BEHIND_M)
