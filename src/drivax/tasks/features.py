@@ -175,7 +175,7 @@ def concatenate_features(
 
 
 def columns_of(group: str, selected: Collection[str], available: Sequence[str] | None = None) -> list[int]:
-    """Return the indices of the selected features' columns among those of ``available``, by default the defaults."""
+    """Return the indices of the selected features' columns among those of ``available`` (None: default features)."""
     start, columns = 0, []
     for name in getattr(Features(), group) if available is None else available:
         width = len(COLUMNS[group][name])
@@ -211,7 +211,7 @@ def projection_offsets() -> Float[Array, " P"]:
 
 
 def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
-    """Return ego's offset to the left of its route (+-5 m, unscaled) and the sine of its heading to it; else 0."""
+    """Return ego's offset left of its route (m, +-5, unscaled) and the sine of its heading to it; 0 without one."""
     hit = project_on_route(bank, context.row, view.xy, context.route_m)
     sine = view.sin * hit.heading[0] - view.cos * hit.heading[1]
     offset = jnp.clip(hit.lateral_m, -SIZE_M, SIZE_M)
