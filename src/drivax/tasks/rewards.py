@@ -56,7 +56,7 @@ class RewardTerm:
         function: Function of the facts before and now, and the surroundings.
         reads: Facts that the function reads.
         option: Field of :class:`RewardConfig` that it takes as a fourth argument.
-        softened: Whether the term is multiplied by :data:`SOFT_FACTORS`.
+        softened: Whether the terms in :data:`SOFT_FACTORS` lower it.
     """
 
     function: Callable[..., Scalar]
@@ -74,7 +74,10 @@ TERMS: dict[str, RewardTerm] = {}
 
 
 def reward_term(*reads: str, option: str | None = None, softened: bool = False) -> Callable[[Any], Any]:
-    """Register a function, which reads these facts, as the built-in term of its name."""
+    """Register a function, which reads these facts, as the built-in term of its name.
+
+    For this module only: :class:`RewardConfig` has fields for the terms registered before it. Yours are ``OwnTerm``.
+    """
 
     def register(function: Any) -> Any:
         TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option, softened)
