@@ -70,7 +70,7 @@ class TrainOptions:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder; no effect with ``resume``.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
-        log: Called with lines about held-out scenarios, memory, pretrained networks and early stopping, and warnings.
+        log: Called with lines about held-out scenarios, memory, pretrained networks and early stops, and warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
             in the traffic may name.
     """

@@ -48,8 +48,8 @@ class SelfPlay(Driving):
     """Driving in groups of environments, each a vehicle of the same scenario: the ego and further egos.
 
     Groups are contiguous. A group starts at a random step, as logged. The episode of each vehicle ends by itself; the
-    vehicle then drives on without reward until all episodes of the group are over, and the group starts again in
-    another scenario. Environments without a vehicle, where a scenario has too few, are always over.
+    vehicle then drives on without reward until all episodes of the group are over, and the group starts again in a
+    newly drawn scenario. Environments without a vehicle, where a scenario has too few, are always over.
     """
 
     config: SelfPlayConfig = SelfPlayConfig()
