@@ -166,7 +166,7 @@ def _divide(
     """Return scenarios to train on, with their weights, and those to validate on, divided if the set holds out some.
 
     Raises:
-        UsageError: The validation set has another length, patience has none, or weights do not fit.
+        UsageError: The validation set has another length, ``patience`` is set without one, or weights do not fit.
     """
     if isinstance(validation, HoldOut) and validation.recordings:
         if weights is not None:
