@@ -102,3 +102,12 @@ def test_offline_algorithms_and_warm_starts_have_no_agent(data):
     for algorithm, name in ((bc, "BcConfig"), (bc_ppo, "BcPpoConfig")):
         with pytest.raises(UsageError, match=rf"{name} has no parts for a loop of your own; use ppo or sac"):
             make_agent(config_of(algorithm, 2), bank)
+
+
+def test_an_agent_in_reactive_traffic_is_made_before_its_bank_is_prepared(data):
+    bank = ScenarioBank.from_scenarios(data)
+    agent = make_agent(replace(config_of(PPO, 2), traffic="idm"), bank)
+    prepared = agent.environment.prepare(bank)
+    assert agent.spec == agent.environment.shapes(prepared)
+    state = jax.eval_shape(agent.init, prepared, jax.random.key(0))
+    assert state.environments.over.shape == (2,)

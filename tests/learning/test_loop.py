@@ -255,7 +255,7 @@ def test_training_holds_out_recordings_by_default(data, config, tmp_path, monkey
     assert resumed.read_metrics()[1]["validation/accuracy"] == last["validation/accuracy"]
     for other in (None, data):
         with pytest.raises(
-            UsageError, match="was validated on other scenarios; resume with the same --valid"
+            UsageError, match="was validated on other scenarios or none; resume with the same --valid"
         ):
             train(short, data, run.path, resume=True, validation=other)
 

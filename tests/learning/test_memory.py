@@ -63,5 +63,5 @@ def test_training_that_does_not_fit_is_refused_with_a_cure():
         replace(fits, limit=7_999_999_999).check()
     assert str(refused.value) == (
         "training does not fit; memory: 8.0 GB of 8.0 GB on cuda:0: scenarios 3.0 GB, replay 5.0 GB, program 2 B; "
-        "lower algorithm.replay.capacity, or set algorithm.replay.store to state"
+        "lower replay.capacity, or set replay.store to state"
     )

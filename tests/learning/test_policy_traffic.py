@@ -8,16 +8,17 @@ import pytest
 
 import drivax
 from drivax import settings
-from drivax.errors import DataError
+from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policies import policy_traffic
+from drivax.learning.policies import open_policy, policy_traffic
 from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.synthetic.generate import Generation, generate
+from drivax.tracking.run_folder import RunFolder
 
 TINY = {
     "task": {
@@ -36,6 +37,12 @@ TINY = {
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(DataError):
         policy_traffic(tmp_path)
+
+
+def test_a_run_of_seeds_that_was_killed_at_its_start_is_refused(tmp_path):
+    RunFolder.create(tmp_path / "run", TrainConfig(), kind="seeds", seeds=2)
+    with pytest.raises(UsageError, match="contains 0 seeds; continue the training with --resume"):
+        open_policy(tmp_path / "run")
 
 
 @pytest.mark.slow

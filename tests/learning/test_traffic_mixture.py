@@ -61,7 +61,7 @@ def test_shares_become_environments(count, shares, groups, sizes):
 def test_a_block_without_environments_is_refused():
     mixture = training_environment(replace(CONFIG, traffic={"log": 0.9, "idm": 0.1}))
     with pytest.raises(
-        UsageError, match=r"traffic idm has a share of 0.1 of 4 environments: none; raise alg"
+        UsageError, match=r"traffic idm has a share of 0.1 of 4 environments: none; raise env"
     ):
         mixture.sizes(4)
     with pytest.raises(UsageError, match=r"traffic log has a share of 0\.2 of 4"):

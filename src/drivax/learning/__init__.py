@@ -5,7 +5,7 @@
 - ``environment`` collects rollouts; ``driving``, ``self_play`` and ``mixture`` are the environments.
 - ``replay`` stores the transitions of SAC, ``experience`` samples logged steps; PPO shuffles its own rollouts.
 - ``training_log.rank`` decides which checkpoint is the best, and ``drivax.tracking.Checkpoints`` keeps it.
-- ``policies`` loads and exports trained policies, as planners and as traffic.
+- ``policies`` loads trained policies as planners and as traffic, and exports them.
 """
 
 import lazy_loader

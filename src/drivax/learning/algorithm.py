@@ -133,6 +133,6 @@ def training_data(
         return experience
     if weights is not None:
         problem = f"{type(config).__name__} does not draw logged steps by weight"
-        cure = "leave out the weights, or use bc, cql, iql, td3_bc, or sac with demonstrations"
+        cure = "leave out the weights, or use bc, cql, iql, td3_bc, or sac or bc_sac with demonstrations"
         raise UsageError(problem, cure=cure)
     return data

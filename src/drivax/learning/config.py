@@ -58,8 +58,9 @@ class TrainConfig:
         start: How training episodes begin; those of self-play and of validation begin as logged, the latter at step 10.
         egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
             of a set made with ``--egos``). Validation episodes are those of the recorded ego.
-        earliest_start, latest_start: Training episodes begin at a random step of the log between the two; the first
-            ones of a run also later, so that they end at different times.
+        earliest_start, latest_start: Training episodes begin at a random step of the log between the two (exceptions:
+            :class:`~drivax.learning.driving.Driving`); the first ones of a run also later, so that they end at
+            different times.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.

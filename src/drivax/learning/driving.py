@@ -23,6 +23,7 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
@@ -97,8 +98,8 @@ class Driving:
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""
-        # Starts change no shape; the logged start is the fastest to trace.
-        simulator = replace(self.simulator, start=LogStart())
+        # Traffic and start change no shape; those of the log need no prepared bank.
+        simulator = replace(self.simulator, traffic=LogTraffic(), start=LogStart())
         observation = jax.eval_shape(
             lambda bank: simulator.observe(bank, simulator.context(bank, 0, CURRENT_STEP)), data
         )
@@ -199,7 +200,8 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        At a step where the ego is not valid, step 10 is taken instead.
+        At a step where the ego is not valid, step 10 is taken instead. A later motion that the log lacks counts as the
+        present one; :meth:`expert_steps` leaves such steps out.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
@@ -283,7 +285,7 @@ class Driving:
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """Return the expert's action within bounds and actuator rates, and whether it exceeded the bounds."""
+        """Return the expert's action within bounds and rates (``route``: bounds), and whether it exceeded bounds."""
         space = self.task.actions
         action = expert_action(bank, context, space)
         # In the space ``route`` the executed action is another one than that which a policy requests.
@@ -311,7 +313,7 @@ def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
 
 
 def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:
-    """Return ``function(bank, index, step, slot, ...)`` of one drawn agent, with slot 0 for None."""
+    """Return ``function`` with its first argument bound to the bank; a slot of None becomes 0."""
 
     def call(index: Array, step: Array, slot: Any, *rest: Array) -> Any:
         return function(bank, index, step, 0 if slot is None else slot, *rest)

@@ -188,7 +188,7 @@ class ExperienceConfig:
 
         Raises:
             UsageError: There is no expert, or the weights do not fit the data.
-            DataError: No step is usable.
+            DataError: No step is usable, or all weights of usable steps are 0.
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)

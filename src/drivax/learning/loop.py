@@ -36,8 +36,8 @@ from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, traini
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
-    "validation": ("was validated on other scenarios", "--validation"),
-    "weights": ("was trained with other weights", "weights"),
+    "validation": ("was validated on other scenarios or none", "--validation"),
+    "weights": ("was trained with other weights or none", "weights"),
     "data": ("was trained on other scenarios", "--data"),
 }
 
@@ -70,7 +70,7 @@ class TrainOptions:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder; no effect with ``resume``.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
-        log: Called with lines about held-out scenarios, memory, pretrained networks and early stopping, and warnings.
+        log: Called with lines about held-out scenarios, memory, pretrained networks and early stops, and warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
             in the traffic may name.
     """
@@ -94,16 +94,18 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms and ``sac`` with
+        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms, and ``sac`` and ``bc_sac`` with
             ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
         out: Run folder.
-        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings with about a tenth
-            of its scenarios (at most 256). None trains on all scenarios without validation.
+        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
+            its scenarios (and 256), else the smallest recording; none of a set of one recording. None trains on all
+            scenarios without validation.
         options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
-        DataError: The run to fine-tune is not a training run, its networks do not fit, or no checkpoint can be read.
+        DataError: No logged step is usable, the run to fine-tune is not a training run, its networks do not fit, or no
+            checkpoint can be read.
         DivergenceError: Rewards, losses, parameters or actions of a seed are not finite; other seeds were trained.
         DrivaxError: Memory ran out.
         Preempted: SIGTERM stopped it, after a checkpoint.
@@ -164,7 +166,7 @@ def _divide(
     """Return scenarios to train on, with their weights, and those to validate on, divided if the set holds out some.
 
     Raises:
-        UsageError: The validation set has another length, patience has none, or weights do not fit.
+        UsageError: The validation set has another length, ``patience`` is set without one, or weights do not fit.
     """
     if isinstance(validation, HoldOut) and validation.recordings:
         if weights is not None:

@@ -148,7 +148,7 @@ class Mixture:
         for name, size in sizes.items():
             if size < 1:
                 problem = f"traffic {name} has a share of {shares[name]:g} of {count} environments: none"
-                raise UsageError(problem, cure="raise algorithm.environments or the share")
+                raise UsageError(problem, cure="raise environments or the share")
         return tuple(sizes.values())
 
 

@@ -44,7 +44,9 @@ def open_policy(run: str | Path) -> RunFolder:
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+        # A process that was killed at its start may not have created any.
+        cure = f"name one, as {inside[0]}" if inside else "continue the training with --resume"
+        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=cure)
     return folder
 
 
@@ -101,7 +103,7 @@ def export_policy(
     commit and hashes of data sets. Only the command, and a run named as ``traffic``, may contain paths of the machine.
 
     Args:
-        run: As for :func:`load_policy`, with its errors.
+        run: As for :func:`load_policy`, with its errors; the traffic of its training must still exist.
         out: Folder to write; its name is that of the policy.
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.
@@ -171,8 +173,8 @@ def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
     plus sign: ``zoo:NAME+idm``. ``trust`` is that of :func:`load_policy`.
 
     Raises:
-        UsageError: There is no such traffic.
-        DataError: The folder is no training run.
+        UsageError: There is no such traffic, or the run in the folder is no training.
+        DataError: It is not a run folder.
     """
     run, base = split_traffic(name)
     return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base), trust=trust)

@@ -30,13 +30,14 @@ _THREADS = 8
 _AXIS = "devices"
 
 _NETWORKS = "networks and optimiser"
+#: Settings are named without their path, which begins with ``algorithm.`` and, in a warm start, ``ppo.`` or ``sac.``.
 _CURES = {
     "scenarios": "train on fewer scenarios",
     "validation": "validate on fewer scenarios",
-    "replay": "lower algorithm.replay.capacity, or set algorithm.replay.store to state",
-    "environments": "lower algorithm.environments",
+    "replay": "lower replay.capacity, or set replay.store to state",
+    "environments": "lower environments",
     _NETWORKS: "choose a smaller network, or fewer --seeds",
-    "program": "lower algorithm.environments, unroll or batch, or raise algorithm.minibatches",
+    "program": "lower environments, unroll or batch, or raise minibatches",
 }
 #: Fields of a learner's state that are listed separately.
 _LISTED_FIELDS = ("replay", "environments")

@@ -57,7 +57,7 @@ class Replay:
         action: Actions in [-1, 1].
         reward: Rewards.
         terminated: Whether the episode ended by a failure.
-        alive: Whether the row is a step; false where it only resets an environment or nothing was written yet.
+        alive: Whether the row is a step; false where an episode was over before it, or nothing was written yet.
         next_row: Row to write next: the oldest, once the ring is full.
     """
 

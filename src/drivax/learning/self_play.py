@@ -48,8 +48,8 @@ class SelfPlay(Driving):
     """Driving in groups of environments, each a vehicle of the same scenario: the ego and further egos.
 
     Groups are contiguous. A group starts at a random step, as logged. The episode of each vehicle ends by itself; the
-    vehicle then drives on without reward until all episodes of the group are over, and the group starts again in
-    another scenario. Environments without a vehicle, where a scenario has too few, are always over.
+    vehicle then drives on without reward until all episodes of the group are over, and the group starts again in a
+    newly drawn scenario. Environments without a vehicle, where a scenario has too few, are always over.
     """
 
     config: SelfPlayConfig = SelfPlayConfig()
@@ -64,7 +64,7 @@ class SelfPlay(Driving):
         groups = round(self.config.past * (count // size))
         if self.config.past and not groups:
             problem = f"self_play.past is {self.config.past:g} of {count // size} groups: none"
-            raise UsageError(problem, cure="raise it, or algorithm.environments")
+            raise UsageError(problem, cure="raise it, or environments")
         is_past = (number // size < groups) & (number % size > 0)
         return PastPolicy(np.flatnonzero(is_past), self.config.refresh)
 
@@ -135,7 +135,7 @@ class SelfPlay(Driving):
     def _slots(
         self, bank: ScenarioBank, index: Array, step: Array, key: Array
     ) -> tuple[Int[Array, " K"], Array]:
-        """Return the slots of ego and of random further egos whose log has two more steps, then padding; and keys."""
+        """Return the slots of ego and of random further egos in the log for two more steps, then padding; and keys."""
         padding, further = bank.agents.shape[2], bank.egos[index, 1:]
         rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
         present = bank.agents[index, step, further, AgentColumn.VALID] > 0

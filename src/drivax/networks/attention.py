@@ -1,4 +1,4 @@
-"""Masked attention, pre-norm residual layers (Vaswani et al. 2017, arXiv 1706.03762), and groups as rows of tokens.
+"""Masked attention (Vaswani et al. 2017, arXiv 1706.03762), pre-norm residual layers, and groups as rows of tokens.
 
 Parameters are float32. ``dtype`` bfloat16 applies to matrix products; softmax, norms and residuals stay float32.
 

@@ -176,7 +176,10 @@ def max_pool(
     activation: Activation, layers: Layers, rows: Float[Array, "*batch row inputs"],
     valid: Bool[Array, "*batch row"],
 ) -> Float[Array, "*batch outputs"]:  # fmt: skip
-    """Return the maximum of zero and the valid rows after the layers; equal rows share its gradient."""
+    """Return the maximum of zero and the valid rows after the layers.
+
+    Equal rows share its gradient; in the native kernel the first takes all of it.
+    """
     if activation not in _MONOTONE:
         return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
     lead, (count, width) = rows.shape[:-2], rows.shape[-2:]

@@ -150,8 +150,8 @@ class WayformerConfig(LatentConfig):
 class MtrConfig(TransformerConfig):
     """An encoder after the Motion Transformer (Shi et al. 2022, arXiv 2209.13508).
 
-    Each mover attends to its own times, then in each layer to the other movers and to the map. Movers are series and
-    groups without a mask; the map is all other groups.
+    Each mover attends to its own times, then in each layer to all movers and to the map. Movers are series and groups
+    without a mask; the map is all other groups.
     """
 
     kind: Literal["mtr"] = "mtr"

@@ -1,9 +1,9 @@
 """Action spaces: meaning and bounds of actions, their dynamics, and expert actions.
 
-:class:`Physical` (default), :class:`Published` and :class:`Discrete` drive the kinematic bicycle by acceleration and
-curvature, :class:`Route` by acceleration and lateral offset from the route. :class:`DeltaLocal` displaces the agent,
-:class:`DirectState` sets its state, :class:`Trajectory` has planned poses, which a controller tracks. Except for the
-last two, actions are in [-1, 1], and a component of 0 is a quantity of 0.
+:class:`Physical` (default) and :class:`Discrete` drive the kinematic bicycle by acceleration and curvature,
+:class:`Published` by acceleration and steering angle, :class:`Route` by acceleration and lateral offset from the route.
+:class:`DeltaLocal` displaces the agent, :class:`DirectState` sets its state, :class:`Trajectory` has planned poses,
+which a controller tracks. Except for the last two, actions are in [-1, 1], and a component of 0 is a quantity of 0.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Physical:
         return self._curvature(jnp.asarray(self.steering), length_m)
 
     def first(self, history: History, length_m: Any) -> Vector:
-        """Return the last action at the start of an episode: zero, or that of the log if actuator rates are limited."""
+        """Return the last action at the start of an episode: zero, or with rates that of the history's last step."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
         command = command_between(history[-2], history[-1])
@@ -350,7 +350,7 @@ class Trajectory:
     Attributes:
         steps: Horizon of a plan, steps.
         controller: nuPlan's LQR and its bicycle about the rear axle.
-        initial_steering: Steering angle at the start: zero as in nuPlan, or that of the log's last half second.
+        initial_steering: Steering angle at the start: zero as in nuPlan, or that of the half second before it.
     """
 
     steps: int = 80
@@ -420,7 +420,7 @@ class Trajectory:
         )
 
     def first(self, history: History, length_m: Any) -> Float[Array, " D"]:
-        """Return the acceleration of the log's last half second, and the initial steering angle."""
+        """Return the acceleration of the history's last half second, and the initial steering angle."""
         length_m = jnp.maximum(length_m, _LEAST_LENGTH_M)
         actuators = controller.recent_actuators(history, length_m, self.controller)
         if self.initial_steering == "zero":

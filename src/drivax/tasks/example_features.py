@@ -106,6 +106,7 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
 
     Gap to the leader or a light that requires a stop, at most 90 m, in units of 50 m; closing speed and speed of the
     leader (0 without one); whether there is one; speed by the limit and the curves ahead. Speeds in units of 15 m/s.
+    Without a route on lanes it looks along the path that :func:`~drivax.simulator.ahead.has_route` calls privileged.
     """
     speed = context.history[-1, MOTION_SPEED]
     inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)

@@ -79,7 +79,8 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 
-#: Frame of all agents 0 to 15 steps ago; the number is static. A second argument selects slots.
+#: Frame of all agents 0 to 15 steps ago (reactive vehicles: older than 9 steps repeats 9); the number is static. A
+#: second argument selects slots.
 Frames = Callable[..., Frame]
 
 
@@ -174,7 +175,7 @@ def concatenate_features(
 
 
 def columns_of(group: str, selected: Collection[str], available: Sequence[str] | None = None) -> list[int]:
-    """Return the indices of the selected features' columns among those of the available ones: the default ones."""
+    """Return the indices of the selected features' columns among those of ``available`` (None: default features)."""
     start, columns = 0, []
     for name in getattr(Features(), group) if available is None else available:
         width = len(COLUMNS[group][name])
@@ -193,8 +194,8 @@ def route_coordinates(
 ) -> list[Float[Array, " K"]]:
     """Return positions of agents along the route (from ego) and left of it, and sine and cosine of the heading to it.
 
-    Positions are in units of 50 m and 5 m; left is at most 20 m, as for an agent that is not alongside the route. Zeros
-    without a route.
+    Positions are in units of 50 m and 5 m; left is clipped to +-20 m, and 20 m for an agent that is not alongside the
+    route. Zeros without a route.
     """
     offsets = projection_offsets()
     path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
@@ -210,7 +211,7 @@ def projection_offsets() -> Float[Array, " P"]:
 
 
 def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
-    """Return ego's offset to the left of its route (m, at most 5) and the sine of its heading to it; 0 without one."""
+    """Return ego's offset left of its route (m, +-5, unscaled) and the sine of its heading to it; 0 without one."""
     hit = project_on_route(bank, context.row, view.xy, context.route_m)
     sine = view.sin * hit.heading[0] - view.cos * hit.heading[1]
     offset = jnp.clip(hit.lateral_m, -SIZE_M, SIZE_M)

@@ -41,9 +41,10 @@ from drivax.tasks.perception import (
 
 #: Block size of :func:`running_count`.
 _BLOCK = 8
-#: Stop lines further behind ego than this are omitted, m. Added to the distance of lights off the route, m.
+#: Stop lines that ego is past by more than this, in the direction of their lane, are omitted, m. Added to the distance
+#: of lights off the route, m.
 _BEHIND_M, _OFF_ROUTE_M = 5.0, 1e4
-#: Agent kinds in the order of the columns of ``type``.
+#: Agent kinds in the order of the columns of ``type``, which are all 0 for ``AgentKind.STATIC``.
 _TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
 Observation = dict[str, Array]
 #: Names of the groups of this module.
@@ -419,7 +420,10 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
 def _lights(
     config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, state: Int[Array, " L"]
 ) -> Observation:
-    """Return the group ``lights``: those on the route first, then the others, each by distance."""
+    """Return the group ``lights``: those on the route first, then the others, each by distance.
+
+    Without a route on lanes they are those on the path that the bank stores instead (``ahead.has_route``).
+    """
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_BEHIND_M)

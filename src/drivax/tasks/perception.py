@@ -39,7 +39,7 @@ class Perception:
 
     Attributes:
         range_m: Range of the detection of agents and stop lines, m.
-        occlusion: Whether vehicles hide agents behind them (:func:`in_view`).
+        occlusion: Whether agents other than pedestrians and cyclists hide those behind them (:func:`in_view`).
         dropout_m: Agents and lights are detected with probability exp(-distance / dropout_m), drawn at each step;
             published: 200 m.
         noise_m: Standard deviation of the position error of agents, stop lines and road pieces in each direction,
@@ -69,7 +69,7 @@ class Perception:
 
     @property
     def of_lights(self) -> bool:
-        """Whether lights may be missed."""
+        """Whether lights may be missed: out of range or dropped, as agents may be."""
         return self.range_m is not None or self.dropout_m is not None
 
 
@@ -115,8 +115,8 @@ def in_view(
 ) -> Bool[Array, " S"]:
     """Return a mask of the agents whose centre or a corner is visible from a point.
 
-    Boxes in ``blocks`` occlude lines of sight through their interior, but not along their sides. No box occludes
-    itself, and a box around the eye occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
+    Boxes in ``blocks`` occlude lines of sight through their interior. No box occludes itself, and a box around the eye
+    occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
     """
     dx, dy = eye[0] - box[:, X], eye[1] - box[:, Y]
     along, across = dx * box[:, COS] + dy * box[:, SIN], dy * box[:, COS] - dx * box[:, SIN]

@@ -56,7 +56,7 @@ class RewardTerm:
         function: Function of the facts before and now, and the surroundings.
         reads: Facts that the function reads.
         option: Field of :class:`RewardConfig` that it takes as a fourth argument.
-        softened: Whether the term is multiplied by :data:`SOFT_FACTORS`.
+        softened: Whether the terms in :data:`SOFT_FACTORS` lower it.
     """
 
     function: Callable[..., Scalar]
@@ -74,7 +74,10 @@ TERMS: dict[str, RewardTerm] = {}
 
 
 def reward_term(*reads: str, option: str | None = None, softened: bool = False) -> Callable[[Any], Any]:
-    """Register a function, which reads these facts, as the built-in term of its name."""
+    """Register a function, which reads these facts, as the built-in term of its name.
+
+    For this module only: :class:`RewardConfig` has fields for the terms registered before it. Yours are ``OwnTerm``.
+    """
 
     def register(function: Any) -> Any:
         TERMS[function.__name__] = RewardTerm(function, frozenset(reads), option, softened)
@@ -95,7 +98,7 @@ def _event_term(name: str, fact: str) -> None:
 
 @reward_term("collision", option="collision_margin_m")
 def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_m: float = 0.0) -> Scalar:
-    """1 while the agent touches another, or is closer than the margin."""
+    """1 while the agent touches another, or is closer than the margin; ignored overlaps do not count."""
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
@@ -204,15 +207,15 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane that ends, or joins
-# the new lane, within 100 m (``scenario.bank.queries.lane_passage``).
+# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane which, within 100 m,
+# ends or joins the new lane (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
 
 @reward_term("late_m", "early_m", softened=True)
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
-    """Adherence to the log's schedule along the route, in [0, 1].
+    """Adherence to the log's schedule along the route, or along the log's path without one, in [0, 1].
 
     1 between the log's present position and that a second later. Behind, 1 / (1 + late / 2 m), which rewards catching
     up from any distance; ahead, exp(-early / 8 m) after the first metre.

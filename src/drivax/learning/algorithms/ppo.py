@@ -41,7 +41,7 @@ _Carry = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class PpoConfig:
-    """PPO. The defaults train on two CPU cores; the preset ``published`` has the published sizes.
+    """PPO. The defaults train on two CPU cores; the preset ``published/ppo`` has the published sizes.
 
     Attributes:
         network: Architecture of policy and value.
