@@ -34,7 +34,7 @@ class ComparisonPlan:
         smallest_difference: The smallest difference that matters, in the unit of the primary metric; null: a tenth of
             ``Sensitivity.deviation``.
         test: Test of means in pairs: ``permutation``, or ``bootstrap`` if differences are far from symmetric.
-        resamples: Number of bootstrap samples and permutations.
+        resamples: Number of permutations, and of bootstrap samples except for the mean of one run, which has 10,000.
         seed: Seed of the split and of all resampling.
     """
 
@@ -102,7 +102,7 @@ class MetricComparison:
     """Comparison of two planners in one metric.
 
     Attributes:
-        unit: ``-`` for shares, empty if unknown.
+        unit: ``-`` without a unit, empty if unknown.
         better: ``high``, ``low``, or ``-`` for neither.
         a, b, difference: Means over the included scenarios, and ``A - B``.
         effects: Cohen's d: ``d_z`` and ``d_av`` of pairs, ``d`` of a split.
@@ -176,4 +176,5 @@ def decide(
         return Decision("no difference", "power", None, ())
     if sensitivity is not None and sensitivity.needed is None:
         return Decision("not enough scenarios", "seeds", None, ())
+    # Without a sensitivity, or with one next to the limit, ``needed`` may not exceed the present number.
     return Decision("not enough scenarios", "power", max(needed, n + 1), ())

@@ -144,7 +144,7 @@ def _step(
     state = jax.tree.map(partial(jnp.where, is_over), state, after)
     all_finite = loop.all_finite & (is_finite | is_over)
     metric_state = state
-    if not planner.replays:
+    if not planner.replays:  # A replay cannot crash.
         metric_state = jax.tree.map(partial(jnp.where, all_finite), state, loop.metric_state)
     context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
     others = _others(simulator.traffic, bank, state)
