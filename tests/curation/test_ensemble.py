@@ -187,7 +187,7 @@ def test_ensemble_trained_on_some_recordings_scores_all(data):
 def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
     scenario_bytes = ScenarioBank.from_scenarios(list(data)).nbytes / 10
     monkeypatch.setattr(ensemble_module, "free_memory", lambda device: int(16.5 * scenario_bytes))
-    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from 4 to"):
+    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* set learn_from to 4 to"):
         train_ensemble(TINY, data)
     with pytest.raises(UsageError, match="are free; free memory"):
         train_ensemble(replace(TINY, folds=5), data)

@@ -246,9 +246,10 @@ def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: i
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
     if 2 * size * count > free:
+        # Half of what fits, because whole recordings exceed the number, and the training needs memory.
         max_scenarios, need_gb = free // (4 * size), 2e-9 * size * count
         problem = f"{count:,} scenarios take about {need_gb:,.0f} GB, and {free / 1e9:,.0f} GB are free"
-        cure = f"pass --learn_from {max_scenarios} to train on fewer scenarios; all are scored"
+        cure = f"set learn_from to {max_scenarios} to train on fewer scenarios; all are scored"
         cure = cure if max_scenarios >= config.folds else "free memory"
         raise UsageError(problem, file=data.path, cure=cure)
 

@@ -221,8 +221,8 @@ class StudySets:
     Attributes:
         train: Training set.
         validation: Validation set, for the choice of checkpoints.
-        test: Test sets. If some scenarios have a labelled event, the test has equally many with and without. The first
-            set has events as often as ordinary traffic.
+        test: Test sets. If only some scenarios have a labelled event, the test has equally many with and without. The
+            first set has events as often as ordinary traffic.
     """
 
     train: Path

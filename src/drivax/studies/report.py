@@ -192,7 +192,7 @@ def rule_cost_table(results: Results, rule: str) -> Table:
 
 
 def validations_table(results: Results, rule: str) -> Table:
-    """Return the first baseline's ``rule`` and score at each validation, and the seeds whose checkpoint they choose."""
+    """Return the first baseline's ``rule`` and score at each validation, and for how many seeds each chooses it."""
     curves = {
         name: np.array([seed[key] for seed in results["validations"]], np.float64)
         for name, key in ((rule, "rule"), ("score", "score"))
@@ -253,8 +253,8 @@ def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> s
 
 def _rankings(results: Results) -> str:
     return rankings_table(results).html() + (
-        "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. Rankings are called "
-        f"unrelated if the interval is within ±{UNRELATED}, related if it is beyond ±{RELATED}. "
+        "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. “They are orthogonal” "
+        f"is supported if the interval is within ±{UNRELATED}, contradicted if it is beyond ±{RELATED}. "
         "Two random rankings have 5 % of their top 5 % in common.</small></p>"
     )
 

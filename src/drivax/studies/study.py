@@ -1,7 +1,8 @@
 """The study runner: score, train, evaluate, test the claims, write the report.
 
-Arms differ in how they draw logged steps. Each arm is trained with several seeds and the same budget, and evaluated on
-one test set. Claims compare arms scenario by scenario. An interrupted study resumes without repeating finished jobs.
+Arms differ in their preset and in how they draw logged steps. Each arm is trained with several seeds, by the budget of
+its preset unless ``total_steps`` is set, and evaluated on one test set. Claims compare arms scenario by scenario. An
+interrupted study resumes without repeating finished jobs.
 """
 
 from __future__ import annotations
@@ -237,7 +238,7 @@ def _test_set(study: Study) -> ScenarioSet:
 
 
 def _strata(study: Study, test: ScenarioSet) -> Strata:
-    """Return the strata of the test set; scenarios without labels are rare if they are among the most critical."""
+    """Return the strata of the test set; in a set without labels the most critical scenarios are rare."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
     has_labels = bool(rare.any())
