@@ -39,7 +39,7 @@ from drivax.simulator.types import Frame
 
 #: Centres of two route windows that cover about 75 m of the path ahead, m.
 _WINDOWS_M = (6.0, 45.0)
-#: nuPlan's filter window of 1.5 s, and its orders for jerk (from accelerations) and yaw acceleration (from headings).
+#: Filter window of 1.5 s, as nuPlan's for jerk, and nuPlan's orders for jerk and yaw acceleration.
 _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 
@@ -155,8 +155,8 @@ def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
 def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, ""]) -> Float[Array, " T"]:
     """Return the volatility of the action from each step to the next; the ``last`` step repeats the previous value.
 
-    Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s. Noise of 1 cm/s in the speed
-    changes the jerk by some hundredths of a m/s3.
+    Jerk (from accelerations) and yaw acceleration (from headings) are derivatives of a polynomial fitted to 1.5 s.
+    Noise of 1 cm/s in the speed changes the jerk by some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
     valid = log.valid[1:] & log.valid[:-1]

@@ -118,7 +118,7 @@ def drive(
     """
     step = partial(_step, simulator, planner, bank)
     first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
-    # A mapped step inside the loop: to map the loop itself, JAX traces its body several times.
+    # Map the step, not the loop: to map a loop, JAX traces its body several times.
     last, outputs = jax.lax.scan(lambda loop, key: jax.vmap(step)(loop, key), first, step_keys.T)
     outputs = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), outputs)
     return jax.vmap(partial(_outcome, simulator.traffic, bank, start_step))(first, last, outputs)

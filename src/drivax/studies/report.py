@@ -160,7 +160,7 @@ def _rate(rate: Mapping[str, float]) -> str:
 
 
 def draws_table(results: Results) -> Table:
-    """Return the distribution of the sampling weights of every arm."""
+    """Return the distribution of the sampling weights of every arm (permuted ones: of seed 0)."""
     names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
     headings = ("arm", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
     rows = [(arm, *(f"{draws[name]:.2f}" for name in names)) for arm, draws in results["draws"].items()]
@@ -265,8 +265,8 @@ def _rule_cost(results: Results, rule: str) -> str:
     agreements = sum(k == best_validation(seed["score"]) for k, seed in zip(best, seeds, strict=True))
     return (
         f"{rule_cost_table(results, rule).html()}<p><small>Test results of the baseline's checkpoints with the highest "
-        f"{escape(rule)} on held-out steps, minus those of the checkpoints with the best validation score, paired by "
-        f"seed. Both rules choose the same checkpoint for {agreements} of the {len(seeds)} seeds.</small></p>"
+        f"{escape(rule)}, minus those of the checkpoints with the best validation score, paired by seed. "
+        f"Both rules choose the same checkpoint for {agreements} of the {len(seeds)} seeds.</small></p>"
         f"{validations_table(results, rule).html()}"
     )
 
