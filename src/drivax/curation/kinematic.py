@@ -188,7 +188,7 @@ def _derivative(
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(box: Array, ground: Array) -> Array:
-        # A logged car without a road edge nearby is on a driveway or outside the map, and counts as on the road.
+        # Where its side of the edges is unknown, as on a driveway or outside the map, a logged car is on the road.
         on_road = jnp.ones(4, bool)
         outside_m = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
         return jnp.max(jnp.clip(1.0 + outside_m / config.edge_m, 0.0, 1.0))

@@ -399,7 +399,7 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
 
 
 def _shift(state: SimState, distance: Array) -> SimState:
-    """Shift the state by a negligible distance."""
+    """Shift the state by a negligible distance, and the index by 0, so that every part depends on the distance."""
     history = state.context.history + distance
     index = state.context.index + distance.astype(jnp.int32)
     return replace(state, context=replace(state.context, history=history, index=index))

@@ -66,7 +66,7 @@ class Demo:
     stages_s: dict[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields except the report, and the versions."""
+        """Return the fields except the report, and a description of the run."""
         return {
             "summaries": self.summaries,
             "policy_minus": self.differences,
