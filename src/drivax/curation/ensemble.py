@@ -104,7 +104,7 @@ class EnsembleConfig:
 class Predictions:
     """Predictions of the members at every step of a set, and the expert's actions, in units of the action space.
 
-    ``action`` are the modes of the members. ``known`` marks steps at which the expert's action is known and within the
+    ``action`` are the modes of the members. ``known`` marks usable steps (``ExpertSteps``) with an action within the
     bounds. ``information`` is the mutual information of action and member in nats, for members trained by likelihood.
     """
 

@@ -39,7 +39,7 @@ _UNDEFINED = -9.0
 
 
 def standard_digests() -> Iterator[tuple[str, str]]:
-    """Generate the standard scenarios, drive them, and yield (name, digest) of each planner and of them all.
+    """Generate the standard scenarios, drive them, and yield (name, digest) of each rollout and of them all.
 
     The first pair is the hash of the set, which the last digest does not cover.
     """
@@ -83,4 +83,5 @@ def grid_cells(
 
 
 def _sha256(data: bytes) -> str:
+    """Return the first 16 hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()[:16]

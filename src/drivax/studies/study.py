@@ -140,7 +140,7 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
     log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
     if not all(check.met for check in checks) and not anyway:
         raise UsageError(
-            "the baseline does not drive well enough for a comparison",
+            "a baseline does not drive well enough for a comparison",
             file=study.folder,
             cure="train longer or with other settings in another --out, or pass --anyway",
         )
