@@ -403,6 +403,11 @@ def test_settings_out_of_range_are_refused(data, tmp_path):
         study = replace(study, config=replace(study.config, total_steps=steps))
         with pytest.raises(UsageError, match=words):
             study.train_config("bc", 0)
+    patient = ("--patience", "2", "--evaluate_every", "1")
+    for training in (patient, ("--checkpoint_rule", "lexicographic")):
+        study = replace(study, config=replace(study.config, total_steps=None, training=training))
+        with pytest.raises(UsageError, match="leave out checkpoint_rule and patience"):
+            study.train_config("bc", 0)
 
 
 def test_claims_that_no_test_decides_are_refused():
