@@ -93,6 +93,8 @@ class EnsembleConfig:
         check_at_least(self, 1, "total_steps")
         check_at_least(self, 0, "seed")
         check_learnable(self.task.actions)
+        if self.weighted == "rarity" and self.task.actions.size != 2:
+            raise UsageError("rarity is of actions of two dimensions", cure="use weighted: plain")
 
     @property
     def iterations(self) -> int:
