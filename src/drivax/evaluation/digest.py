@@ -2,8 +2,8 @@
 
 Rule-based planners drive 64 scenarios of the built-in world. The digest covers truths, counts, which of them are
 defined, and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would
-differ between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its
-unit that is farthest from all 64 values (docs/guide/reproducibility.md has distances).
+differ between machines by float noise. The grid of each quantity is therefore shifted by the multiple of an eighth of
+its unit whose edges are farthest from all 64 values (docs/guide/reproducibility.md has distances).
 """
 
 from __future__ import annotations

@@ -142,6 +142,8 @@ class StudyDefinition:
             "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
             "metric": (self.metrics, METRICS), "method": (methods, METHODS),
         }  # fmt: skip
+        if "random_matched" in methods:
+            raise ValueError("for random_matched use the method to match with permuted: true")
         for kind, (names, available) in choices.items():
             for name in names:
                 if name not in available:

@@ -104,7 +104,7 @@ def run_study(
     tables = _score(study, log)
     definition, config = study.definition, study.config
     data, test = ScenarioSet.open(study.sets.train), _test_set(study)
-    # Observations and actions of all arms are the same.
+    # The presets of all arms must have the same observations and actions.
     usable = usable_steps(study.train_config(definition.baselines[0], 0), data)
     for name in definition.planners:
         if not study.evaluation(name).is_dir():
@@ -325,7 +325,7 @@ def _train_and_evaluate_arm(job: Job) -> float:
     steps = Checkpoints(refuse_link(run / "checkpoints")).steps()
     _check_not_evaluated(job, steps)
     validation = ScenarioSet.open(study.sets.validation)
-    # A finished training ends at once, and deletes what its interruption left.
+    # Of a finished training, this only deletes what an interruption left.
     train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])
