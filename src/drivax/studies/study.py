@@ -150,7 +150,10 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
 def _write_pages(
     study: Study, data: ScenarioSet, results: Mapping[str, Any], tables: Mapping[str, ScoreTable]
 ) -> None:
-    """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them."""
+    """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them.
+
+    A scenario of several methods has the scores of the last.
+    """
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
     write_report(study.definition, results, tables, actions, study.folder / "report.html")
