@@ -279,8 +279,8 @@ def comfort_series(ego: EgoMotion) -> Comfort:
     """Return the six comfort series (``ego_is_comfortable``).
 
     As in the devkit, values are rounded to 8 decimals, and the acceleration of the centre adds both terms of the yawing
-    frame to the longitudinal component, so that the lateral one is always 0. Jerk magnitude is that of the rear axle. The filter windows of yaw rate and yaw
-    acceleration have 5 samples.
+    frame to the longitudinal component, so that the lateral one is always 0. Jerk magnitude is that of the rear axle.
+    The filter windows of yaw rate and yaw acceleration have 5 samples.
     """
     samples = len(ego.heading)
 
