@@ -184,7 +184,7 @@ class StudyConfig:
         seeds: Number of training runs of each arm.
         total_steps: Number of logged steps to draw in each training; null for that of the preset.
         training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``; not
-            ``checkpoint_rule`` or ``patience``.
+            ``checkpoint_rule`` or ``patience``. The study sets ``seed``, ``evaluate_every`` and ``checkpoint_every``.
         validations: Approximate number of closed-loop validations; the test evaluates the best checkpoint.
         weights: Settings of the sampling weights, the same for all methods.
         ensemble: The ensemble.
