@@ -277,7 +277,7 @@ def fit(
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
     results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
-    take three times as long.
+    are slower.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:

@@ -48,7 +48,7 @@ from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
 from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
-#: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
+#: Scenarios per program call on a CPU, a compromise between planners whose larger batches exceed the caches and others
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
 CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
 #: Maximum number of scenarios in an error message, and of crashes in a list.
