@@ -21,7 +21,7 @@ from drivax.curation.ensemble import (
     sample_recordings,
     train_ensemble,
 )
-from drivax.curation.methods import ensemble_table
+from drivax.curation.methods import check_combination, ensemble_table
 from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
 from drivax.errors import UsageError
@@ -35,7 +35,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import DirectState
+from drivax.tasks.actions import DeltaLocal, DirectState
 from drivax.tasks.task import Task
 from quick import quick
 from scenes import SMALL, car, straight_road
@@ -187,7 +187,7 @@ def test_ensemble_trained_on_some_recordings_scores_all(data):
 def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
     scenario_bytes = ScenarioBank.from_scenarios(list(data)).nbytes / 10
     monkeypatch.setattr(ensemble_module, "free_memory", lambda device: int(16.5 * scenario_bytes))
-    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from 4 to"):
+    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* set learn_from to 4 to"):
         train_ensemble(TINY, data)
     with pytest.raises(UsageError, match="are free; free memory"):
         train_ensemble(replace(TINY, folds=5), data)
@@ -281,6 +281,13 @@ def test_command_trains_mixtures_by_likelihood(data, tmp_path, capsys):
     assert table.config["seed"] == 3
 
 
+def test_every_dimension_of_the_action_is_a_component():
+    config = EnsembleConfig(task=Task(actions=DeltaLocal()))
+    check_combination("ensemble", config, {"weights": {"action_2": 1.0}})
+    with pytest.raises(UsageError, match="unknown component 'action_3'"):
+        check_combination("ensemble", config, {"weights": {"action_3": 1.0}})
+
+
 def test_invalid_settings_are_refused(data, tmp_path, capsys):
     with pytest.raises(UsageError, match="1 folds"):
         EnsembleConfig(folds=1)
@@ -292,6 +299,8 @@ def test_invalid_settings_are_refused(data, tmp_path, capsys):
         EnsembleConfig(seed=-1)
     with pytest.raises(UsageError, match="policies cannot learn in direct_state"):
         EnsembleConfig(task=Task(actions=DirectState()))
+    with pytest.raises(UsageError, match="rarity is of actions of two dimensions; use weighted: plain"):
+        EnsembleConfig(weighted="rarity", task=Task(actions=DeltaLocal()))
     call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
     assert main([*call, "--folds", "3"]) == 2
     assert "folds: unknown setting; use one of urgent_s" in capsys.readouterr().err

@@ -92,6 +92,8 @@ def test_planners_of_one_name_are_distinguished_by_their_folders():
     )
     assert compare(PLAN, [bc], [ppo]).names == ("seed-0 (bc/seed-0)", "seed-0 (ppo/seed-0)")
     assert compare(PLAN, [bc], [other]).names == ("seed-0 (seed-0)", "seed-0 (other)")
+    seeds = [dataclasses.replace(one, folder=Path(f"runs/bc/{row}")) for row, one in enumerate((*tables, bc))]
+    assert compare(PLAN, seeds[:2], seeds[2:]).names == ("bc (A)", "bc (B)")
 
 
 def test_order_does_not_matter_and_only_common_scenarios_count():

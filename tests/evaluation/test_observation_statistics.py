@@ -148,7 +148,12 @@ def test_planner_of_another_action_space_is_refused(bank):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"), [({"every": 0}, "every 0 steps"), ({}, "needs stored scenarios")]
+    ("options", "words"),
+    [
+        ({"every": 0}, "every 0 steps"),
+        ({"every": 91}, "every 91 steps; use 1 to 80"),
+        ({}, "needs stored scenarios"),
+    ],
 )
 def test_impossible_statistics_are_refused(bank, options, words, monkeypatch):
     if not options:

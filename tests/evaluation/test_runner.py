@@ -249,8 +249,9 @@ def test_audit_finds_violations_of_the_log():
 def test_start_step_without_an_action_is_refused():
     bank = bank_of(straight_road([car(0, 0, 0, 8)]))
     names = [{"dataset": "test", "scenario_id": "a", "segment": "a"}]
-    with pytest.raises(UsageError, match="leaves no action"):
-        evaluate(Expert(), bank, names, start_step=90)
+    for step in (90, -1):
+        with pytest.raises(UsageError, match=f"no episode can start at step {step}; use 0 to 89"):
+            evaluate(Expert(), bank, names, start_step=step)
 
 
 def named(recording, name):

@@ -18,7 +18,7 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.seeds import CrossedEffect
 from drivax.stats.significance import holm_adjust
 from drivax.studies import study as runner
-from drivax.studies.definition import Study, StudyConfig, StudyDefinition, StudySets, load_study
+from drivax.studies.definition import Arm, Study, StudyConfig, StudyDefinition, StudySets, load_study
 from drivax.studies.verdicts import (
     Strata,
     ValidationCheck,
@@ -403,6 +403,11 @@ def test_settings_out_of_range_are_refused(data, tmp_path):
         study = replace(study, config=replace(study.config, total_steps=steps))
         with pytest.raises(UsageError, match=words):
             study.train_config("bc", 0)
+    patient = ("--patience", "2", "--evaluate_every", "1")
+    for training in (patient, ("--checkpoint_rule", "lexicographic")):
+        study = replace(study, config=replace(study.config, total_steps=None, training=training))
+        with pytest.raises(UsageError, match="leave out checkpoint_rule and patience"):
+            study.train_config("bc", 0)
 
 
 def test_claims_that_no_test_decides_are_refused():
@@ -414,6 +419,8 @@ def test_claims_that_no_test_decides_are_refused():
         replace(LONGTAIL, metrics=metrics, claims=(replace(claim, metric="distance"),))
     with pytest.raises(ValueError, match="two different baselines"):
         replace(LONGTAIL, baselines=("bc", "bc"))
+    with pytest.raises(ValueError, match="use the method to match with permuted: true"):
+        replace(LONGTAIL, arms=LONGTAIL.arms | {"control": Arm(method="random_matched")})
     with pytest.raises(ValueError, match="'idm' is a planner and an arm"):
         replace(LONGTAIL, arms=LONGTAIL.arms | {"idm": LONGTAIL.arms["bc"]})
 

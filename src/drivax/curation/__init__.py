@@ -1,8 +1,8 @@
 """Criticality scores of logged scenarios, sampling weights, and the most critical subset of a set.
 
 ``methods`` registers the methods and applies them to a set: ``kinematic`` and ``rarity`` compute components of every
-step of the logs (read by ``logged``), ``ensemble`` trains critics and predicts, ``methods`` scores their disagreement,
-and ``scores`` holds the table of scores. ``weights`` converts a table to sampling weights, ``subset`` writes the most
+step of the logs (read by ``logged``), and ``ensemble`` trains policies, whose disagreement ``methods`` scores.
+``scores`` holds the table of scores, ``weights`` converts a table to sampling weights, and ``subset`` writes the most
 critical scenarios.
 """
 

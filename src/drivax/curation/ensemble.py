@@ -93,6 +93,8 @@ class EnsembleConfig:
         check_at_least(self, 1, "total_steps")
         check_at_least(self, 0, "seed")
         check_learnable(self.task.actions)
+        if self.weighted == "rarity" and self.task.actions.size != 2:
+            raise UsageError("rarity is of actions of two dimensions", cure="use weighted: plain")
 
     @property
     def iterations(self) -> int:
@@ -104,7 +106,7 @@ class EnsembleConfig:
 class Predictions:
     """Predictions of the members at every step of a set, and the expert's actions, in units of the action space.
 
-    ``action`` are the modes of the members. ``known`` marks steps at which the expert's action is known and within the
+    ``action`` are the modes of the members. ``known`` marks usable steps (``ExpertSteps``) with an action within the
     bounds. ``information`` is the mutual information of action and member in nats, for members trained by likelihood.
     """
 
@@ -246,9 +248,10 @@ def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: i
         return
     size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
     if 2 * size * count > free:
+        # Half of what fits, because whole recordings exceed the number, and the training needs memory.
         max_scenarios, need_gb = free // (4 * size), 2e-9 * size * count
         problem = f"{count:,} scenarios take about {need_gb:,.0f} GB, and {free / 1e9:,.0f} GB are free"
-        cure = f"pass --learn_from {max_scenarios} to train on fewer scenarios; all are scored"
+        cure = f"set learn_from to {max_scenarios} to train on fewer scenarios; all are scored"
         cure = cure if max_scenarios >= config.folds else "free memory"
         raise UsageError(problem, file=data.path, cure=cure)
 
@@ -274,7 +277,7 @@ def fit(
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
     results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
-    take three times as long.
+    are slower.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:

@@ -7,8 +7,8 @@ Components of every step, all in [0, 1]:
   (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), over the car's maximum deceleration (brake threat number
   of Braennstroem, Sjoeberg and Coelingh, 2008). Oncoming agents count as standing, because ego's braking cannot reduce
   their share of the closing speed;
-- volatility: the larger of jerk and yaw acceleration, relative to their limits, from a Savitzky-Golay filter (1964)
-  centred at the action of the step;
+- volatility: the larger of jerk and yaw acceleration, relative to twice nuPlan's limits, from a Savitzky-Golay filter
+  (1964) around the action of the step;
 - off_road: closeness of the car's corners to the road edge, 1 beyond it;
 - lane_deviation: distance to the nearest lane centre;
 - density: number of agents.
@@ -39,7 +39,7 @@ from drivax.simulator.types import Frame
 
 #: Centres of two route windows that cover about 75 m of the path ahead, m.
 _WINDOWS_M = (6.0, 45.0)
-#: nuPlan's filter window of 1.5 s, and its orders for jerk (from accelerations) and yaw acceleration (from headings).
+#: Filter window of 1.5 s, as nuPlan's for jerk, and nuPlan's orders for jerk and yaw acceleration.
 _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 
@@ -87,7 +87,7 @@ def check_positive(values: dict[str, float]) -> None:
     """Check that scales are positive and finite."""
     for name, value in values.items():
         if not 0.0 < value < float("inf"):
-            raise UsageError(f"{name} is {value}", cure="use a positive number")
+            raise UsageError(f"{name} is {value}", cure="use a positive number, but not inf")
 
 
 def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
@@ -117,8 +117,8 @@ def _braking_at_step(
     """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's logged path.
 
     An agent is on the path if its box overlaps a strip of ego's width along the logged route, on ego's level, up to
-    about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way. The
-    result is 0 if no agent is on the path, or if ego does not approach it.
+    about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if
+    no agent is on the path, or if ego does not approach it. A gap below 0.1 m, or an overlap, counts as 0.1 m.
 
     ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the logged route.
     """
@@ -155,8 +155,8 @@ def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
 def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, ""]) -> Float[Array, " T"]:
     """Return the volatility of the action from each step to the next; the ``last`` step repeats the previous value.
 
-    Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s. Noise of 1 cm/s in the speed
-    changes the jerk by some hundredths of a m/s3.
+    Jerk (from accelerations) and yaw acceleration (from headings) are derivatives of a polynomial fitted to 1.5 s.
+    Noise of 1 cm/s in the speed changes the jerk by some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
     valid = log.valid[1:] & log.valid[:-1]
@@ -188,7 +188,7 @@ def _derivative(
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(box: Array, ground: Array) -> Array:
-        # A logged car without a road edge nearby is on a driveway or outside the map, and counts as on the road.
+        # Where its side of the edges is unknown, as on a driveway or outside the map, a logged car is on the road.
         on_road = jnp.ones(4, bool)
         outside_m = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
         return jnp.max(jnp.clip(1.0 + outside_m / config.edge_m, 0.0, 1.0))
@@ -260,7 +260,7 @@ def _backward_difference(values: Float[Array, " T"]) -> Float[Array, " T"]:
 
 
 def _interaction(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    """Return the largest product of distance and closing speed, ``max(0, -dp . dv)``, over all agents."""
+    """Return the largest product of distance and closing speed, ``-dp . dv``, over its scale, within 0 and 1."""
 
     def largest(frame: Frame, velocity: Array) -> Array:
         offset, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity

@@ -131,7 +131,7 @@ def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None)
 def map_batches(
     data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
 ) -> dict[str, Numbers]:
-    """Apply a function to banks of ``BATCH`` scenarios of one shape, and return its results by name, ``[N, ...]``."""
+    """Apply a function to banks of one shape, up to ``BATCH`` scenarios each; return results by name, ``[N, ...]``."""
     sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]

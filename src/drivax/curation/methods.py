@@ -21,7 +21,6 @@ from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity,
 from drivax.curation.scores import Combination, ScoreTable, read_scores
 from drivax.curation.weights import permute_scores
 from drivax.errors import DataError, UsageError, did_you_mean
-from drivax.networks.distributions import Actions
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
@@ -166,7 +165,7 @@ def ensemble_table(
 ) -> ScoreTable:
     """Return scores by the disagreement d of an ensemble, which may have been trained on another set.
 
-    The component ``disagreement`` is ``d / (d + scale)``, which is monotonic in d; ``action_0`` and ``action_1`` are
+    The component ``disagreement`` is ``d / (d + scale)``, which is monotonic in d; ``action_0``, ``action_1``, ... are
     the same for each dimension of the action. An ensemble trained by likelihood has ``information`` instead, the
     mutual information relative to its maximum. ``error_rank_correlation`` in the table's configuration is the rank
     correlation of scores and squared errors over steps. If the ensemble was trained on all scenarios of the set, errors
@@ -221,7 +220,7 @@ def _ensemble_combination(config: EnsembleConfig) -> Combination:
 
 
 def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
-    size = 0 if config.cloning.loss == "likelihood" else Actions().size
+    size = 0 if config.cloning.loss == "likelihood" else config.task.actions.size
     return tuple(f"action_{index}" for index in range(size))
 
 

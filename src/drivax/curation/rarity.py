@@ -73,7 +73,7 @@ class KernelRarity:
         if not 0.0 <= self.temper <= 1.0:
             raise UsageError(f"temper is {self.temper}", cure="use 0 to 1")
         if not 1.0 <= self.most < float("inf"):
-            raise UsageError(f"most is {self.most}", cure="use 1 or more")
+            raise UsageError(f"most is {self.most}", cure="use 1 or more, but not inf")
 
     def density(self, actions: Actions, at: QueryActions) -> QueryValues:
         """Return the density of ``actions`` at the points ``at``, per unit of area; both are in [-1, 1]."""

@@ -43,7 +43,7 @@ class Combination:
     def __post_init__(self) -> None:
         for name, weight in self.weights.items():
             if not 0.0 <= weight < float("inf"):
-                raise UsageError(f"the weight of {name!r} is {weight}", cure="use 0 or more")
+                raise UsageError(f"the weight of {name!r} is {weight}", cure="use 0 or more, but not inf")
         if not any(self.weights.values()):
             raise UsageError("all weights are 0", cure="give a component a weight above 0")
         aggregators = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario

@@ -46,8 +46,8 @@ class WeightConfig:
 
     def __post_init__(self) -> None:
         for name, is_valid, cure in (
-            ("floor", 0.0 <= self.floor < float("inf"), "use 0 or more"),
-            ("temperature", 0.0 < self.temperature < float("inf"), "use a positive number"),
+            ("floor", 0.0 <= self.floor < float("inf"), "use 0 or more, but not inf"),
+            ("temperature", 0.0 < self.temperature < float("inf"), "use a positive number, but not inf"),
             ("most", self.most > 1.0, "use more than 1, inf for no limit"),
             ("uniform", 0.0 <= self.uniform <= 1.0, "use 0 to 1"),
         ):

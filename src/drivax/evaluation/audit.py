@@ -1,7 +1,7 @@
 """Audit scenarios: replay the logged ego and evaluate the episode.
 
-A violation by the logged ego points to a defect of the map or the converter. Steps without a logged ego are not
-evaluated. :data:`~drivax.scenario.select.selection.FINDINGS` explains the findings.
+A violation by the logged ego points to a defect of the map or the converter. Steps without a logged ego only count for
+``ignored_overlaps``. :data:`~drivax.scenario.select.selection.FINDINGS` explains the findings.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Findings = dict[str, float | int | bool | str | None]
 
 #: Logs per batch.
 BATCH = 64
-#: The heading of an agent is wrong by pi if it reverses more than 20 m, or more than 5 m and 90 % of its distance.
+#: The heading of an agent counts as wrong by pi if it reverses more than 20 m, or more than 5 m and 90 % of its way.
 REVERSE_M, MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE = 20.0, 5.0, 0.9
 #: Slower motion is jitter.
 CREEP_MPS = 0.5
 _DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
-#: A route leads to the log's end if its goal is at most as far from it, m (as for ``reached_goal``).
+#: Largest distance between the goal of a route and the end of the log that it leads to, m (as for ``reached_goal``).
 GOAL_M = 3.0
 _FACTS = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
     "logged", "log_divergence_m",
 )  # fmt: skip
-#: Action spaces, by the finding that counts logged actions outside their bounds.
+#: Action spaces, by the finding that is the share of logged actions outside their bounds.
 _ACTION_SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 

@@ -52,12 +52,12 @@ class Comparison:
     """Result of a comparison.
 
     Attributes:
-        names, folders: Different names, and run folders of A and B.
+        names, folders: Different names, and run folders of A and B; of several seeds the folder around the first run.
         traffic: Traffic model of both.
         scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
         strata: Number of strata of the split; 1 without strata.
-        sensitivity: Sensitivity of the primary metric; None if the metric does not vary, or if too few scenarios or
-            recordings define it.
+        sensitivity: Sensitivity of the primary metric; None if its differences (in a split: its values) do not vary, or
+            if too few scenarios or recordings define it.
         seeds: Spread over seeds of A and B; None for a single seed.
     """
 
@@ -83,7 +83,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Side:
-    """One planner: the evaluation of each seed, and the mask of its common scenarios."""
+    """One planner: the evaluation of each seed, the common scenarios, and the mask of those in its arm."""
 
     tables: Sequence[EpisodeTable]
     pairs: Pairs
@@ -267,7 +267,7 @@ def compare(
         pairing.check_metric(metric, (*a, *b), primary=metric == plan.primary)
     pairs = Pairs.of(*a, *b)
     if not pairs.keys:
-        raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
+        raise UsageError("the runs have no scenario in common", cure="evaluate all on the same scenarios")
     if plan.split != "paired" and max(len(a), len(b)) > 1:
         raise UsageError("a split takes one evaluation of A and of B", cure="compare seeds in pairs")
     split = None if plan.split == "paired" else _split(plan, pairs, entries)
@@ -300,10 +300,10 @@ def compare(
 
 
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
-    """Return the names of A and B; equal ones with the shortest different ends of their folders."""
+    """Return the names of A and B; equal ones with the shortest different ends of their folders, if these differ."""
     if a.name != b.name:
         return a.name, b.name
-    if a.folder is None or b.folder is None:
+    if a.folder is None or b.folder is None or a.folder.resolve() == b.folder.resolve():
         return f"{a.name} (A)", f"{b.name} (B)"
     first, second = a.folder.resolve(), b.folder.resolve()
     return f"{a.name} ({path_end(first, [second])})", f"{b.name} ({path_end(second, [first])})"

@@ -278,9 +278,9 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
 def comfort_series(ego: EgoMotion) -> Comfort:
     """Return the six comfort series (``ego_is_comfortable``).
 
-    As in the devkit, the acceleration of the centre adds both terms of the yawing frame to the longitudinal component,
-    so that the lateral one is always 0. Jerk magnitude is that of the rear axle. The filter windows of yaw rate and yaw
-    acceleration have 5 samples.
+    As in the devkit, values are rounded to 8 decimals, and the acceleration of the centre adds both terms of the yawing
+    frame to the longitudinal component, so that the lateral one is always 0. Jerk magnitude is that of the rear axle.
+    The filter windows of yaw rate and yaw acceleration have 5 samples.
     """
     samples = len(ego.heading)
 
@@ -351,7 +351,7 @@ def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
 
 
 def _current_objects(road: Road, inside: Bool[np.ndarray, " o"]) -> set[int]:
-    """Return the lane that contains a point, or else the connectors (``get_current_route_objects``)."""
+    """Return the first lane that contains a point, or else the connectors (``get_current_route_objects``)."""
     containing = np.flatnonzero(inside).tolist()
     lanes = [index for index in containing if not road.objects[index].connector]
     return set(lanes[:1] or containing)
@@ -392,7 +392,7 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
     for agent in np.flatnonzero(touches.any(axis=0)).tolist():
         sample = int(touches[:, agent].argmax())
         angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample, agent][None])[0]
-        if abs(ego.speed[sample]) <= _STOPPED_MPS:
+        if ego.speed[sample] <= _STOPPED_MPS:
             kind = _EGO_STOPPED
         elif tracks.speed[sample, agent] <= _STOPPED_MPS:
             kind = _TRACK_STOPPED
@@ -408,7 +408,7 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
 
 
 def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
-    """Return 1 - n/2 for n at-fault collisions with static objects, 0 after an at-fault collision with a road user."""
+    """Return 1 - n/2, at least 0, for n at-fault collisions; 0 if one is with a road user."""
     at_fault = [tracks.kind[collision.agent] for collision in collisions if collision.at_fault]
     if not all(kind in (AgentKind.STATIC, AgentKind.OTHER) for kind in at_fault):
         return 0.0
@@ -434,9 +434,9 @@ def _time_to_collision(
         angle = _angle_deg(ego.rear_axle[sample], ego.heading[sample], tracks.xy[sample])
         relevant = (angle < _AHEAD_DEG) | (includes_sides[sample] & (angle <= _BEHIND_DEG))
         agents = np.flatnonzero(relevant & tracks.present[sample] & (first_contact > sample))
-        if not len(agents) or abs(ego.speed[sample]) <= _TTC_STOPPED_MPS:
+        if not len(agents) or ego.speed[sample] <= _TTC_STOPPED_MPS:
             continue
-        ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], abs(ego.speed[sample]), ahead_s)
+        ego_boxes = _sweep(ego.corners[sample], ego.heading[sample], ego.speed[sample], ahead_s)
         motion = (values[sample, agents] for values in (tracks.corners, tracks.heading, tracks.speed))
         overlaps = shapely.intersects(ego_boxes, _sweep(*motion, ahead_s)).any(axis=0)
         if overlaps.any():
@@ -518,6 +518,7 @@ def _wrong_way_distance(road: Road, route: Sequence[Sequence[int]], ego: EgoMoti
             last_position = position
         else:
             last_object, last_position = objects[0], None
+    # As in the devkit: a window has one difference more than fits in its duration.
     samples = round(_DIRECTION_S / ego.dt_s)
     sums = [progress[max(0, end - samples) : end + 1].sum() for end in range(len(progress))]
     return -abs(float(min(sums)))

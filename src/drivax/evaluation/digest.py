@@ -2,8 +2,8 @@
 
 Rule-based planners drive 64 scenarios of the built-in world. The digest covers truths, counts, which of them are
 defined, and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would
-differ between machines by float noise. The grid of each quantity therefore starts at that multiple of an eighth of its
-unit that is farthest from all 64 values (docs/guide/reproducibility.md has distances).
+differ between machines by float noise. The grid of each quantity is therefore shifted by the multiple of an eighth of
+its unit whose edges are farthest from all 64 values (docs/guide/reproducibility.md has distances).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _UNDEFINED = -9.0
 
 
 def standard_digests() -> Iterator[tuple[str, str]]:
-    """Generate the standard scenarios, drive them, and yield (name, digest) of each planner and of them all.
+    """Generate the standard scenarios, drive them, and yield (name, digest) of each rollout and of them all.
 
     The first pair is the hash of the set, which the last digest does not cover.
     """
@@ -83,4 +83,5 @@ def grid_cells(
 
 
 def _sha256(data: bytes) -> str:
+    """Return the first 16 hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()[:16]

@@ -182,7 +182,7 @@ class EpisodeTable:
 
     @property
     def crash_by_scenario(self) -> dict[ScenarioKey, Crash]:
-        """Crash by scenario."""
+        """Crash by scenario; of repeated episodes the last one."""
         return {(crash.dataset, crash.scenario_id): crash for crash in self.crashes}
 
     @cached_property
@@ -190,7 +190,7 @@ class EpisodeTable:
         """Trajectories of the episodes, in their order.
 
         Raises:
-            DataError: ``trajectories.npz`` is missing, damaged, or lacks an episode.
+            DataError: ``trajectories.npz`` is missing, damaged or edited, or lacks an episode.
         """
         if self.in_memory is not None:
             return self.in_memory

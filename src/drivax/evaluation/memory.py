@@ -25,7 +25,7 @@ _MEMORY_INFO = Path("/proc/meminfo")
 
 
 def memory_of(device: Any, share: int = 1) -> int | None:
-    """Return the memory of a device in bytes; of a CPU, the memory of the machine or container over ``share``."""
+    """Return the bytes of a device, or None if unknown; of a CPU those of machine or container divided by ``share``."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"])
@@ -36,7 +36,10 @@ def memory_of(device: Any, share: int = 1) -> int | None:
 
 
 def free_memory(device: Any) -> int | None:
-    """Return the free bytes of a device, or None if unknown; the page cache of Linux counts as free."""
+    """Return the free bytes of a device, or None if unknown.
+
+    The page cache of Linux counts as free; on other systems, all of the memory of a CPU does.
+    """
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
@@ -51,7 +54,7 @@ def free_memory(device: Any) -> int | None:
 
 
 def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:
-    """Return the number of scenarios to load at a time: as many as fit in half of the free memory.
+    """Return the number of scenarios to load at a time: as many as fit, with the program, in half of the free memory.
 
     At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`, which is returned if
     ``free`` (bytes) is None. A scenario exists twice while its bank is built.

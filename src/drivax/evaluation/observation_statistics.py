@@ -1,8 +1,8 @@
 """Statistics of observation features, their correlation with collisions, and their importance to a policy.
 
 States of closed-loop episodes are sampled at regular steps. The statistics of a column are its mean, standard
-deviation and extremes over all valid rows, the number of its non-finite entries, its correlation with collisions, and
-its importance to the planner.
+deviation and extremes over finite entries of valid rows, the number of its non-finite entries, its correlation with
+collisions, and its importance to the planner.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class ObservationStatistics:
     Attributes:
         planner: Name of the planner.
         episodes, collisions: Numbers of episodes, and of episodes with a collision.
-        states, permuted: Numbers of sampled states, and of states whose features were permuted.
+        states, permuted: Numbers of sampled states before the last step of a log, and of those with permuted features.
         features: Statistics of each column.
         groups: Importance of each group as a whole, if features were permuted.
     """
@@ -128,16 +128,17 @@ def observation_statistics(
         task: Observations and actions.
         permute: Whether to measure the importance of features to the planner.
         traffic: Traffic model; log replay by default.
-        every: Steps between two sampled states.
+        every: Steps between two sampled states; a shorter rest of the steps has no sample.
         seed: Seed of the planner, as in an evaluation, and of the permutations.
 
     Raises:
         UsageError: Planner and task have different action spaces, the planner needs stored scenarios, or ``every`` is
-            below 1.
+            below 1 or above the steps of an episode.
     """
     check_actions(planner, task)
-    if every < 1:
-        raise UsageError(f"every {every} steps", cure="use 1 or more")
+    steps = bank.steps - 1 - CURRENT_STEP
+    if not 1 <= every <= steps:
+        raise UsageError(f"every {every} steps", cure=f"use 1 to {steps}")
     if hasattr(planner, "prepare"):
         problem = f"planner {planner.name} needs stored scenarios"
         raise UsageError(problem, cure="choose another planner")
@@ -180,7 +181,7 @@ def _planner_importances(
 
 
 def _mask_after_log(observation: Mapping[str, Values], in_log: Values) -> dict[str, Values]:
-    """Return observations ``[episode, sample, ...]`` with every group masked after the end of the log."""
+    """Return observations ``[episode, sample, ...]`` with every group masked where ``in_log`` is false."""
     result = dict(observation)
     masks = {f"{group}_mask" for group in observation}
     for group in (name for name in observation if name not in masks):
@@ -216,7 +217,7 @@ def column_statistics(
 def sample_states(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0
 ) -> SampledStates:
-    """Return sampled states of one episode per scenario, up to a crash those of an evaluation with this seed."""
+    """Return sampled states of one episode per scenario: until a crash, those of an evaluation with this seed."""
     batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
         scenarios = np.arange(first, min(first + BATCH, len(bank)))
@@ -310,9 +311,9 @@ def importances(
 
     This is permutation importance (Breiman 2001) of the action instead of a loss. A column is permuted among the valid
     rows of all states; a whole group is permuted between states, including its mask. The change is the root mean
-    square difference from the action for the true observation, over states and action dimensions, in standard
-    deviations of each dimension over the states. A feature without influence has 0; 1.41 is the difference between the
-    actions of independent states. The result is NaN if the action is the same in all states.
+    square difference from the action for the true observation, over states and the action dimensions that vary, in
+    standard deviations of each dimension over the states. A feature without influence has 0; 1.41 is the difference
+    between the actions of independent states. The result is NaN if the action is the same in all states.
 
     Args:
         act: From a batch of observations to actions ``[state, D]``.

@@ -34,7 +34,7 @@ class ComparisonPlan:
         smallest_difference: The smallest difference that matters, in the unit of the primary metric; null: a tenth of
             ``Sensitivity.deviation``.
         test: Test of means in pairs: ``permutation``, or ``bootstrap`` if differences are far from symmetric.
-        resamples: Number of bootstrap samples and permutations.
+        resamples: Number of permutations, and of bootstrap samples except for the mean of one run, which has 10,000.
         seed: Seed of the split and of all resampling.
     """
 
@@ -102,7 +102,7 @@ class MetricComparison:
     """Comparison of two planners in one metric.
 
     Attributes:
-        unit: ``-`` for shares, empty if unknown.
+        unit: ``-`` without a unit, empty if unknown.
         better: ``high``, ``low``, or ``-`` for neither.
         a, b, difference: Means over the included scenarios, and ``A - B``.
         effects: Cohen's d: ``d_z`` and ``d_av`` of pairs, ``d`` of a split.
@@ -142,7 +142,7 @@ class Decision:
     Attributes:
         recommendation: The planner to choose, no difference, or not enough scenarios to decide.
         because: The part of the rule that decided.
-        needed: Required number of scenarios, if there are too few.
+        needed: Required number of scenarios, if there are too few; one more than there are if it is unknown.
         caveats: Secondary metrics in which the recommended planner is worse.
     """
 
@@ -159,9 +159,9 @@ def decide(
     """Decide by the rule: enough scenarios, then the test, then the power to conclude "no difference".
 
     With fewer scenarios than the plan's minimum, there is no decision. A test that rejects recommends the better
-    planner. Otherwise the result is "no difference" if both planners have the same values, or if the comparison had
-    the plan's power to detect the smallest difference that matters. If it had not, there are not enough scenarios, or
-    not enough seeds if no number of scenarios suffices.
+    planner. Otherwise the result is "no difference" if both planners have the same values in all seeds, or if the
+    comparison had the plan's power to detect the smallest difference that matters. If it had not, there are not enough
+    scenarios, or not enough seeds if no number of scenarios suffices.
     """
     n = primary.difference.n
     needed = max(plan.minimum_scenarios, 0 if sensitivity is None else sensitivity.needed or 0)
@@ -176,4 +176,5 @@ def decide(
         return Decision("no difference", "power", None, ())
     if sensitivity is not None and sensitivity.needed is None:
         return Decision("not enough scenarios", "seeds", None, ())
+    # Without a sensitivity, or close to the required power, ``needed`` may not exceed the present number.
     return Decision("not enough scenarios", "power", max(needed, n + 1), ())

@@ -101,7 +101,7 @@ def devkit_rows(
         ours = {name: float(table.metrics[metric][number]) for name, metric in TERMS.items()}
         ours |= {name: 1.0 - ours[name] for name in _NEGATED}
         devkit = {name: float(getattr(verdict, name)) for name in TERMS}
-        # A crashed ego stands still, which would be comfortable and safe; a crash must not improve the score.
+        # After a crash the last state is repeated, which may look comfortable and safe.
         devkit |= {"score": 0.0} if key in crashes else {}
         result.append(ProfileRow(*key, ours, devkit))
         progress(number + 1, len(table))
@@ -226,7 +226,10 @@ def _moving_agents(
 
 
 def _speeds(xy: Float[np.ndarray[Any, Any], "t A 2"]) -> Float[np.ndarray[Any, Any], "t A"]:
-    """Return speeds over the longest valid window of up to 0.5 s; stored positions are multiples of 2 cm."""
+    """Return speeds over the longest valid window of the last 0.5 s, or over the next step where an agent appears.
+
+    Speeds over one step are noisy, because stored positions are multiples of 2 cm.
+    """
     speed = np.zeros(xy.shape[:2])
     for lag in range(1, _SPEED_STEPS + 1):
         window_speed = np.linalg.norm(xy[lag:] - xy[:-lag], axis=-1) / (lag * DT_S)

@@ -44,8 +44,8 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 class MetricLabel:
     """Presentation of a metric: label with unit, better direction (``-`` for none), unit, and explanation.
 
-    The unit is ``rate`` for shares of episodes, and ``share`` for other numbers without a unit. The explanation of an
-    unknown metric is empty.
+    The unit is ``rate`` for built-in shares of episodes, ``share`` for other numbers without a unit. An unknown metric
+    has no explanation.
     """
 
     text: str

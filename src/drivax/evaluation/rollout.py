@@ -118,7 +118,7 @@ def drive(
     """
     step = partial(_step, simulator, planner, bank)
     first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
-    # A mapped step inside the loop: to map the loop itself, JAX traces its body several times.
+    # Map the step, not the loop: to map a loop, JAX traces its body several times.
     last, outputs = jax.lax.scan(lambda loop, key: jax.vmap(step)(loop, key), first, step_keys.T)
     outputs = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), outputs)
     return jax.vmap(partial(_outcome, simulator.traffic, bank, start_step))(first, last, outputs)
@@ -144,7 +144,7 @@ def _step(
     state = jax.tree.map(partial(jnp.where, is_over), state, after)
     all_finite = loop.all_finite & (is_finite | is_over)
     metric_state = state
-    if not planner.replays:
+    if not planner.replays:  # A replay cannot crash.
         metric_state = jax.tree.map(partial(jnp.where, all_finite), state, loop.metric_state)
     context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
     others = _others(simulator.traffic, bank, state)

@@ -48,7 +48,7 @@ from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
 from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
-#: Scenarios per program call on a CPU, where larger batches exceed the caches and smaller ones add overhead
+#: Scenarios per program call on a CPU, a compromise between planners whose larger batches exceed the caches and others
 #: (docs/log/2026-11-22-evaluation.md), and on other devices.
 CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
 #: Maximum number of scenarios in an error message, and of crashes in a list.
@@ -227,8 +227,8 @@ def evaluate(
         options: See :class:`Options`.
 
     Raises:
-        UsageError: There is no scenario, planner, task, start and scenarios are incompatible, or an option is invalid
-            (``batch`` below 1, ``sizes`` too small).
+        UsageError: ``scenarios`` is empty; or planner, task, start and scenarios are incompatible; or an option is
+            invalid (``batch`` below 1, ``sizes`` too small).
         DataError: A log is too short.
         DrivaxError: Memory is insufficient, or ego's motion is not finite.
     """
@@ -327,7 +327,7 @@ class _Evaluation:
         if not isinstance(task, Task):
             raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
         if not 0 <= start_step < steps - 1:
-            raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {steps - 2}")
+            raise UsageError(f"no episode can start at step {start_step}", cure=f"use 0 to {steps - 2}")
         check_actions(planner, task)
         if planner.replays and simulator.start != LogStart():
             problem = f"planner {planner.name} replays the log and cannot start elsewhere"
@@ -456,7 +456,7 @@ def _check_finite(episodes: Episodes, names: Names) -> None:
     """Check that ego's motion is finite.
 
     Raises:
-        DrivaxError: It is not, although all actions were: the action space or the traffic is defective.
+        DrivaxError: It is not, although all executed actions were: the action space or the traffic is defective.
     """
     invalid = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
     if invalid.size:

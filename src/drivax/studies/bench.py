@@ -80,8 +80,10 @@ class BenchConfig:
 
 def use_all_cores() -> None:
     """Make every core of this process a JAX device; has no effect once JAX has started."""
+    # macOS has no affinities.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+        jax.config.update("jax_num_cpu_devices", cores)
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
@@ -89,7 +91,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
 
     Args:
         bank: Distinct scenarios; when an episode ends, another starts in a random one.
-        config: Sizes.
+        config: Settings.
 
     Returns:
         The object of ``drivax bench --json``: ``by_part`` in microseconds per environment and step, ``cost_by_part`` in
@@ -132,7 +134,7 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
     if BATCHES[0] % jax.device_count():
         problem = f"batches of {BATCHES[0]} cannot be divided among {jax.device_count()} devices"
         raise UsageError(
-            problem, cure="use a number of cores that divides them, as `taskset -c 0-3 drivax bench`"
+            problem, cure="use a number of cores that divides them: `taskset -c 0-3 drivax bench --metrics`"
         )
 
     def program(metrics: MetricNames, batch: int) -> Program:
@@ -397,7 +399,7 @@ def _repeat_part(config: BenchConfig, part: Part) -> Any:
 
 
 def _shift(state: SimState, distance: Array) -> SimState:
-    """Shift the state by a negligible distance."""
+    """Shift the state by a negligible distance, and the index by 0, so that every part depends on the distance."""
     history = state.context.history + distance
     index = state.context.index + distance.astype(jnp.int32)
     return replace(state, context=replace(state.context, history=history, index=index))

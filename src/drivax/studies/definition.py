@@ -142,6 +142,8 @@ class StudyDefinition:
             "baseline": (self.baselines, self.arms), "planner": (self.planners, PLANNERS),
             "metric": (self.metrics, METRICS), "method": (methods, METHODS),
         }  # fmt: skip
+        if "random_matched" in methods:
+            raise ValueError("for random_matched use the method to match with permuted: true")
         for kind, (names, available) in choices.items():
             for name in names:
                 if name not in available:
@@ -181,7 +183,8 @@ class StudyConfig:
         arms: Names of the arms, including all baselines; empty for all arms.
         seeds: Number of training runs of each arm.
         total_steps: Number of logged steps to draw in each training; null for that of the preset.
-        training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``.
+        training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``; not
+            ``checkpoint_rule`` or ``patience``. The study sets ``seed``, ``evaluate_every`` and ``checkpoint_every``.
         validations: Approximate number of closed-loop validations; the test evaluates the best checkpoint.
         weights: Settings of the sampling weights, the same for all methods.
         ensemble: The ensemble.
@@ -221,8 +224,8 @@ class StudySets:
     Attributes:
         train: Training set.
         validation: Validation set, for the choice of checkpoints.
-        test: Test sets. If some scenarios have a labelled event, the test has equally many with and without. The first
-            set has events as often as ordinary traffic.
+        test: Test sets. If only some scenarios have a labelled event, the test has equally many with and without. The
+            first set has events as often as ordinary traffic.
     """
 
     train: Path
@@ -327,6 +330,9 @@ class Study:
         if config.iterations < 2:
             problem = f"a training of {total_steps} steps has one iteration, too few for validations"
             raise UsageError(problem, cure="raise total_steps")
+        if config.checkpoint_rule != "score" or config.patience:
+            problem = "a study chooses checkpoints by the score, and stops no training early"
+            raise UsageError(problem, cure="leave out checkpoint_rule and patience")
         interval = max(config.iterations // self.config.validations, 1)
         # All checkpoints of the first baseline stay: another rule chooses among them afterwards.
         keep = config.iterations if arm == self.definition.baselines[0] else config.keep

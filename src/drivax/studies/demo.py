@@ -39,7 +39,7 @@ _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Sizes of the demo.
+    """Settings of the demo.
 
     Attributes:
         training: Number of training scenarios.
@@ -58,7 +58,7 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class Demo:
-    """Result of the demo: the report, a summary of each planner, paired differences to the policy, seconds by stage."""
+    """Result of the demo: the report, a summary of each planner, the policy's paired differences, seconds by stage."""
 
     report: Path
     summaries: list[dict[str, Any]]
@@ -66,7 +66,7 @@ class Demo:
     stages_s: dict[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Return summaries, paired differences to the policy, times and versions."""
+        """Return the fields except the report, and a description of the run."""
         return {
             "summaries": self.summaries,
             "policy_minus": self.differences,
@@ -114,7 +114,7 @@ def run_demo(
 
     Args:
         out: Folder for sets, runs and ``report.html``.
-        config: Sizes.
+        config: Settings.
         log: Called with a line before each stage.
         overwrite: Replace the output of an earlier demo in ``out``.
 

@@ -160,7 +160,7 @@ def _rate(rate: Mapping[str, float]) -> str:
 
 
 def draws_table(results: Results) -> Table:
-    """Return the distribution of the sampling weights of every arm."""
+    """Return the distribution of the sampling weights of every arm (permuted ones: of seed 0)."""
     names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
     headings = ("arm", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
     rows = [(arm, *(f"{draws[name]:.2f}" for name in names)) for arm, draws in results["draws"].items()]
@@ -192,7 +192,7 @@ def rule_cost_table(results: Results, rule: str) -> Table:
 
 
 def validations_table(results: Results, rule: str) -> Table:
-    """Return the first baseline's ``rule`` and score at each validation, and the seeds whose checkpoint they choose."""
+    """Return the first baseline's ``rule`` and score at each validation, and for how many seeds each chooses it."""
     curves = {
         name: np.array([seed[key] for seed in results["validations"]], np.float64)
         for name, key in ((rule, "rule"), ("score", "score"))
@@ -253,8 +253,8 @@ def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> s
 
 def _rankings(results: Results) -> str:
     return rankings_table(results).html() + (
-        "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. Rankings are called "
-        f"unrelated if the interval is within ±{UNRELATED}, related if it is beyond ±{RELATED}. "
+        "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. “They are orthogonal” "
+        f"is supported if the interval is within ±{UNRELATED}, contradicted if it is beyond ±{RELATED}. "
         "Two random rankings have 5 % of their top 5 % in common.</small></p>"
     )
 
@@ -265,8 +265,8 @@ def _rule_cost(results: Results, rule: str) -> str:
     agreements = sum(k == best_validation(seed["score"]) for k, seed in zip(best, seeds, strict=True))
     return (
         f"{rule_cost_table(results, rule).html()}<p><small>Test results of the baseline's checkpoints with the highest "
-        f"{escape(rule)} on held-out steps, minus those of the checkpoints with the best validation score, paired by "
-        f"seed. Both rules choose the same checkpoint for {agreements} of the {len(seeds)} seeds.</small></p>"
+        f"{escape(rule)}, minus those of the checkpoints with the best validation score, paired by seed. "
+        f"Both rules choose the same checkpoint for {agreements} of the {len(seeds)} seeds.</small></p>"
         f"{validations_table(results, rule).html()}"
     )
 

@@ -1,7 +1,8 @@
 """The study runner: score, train, evaluate, test the claims, write the report.
 
-Arms differ in how they draw logged steps. Each arm is trained with several seeds and the same budget, and evaluated on
-one test set. Claims compare arms scenario by scenario. An interrupted study resumes without repeating finished jobs.
+Arms differ in their preset and in how they draw logged steps. Each arm is trained with several seeds, by the budget of
+its preset unless ``total_steps`` is set, and evaluated on one test set. Claims compare arms scenario by scenario. An
+interrupted study resumes without repeating finished jobs.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def run_study(
     tables = _score(study, log)
     definition, config = study.definition, study.config
     data, test = ScenarioSet.open(study.sets.train), _test_set(study)
-    # Observations and actions of all arms are the same.
+    # The presets of all arms must have the same observations and actions.
     usable = usable_steps(study.train_config(definition.baselines[0], 0), data)
     for name in definition.planners:
         if not study.evaluation(name).is_dir():
@@ -139,7 +140,7 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
     log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
     if not all(check.met for check in checks) and not anyway:
         raise UsageError(
-            "the baseline does not drive well enough for a comparison",
+            "a baseline does not drive well enough for a comparison",
             file=study.folder,
             cure="train longer or with other settings in another --out, or pass --anyway",
         )
@@ -149,7 +150,10 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
 def _write_pages(
     study: Study, data: ScenarioSet, results: Mapping[str, Any], tables: Mapping[str, ScoreTable]
 ) -> None:
-    """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them."""
+    """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them.
+
+    A scenario of several methods has the scores of the last.
+    """
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
     write_report(study.definition, results, tables, actions, study.folder / "report.html")
@@ -237,7 +241,7 @@ def _test_set(study: Study) -> ScenarioSet:
 
 
 def _strata(study: Study, test: ScenarioSet) -> Strata:
-    """Return the strata of the test set; scenarios without labels are rare if they are among the most critical."""
+    """Return the strata of the test set; in a set without labels the most critical scenarios are rare."""
     recordings = recordings_of(test.entries)
     rare = event_kinds(test) > 0
     has_labels = bool(rare.any())
@@ -324,7 +328,7 @@ def _train_and_evaluate_arm(job: Job) -> float:
     steps = Checkpoints(refuse_link(run / "checkpoints")).steps()
     _check_not_evaluated(job, steps)
     validation = ScenarioSet.open(study.sets.validation)
-    # A finished training ends at once, and deletes what its interruption left.
+    # Of a finished training, this only deletes what an interruption left.
     train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])

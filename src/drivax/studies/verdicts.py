@@ -190,7 +190,7 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
 
 
 def _decide(result: ClaimResult, claims: int) -> ClaimResult:
-    """Return the result with its verdict; ``claims`` claims are adjusted together."""
+    """Return the result with its verdict; its group has ``claims`` claims."""
     if result.effect is None or result.adjusted_p is None:
         needed = "fewer than two recordings define it"
         if result.difference is not None:
