@@ -63,9 +63,9 @@ def check_reward(term: Term | str) -> None:
 def check_metric(metric: Metric | str) -> None:
     """Check a metric or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It has a unit and a definition. Its step value, if any, is a number or boolean and whether it is defined; a defined
-    one follows the rules of :func:`check_reward`, and the metric declares all facts that it reads. ``compute``, if any,
-    returns a ``Value`` at the end of an episode, which is finite if defined.
+    It has a unit and a definition. Its step value, if any, is a number or boolean and whether it is defined (rows of
+    both if delayed); a defined one follows the rules of :func:`check_reward`, and the metric declares all facts that it
+    reads. ``compute``, if any, returns a ``Value`` at the end of an episode, which is finite if defined.
     """
     what = f"metric {getattr(metric, 'definition', metric)!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
