@@ -158,7 +158,8 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
 
     Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
     are pure, repeat bit for bit from a stored state, change the parameters, and log finite numbers. The planner acts
-    within [-1, 1]; its mode is deterministic. Use small sizes, because the check runs three iterations.
+    within [-1, 1]; its mode is deterministic. Use small sizes and no warm-up, because the check runs three iterations
+    of a training of four, and the first must learn.
     """
     settings = instance(config)
     what = f"algorithm {type(settings).__name__}"
