@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow
 import pytest
 
 from drivax.cli import main
@@ -319,9 +320,22 @@ def test_unreadable_file_is_skipped_and_a_full_process_stops(folder, tmp_path, m
         convert(folder, tmp_path / "other")
 
 
+@pytest.mark.parametrize("name", ["womd-scenario", "nuplan", "av2-motion"])
+def test_too_many_open_files_end_a_conversion(name, tmp_path, monkeypatch):
+    def fail(*arguments, **settings):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    path = tmp_path / "source"
+    path.write_bytes(b"x")
+    monkeypatch.setattr(Path, "open", fail)
+    monkeypatch.setattr(pyarrow, "OSFile", fail)
+    with pytest.raises(UsageError, match="too many open files"):
+        list(convert_file(path, Conversion(format=name)))
+
+
 def test_file_that_cannot_be_opened_is_a_bad_record(tmp_path):
     (bad,) = convert_file(tmp_path / "gone.tfrecord", Conversion(format="womd-scenario"))
-    assert isinstance(bad, BadRecord) and bad.problem == "No such file or directory" and bad.cure
+    assert isinstance(bad, BadRecord) and bad.problem == "file not found" and bad.cure
 
 
 # --- What is left out, and what is written next to the scenarios.

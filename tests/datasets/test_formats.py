@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import importlib
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -138,6 +140,15 @@ def test_errors_for_unrecognised_files_say_why(content, problem, tmp_path):
     with pytest.raises(DataError, match=problem) as caught:
         detect(path)
     assert caught.value.file == path and caught.value.cure
+
+
+def test_a_file_without_permission_has_its_own_cure(tmp_path, monkeypatch):
+    def fail(*arguments, **settings):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    (tmp_path / "shard.tfrecord").write_bytes(b"x")
+    monkeypatch.setattr(Path, "open", fail)
+    assert "change the permissions" in detect_error(tmp_path / "shard.tfrecord").cure
 
 
 def test_errors_for_other_tfrecords_say_what_drivax_reads(wire, write_records):

@@ -246,6 +246,7 @@ def broken(content, *path, value):
         (("roads", 1, "id"), 1, "not unique"),
         (("roads", 0, "geometry"), None, "geometry of road 1"),
         (("roads", 0, "geometry", 3, "y"), [[0]], "geometry of road 1"),
+        (("roads", 0, "geometry"), [{"x": [], "y": [], "z": []}], "geometry of road 1"),
         (("roads", 0, "geometry", 3, "y"), float("inf"), "not finite"),
         (("tl_states",), [1], "not a dictionary"),
         (("tl_states",), {"x": {}}, "not an id"),

@@ -136,7 +136,7 @@ def test_nan_coordinates_raise_no_warning(tmp_path, envelope):
 
 
 def test_damaged_files_are_reported(tmp_path):
-    with pytest.raises(DataError, match="cannot be read"), open_database(tmp_path / "missing.gpkg"):
+    with pytest.raises(DataError, match="file not found"), open_database(tmp_path / "missing.gpkg"):
         pass
     other = tmp_path / "other.gpkg"
     other.write_bytes(b"PK\3\4" * 100)

@@ -22,7 +22,7 @@ from drivax.datasets.nuscenes.reader import (
     yaw,
 )
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.errors import DataError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import windows
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
@@ -60,6 +60,13 @@ def test_missing_files_are_reported(tmp_path):
     (bad,) = NuScenes().read(path)
     assert isinstance(bad, BadRecord)
     assert "is missing" in str(bad.error())
+
+
+def test_missing_shapely_names_the_extra(tmp_path, hide_packages):
+    path = sample.write(tmp_path)
+    hide_packages("shapely")
+    with pytest.raises(UsageError, match=r"pip install 'drivax\[maps\]'"):
+        list(NuScenes().read(path))
 
 
 @pytest.mark.parametrize("folder", ["maps", "expansion"])

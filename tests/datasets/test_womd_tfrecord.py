@@ -137,7 +137,7 @@ def test_framing_is_detected_by_the_first_header(good, tmp_path):
 
 
 def test_missing_file_is_reported(tmp_path):
-    with pytest.raises(DataError, match="No such file"):
+    with pytest.raises(DataError, match="file not found"):
         next(read_records(tmp_path / "none"))
 
 

@@ -43,7 +43,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing_package(error) or error from error
 
-#: Bound to which observations are clipped (5 km, 1.5 km/s; own groups too), since Gymnasium needs finite bounds.
+#: Bound to which observations are clipped (5 km, 1.5 km/s; own groups too), so that spaces have finite bounds.
 LIMIT = 100.0
 
 

@@ -141,7 +141,8 @@ def _key(scenario: Scenario) -> tuple[str, str]:
 def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
     """Yield the recordings of a file, and a bad record for a file or disk that cannot be read.
 
-    Limits of this process (open files, memory) and missing packages are raised.
+    Limits of this process (open files, memory) and missing packages are raised, but Argoverse and nuPlan take a lack of
+    memory for damage.
     """
     try:
         yield from reader.read(path)
@@ -282,7 +283,11 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return what a conversion shares with one that it resumes: options, and path, size and ends of each file."""
+    """Return what a conversion shares with one that it resumes.
+
+    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read.
+    Companions (maps, poses) are not compared.
+    """
     digest = hashlib.sha256()
     for entry in data.inputs:
         size, ends = _ends(entry.path)
@@ -362,7 +367,7 @@ class _Sink:
             self._write_batch()
 
     def skipped_rows(self) -> dict[str, Any]:
-        """Return the records that are not in the set, for its manifest."""
+        """Return number and list of the skipped records, and the number of filtered scenarios, for the manifest."""
         rows = [_row(self._data, record) for record in self.skipped]
         for row in rows:
             del row["cure"]

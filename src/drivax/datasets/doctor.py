@@ -32,7 +32,7 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 @dataclass(frozen=True)
 class Part:
-    """Files of one format, data set and version: ``sample_size`` of them are described, ``whole`` if those are all.
+    """Files of one format, data set and version: ``sample_size`` of them are described, ``whole`` if all intact ones.
 
     ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` are
     the most frequent ones, ``missing`` those of all of them. ``convertible`` says whether some file lacks nothing.

@@ -108,8 +108,9 @@ class Survey:
 def survey(src: str | Path, name: str = AUTO) -> Survey:
     """Find the files to read, and their formats.
 
-    A file given by name is always read. In a folder (searched to any depth, without hidden names) these are the files
-    that a reader recognises, and those with the name of a format's files, so that damaged ones are reported.
+    A file given by name is always read. In a folder (searched to any depth, without hidden names and links to folders)
+    these are the files that a reader recognises, and those with the name of a format's files, so that damaged ones are
+    reported.
 
     Args:
         src: A file or a folder.
@@ -167,5 +168,5 @@ def _no_input_error(folder: Path, count: int, readers: tuple[Reader, ...]) -> Da
     return unsupported.explain_folder(folder) or DataError(
         f"none of the {count} files in it is {kind}" if count else "has no files",
         file=folder,
-        cure="name the folder that holds the downloaded data",
+        cure="name the folder that holds the downloaded data; links to folders in it are not followed",
     )

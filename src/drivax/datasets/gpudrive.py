@@ -201,7 +201,7 @@ def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
     try:
         columns = [i for i, key in enumerate(keys) if key not in _OPTIONAL or not rows or key in rows[0]]
         values = np.array([[row[keys[i]] for i in columns] for row in rows], np.float64)
-        if values.size and values.shape != (len(rows), len(columns)):
+        if len(rows) and values.shape != (len(rows), len(columns)):
             raise ValueError("values are lists")
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise DataError(f"{what} is not a list of numbers {', '.join(keys)}", cure=_SKIP) from error

@@ -80,7 +80,7 @@ class Reader(Protocol):
 
     Readers hold no state and no open files: worker processes receive them by name. They read one file at a time, the
     one that names the recording or recordings (a shard, a pickle, a parquet, a database), and find what belongs to it
-    (a map, poses) next to it. Packages of extras are imported when they are needed.
+    (a map, poses) next to or above it. Packages of extras are imported when they are needed.
     """
 
     @property
@@ -116,7 +116,12 @@ class Reader(Protocol):
         ...
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """Yield the recordings of a file in file order, and a bad record in place of each that cannot be read."""
+        """Yield the recordings of a file in file order, and a bad record in place of each that cannot be read.
+
+        Raises:
+            DataError: The file cannot be opened; some readers yield a bad record instead.
+            UsageError: A package of an extra is missing, or a limit of this process is reached.
+        """
         ...
 
 

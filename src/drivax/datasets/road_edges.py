@@ -31,9 +31,9 @@ _AGAIN = "download the map again"
 def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
     """Return the boundary of all drivable areas: one closed EDGE_BOUNDARY per ring, drivable side on the left.
 
-    Self-intersecting polygons are repaired, overlapping and touching ones joined, gaps of up to 10 cm between them
-    closed (morphological closing); rings of fewer than three different points are dropped, then pieces below 1 m2 and
-    holes below 0.05 m2. Exteriors become anticlockwise, holes clockwise, the first point is repeated at the end.
+    Rings of fewer than three different points are dropped, self-intersecting polygons repaired, overlapping or touching
+    ones joined, gaps of up to 10 cm closed (morphological closing), then pieces below 1 m2 and holes below 0.05 m2
+    dropped. Exteriors become anticlockwise, holes clockwise, the first point is repeated at the end.
     Heights are interpolated along the nearest edge of a ring with three columns, 0 if there is none. Feature ids count
     up from ``first_id``.
     """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from drivax.datasets.womd.messages import parse
 from drivax.datasets.womd.tfrecord import read_records
-from drivax.errors import DataError, UsageError
+from drivax.errors import DataError, UsageError, explain_system
 from drivax.reading import read_json
 from drivax.scenario.store import AGAIN, MANIFEST
 
@@ -69,7 +69,8 @@ def explain(path: Path) -> DataError:
         with path.open("rb") as file:
             head = file.read(_HEAD)
     except OSError as error:
-        return DataError(error.strerror or "cannot be opened", file=path, cure="check the path")
+        cure = getattr(explain_system(error, path), "cure", "check the path")
+        return DataError(error.strerror or "cannot be opened", file=path, cure=cure)
     if not head:
         return DataError("the file is empty", file=path, cure="copy or download the file again")
     for magic, (problem, cure) in _MAGIC.items():

@@ -1,7 +1,7 @@
 """Checks of user-defined components for tests; errors name the violated rule and the cure.
 
-A check takes a component or its dotted name; planners and traffic models also by name. All
-built-in components pass, experts with ``privileged=True``.
+A check takes a component or its dotted name; planners and traffic models also by name. The built-in
+reward terms, metrics, encoders, traffic models and planners pass, experts with ``privileged=True``.
 """
 
 import lazy_loader

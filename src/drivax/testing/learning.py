@@ -28,7 +28,7 @@ from drivax.testing.contract import (
     same,
 )
 
-#: Groups with one and two row axes, with and without masks; one group of the second specification has no rows.
+#: Groups with up to two row axes, with and without masks; one group of the second specification has no rows.
 _SPECS = (
     {
         "agents": (4, 2, 3), "agents_mask": (4, 2), "ego": (2, 6), "ego_static": (4,), "route": (5, 5),
@@ -69,6 +69,7 @@ def check_encoder(config: EncoderConfig | str) -> None:
         expect(valid, problem, "return [*batch, width] float32, and set width")
         check_numbers(what, embedding)
         _check_state(what, settings, spec, encoder)
+        # Eager calls are slow: only the first specification is embedded without compilation too.
         _check_batches(what, (encoder if number == 0 else run, run), batch, embedding, tolerance)
         _check_masks(what, run, batch, embedding, tolerance)
         _check_gradients(what, encoder, batch)
@@ -102,7 +103,10 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
 def _check_batches(
     what: str, encoders: tuple[Any, Any], batch: Any, embedding: Any, tolerance: float
 ) -> None:
-    """Check one observation, alone and in a batch with two axes of size one; ``encoders``: eager and compiled."""
+    """Check one observation, alone by the first encoder and in a batch with two axes of size one by the second.
+
+    Check also that not all observations have the same embedding.
+    """
     single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), encoders
     for result in (encoder(single), run(jax.tree.map(lambda leaf: leaf[None, None], single))[0, 0]):
         valid = same(embedding[0], jax.device_get(result), tolerance)
@@ -154,7 +158,8 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
 
     Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
     are pure, repeat bit for bit from a stored state, change the parameters, and log finite numbers. The planner acts
-    within [-1, 1]; its mode is deterministic. Use small sizes, because the check runs three iterations.
+    within [-1, 1]; its mode is deterministic. Use small sizes and no warm-up, because the check runs three iterations
+    of a training of four, and the first must learn.
     """
     settings = instance(config)
     what = f"algorithm {type(settings).__name__}"
@@ -182,7 +187,8 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     before, after = int(stored.iteration), int(second.iteration)
     expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
     unchanged = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
-    expect(not unchanged, f"{what} learns nothing in an iteration", "return the new parameters")
+    cure = "return the new parameters, and set any warm-up to 0 for the check"
+    expect(not unchanged, f"{what} learns nothing in an iteration", cure)
     _check_logs(what, logs)
     repeated, _ = iterate(data, jax.tree.map(jnp.copy, stored))
     valid = same(_host_arrays(repeated), _host_arrays(second), 0.0)

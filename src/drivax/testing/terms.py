@@ -15,7 +15,7 @@ from drivax.plugins import find_named
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.types import FACTS, ON_REQUEST, AgentContext, Frame
+from drivax.simulator.types import AgentContext, Frame
 from drivax.tasks.observations import Feature, OwnGroup
 from drivax.tasks.rewards import Term
 from drivax.tasks.task import Task
@@ -63,9 +63,9 @@ def check_reward(term: Term | str) -> None:
 def check_metric(metric: Metric | str) -> None:
     """Check a metric or its dotted name; raise :class:`BrokenContract` if it violates a rule.
 
-    It has a unit and a definition. Its step value, if any, is a number or boolean and whether it is defined; a defined
-    one follows the rules of :func:`check_reward`, and the metric declares all facts that it reads. ``compute``, if any,
-    returns a ``Value`` at the end of an episode, which is finite if defined.
+    It has a unit and a definition. Its step value, if any, is a number or boolean and whether it is defined (rows of
+    both if delayed); a defined one follows the rules of :func:`check_reward`, and the metric declares all facts that it
+    reads. ``compute``, if any, returns a ``Value`` at the end of an episode, which is finite if defined.
     """
     what = f"metric {getattr(metric, 'definition', metric)!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
@@ -170,8 +170,6 @@ def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = F
 
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
     """Check that a value can be computed from its declared facts alone."""
-    unknown_facts = sorted(reads - FACTS - ON_REQUEST)
-    expect(not unknown_facts, f"{what} reads unknown fact {unknown_facts[:1]}", "see simulator.types.Facts")
     try:
         Program(what, value)(worlds.without_facts(worlds.moments(), reads))
     except (AttributeError, TypeError, ValueError) as error:

@@ -102,6 +102,7 @@ def _lane(segment: Any) -> MapFeature | None:
     if min(lengths) < _SHORTEST_M:
         return None
     # Sampled at the same fractions of their lengths, points of one row face each other.
+    # A longer line is damage, which ``_check_extent`` refuses; until then it takes little memory.
     count = int(min(max(lengths), 2 * _SPREAD_M) / _SPACING_M) + 2
     fraction = np.linspace(0.0, 1.0, max(len(left), len(right), count))
     left, right = _at(left, fraction), _at(right, fraction)

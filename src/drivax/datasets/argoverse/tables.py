@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from drivax.datasets.reader import read_head
-from drivax.errors import DataError, import_extra
+from drivax.errors import DataError, explain_system, import_extra
 from drivax.reading import check_regular
 
 DATASET = "av2"
@@ -65,7 +65,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
 
     Raises:
         DataError: The file is missing or damaged, has no rows, or lacks a column.
-        UsageError: pyarrow is missing.
+        UsageError: pyarrow is missing, or too many files are open.
     """
     pa = import_extra("pyarrow")
     check_regular(path, _AGAIN)
@@ -83,6 +83,8 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure) from error
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        if isinstance(error, OSError) and (failure := explain_system(error, path)):
+            raise failure from error
         raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
     return Table(table.num_rows, numbers, texts, unread)
 

@@ -1,8 +1,8 @@
 """From a stored scenario back to a recording, which exporters write and tests compare.
 
-Some information is lost. Stored polylines are simplified to 5 cm and cropped to 100 m around ego's log; boxes have one
-size; parked agents have one pose and no marks; stop signs have no ids and heights, and lights without a lane on the map
-no lane id. ``scenario.build.assemble`` says what is kept.
+Some information is lost. Stored polylines are simplified to 5 cm and, lanes of routes aside, cropped to 100 m around
+ego's log; boxes have one size; parked agents have one pose and no marks; stop signs have no ids and heights, and lights
+without a lane on the map no lane id. ``scenario.build.assemble`` says what is kept.
 """
 
 from __future__ import annotations

@@ -118,8 +118,8 @@ def _steps(recording: Recording) -> tuple[_Array, _Array]:
 def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     """Return the rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
-    That is: up to 8 tracks to predict by id, then those that are valid now by their distance from ego, then all
-    others, those with most valid steps first. Tracks that are not valid at any of the 91 steps are left out.
+    That is: of the tracks that are valid now up to 8 to predict by id, then the others by their distance from ego; then
+    those that are not, by their number of valid steps. Tracks that are not valid at any of the 91 steps are left out.
     """
     now = tracks.valid[:, CURRENT_STEP]
     to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
@@ -240,6 +240,7 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
     features = tuple(sorted(features, key=lambda feature: _ORDER.index(feature.kind)))
     spacing = _SPACING_M
     lines = [_sample(feature, spacing) for feature in features]
+    # Ends: the features' own points are fewer (two for each of at most 8192 stored segments).
     while sum(map(len, lines)) > POINTS:
         spacing *= _WIDEN
         lines = [_sample(feature, spacing) for feature in features]

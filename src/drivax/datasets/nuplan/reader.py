@@ -18,7 +18,7 @@ from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, fea
 from drivax.datasets.nuplan.sqlite import Database, open_database
 from drivax.datasets.parsing import flatten
 from drivax.datasets.reader import BadRecord, Description, attempt
-from drivax.errors import DataError
+from drivax.errors import DataError, DrivaxError
 from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
@@ -86,7 +86,7 @@ class NuPlan:
         try:
             with open_database(path) as database:
                 return all(database.columns(table) for table in _SIGNATURE)
-        except (OSError, DataError):
+        except (OSError, DrivaxError):
             return False
 
     def describe(self, path: Path) -> Description:
@@ -206,7 +206,8 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
     Of sweeps at 20 Hz every second one is taken, counted from the last gap. A piece that is too short for a window is
-    dropped: its steps are in the future of the piece before, or in the past of the one after.
+    dropped: its steps are in the future of the piece before, or in the past of the one after. Of a stretch between two
+    gaps that is too short itself, the first piece is kept.
     """
     recordings: list[Piece] = []
     counts: dict[str, int] = {}
@@ -216,7 +217,6 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
         sweeps = np.arange(first, last, step)
         for begin, end in _scenes(line, sweeps):
             span = slice(max(begin - CURRENT_STEP, 0), min(end + steps - CURRENT_STEP - 1, len(sweeps)))
-            # Keep the first piece if the whole stretch between two gaps is too short for a window.
             if span.stop - span.start < steps and (begin > 0 or len(sweeps) >= steps):
                 continue
             scene = line.scenes[sweeps[begin]]

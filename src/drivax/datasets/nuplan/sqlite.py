@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.errors import DataError, import_extra
-from drivax.reading import check_regular
+from drivax.reading import check_regular, explain_damage
 
 Array = np.ndarray[Any, Any]
 
@@ -95,11 +95,8 @@ class Database:
 def open_database(path: Path) -> Iterator[Database]:
     """Open a SQLite file read-only and as immutable: no lock, no journal, nothing is written next to it."""
     check_regular(path, _CURE)
-    try:
-        with path.open("rb") as file:
-            head = file.read(len(_MAGIC))
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
+    with explain_damage(path, "check the path"), path.open("rb") as file:
+        head = file.read(len(_MAGIC))
     if head != _MAGIC:
         raise DataError("is not an SQLite file", file=path, cure=_CURE)
     try:

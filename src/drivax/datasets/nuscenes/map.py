@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from drivax.datasets.parsing import load_json
 from drivax.datasets.road_edges import Area, road_edges
-from drivax.errors import DataError
+from drivax.errors import DataError, import_extra
 from drivax.geometry.polylines import headings
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
@@ -102,7 +102,7 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """Read the map in a file of the map expansion (v1.2 or later)."""
+    """Read the map in a file of the map expansion (v1.2 or later); the last four files are kept, as first read."""
     content = load_json(path)
     try:
         return _Layers(content).city()
@@ -227,8 +227,7 @@ class _Layers:
 
     def _stops(self, lanes: Sequence[MapFeature], first_id: int) -> list[MapFeature]:
         """Return stop lines of stop signs: one point each, with the lanes that end in them."""
-        import shapely
-
+        shapely = import_extra("shapely")
         stops: list[MapFeature] = []
         rows = [row for row in self._layer("stop_line") if row.get("stop_line_type") == "STOP_SIGN"]
         areas = [exterior for row in rows for exterior, _ in self._areas([row["polygon_token"]])]

@@ -150,7 +150,10 @@ def _votes(edge: Array, points: Array) -> int:
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Features without dangling links, ids by name, whether the file lacks heights (``flat``), and counts of losses."""
+    """Features, ids by name, whether the file lacks heights (``flat``), and counts of losses.
+
+    Links lead to features of the file, but those to skipped ones dangle.
+    """
 
     features: tuple[MapFeature, ...]
     names: Names

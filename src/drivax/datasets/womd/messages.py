@@ -294,7 +294,7 @@ class ExampleFeatures:
         return sum(_KNOWN.fullmatch(str(name)) is None for name in self._values)
 
     def origin(self) -> Float64[np.ndarray, "3"]:
-        """Return the origin of the coordinates in the source's map frame; zeros unless drivax wrote the example."""
+        """Return the origin of the coordinates in the source's map frame; zeros without :data:`ORIGIN`."""
         if ORIGIN not in self._values:
             return np.zeros(3)
         try:

@@ -85,7 +85,7 @@ class TfRecordReader:
         try:
             return looks_framed(path) and format_of(_first(path)) == self.name
         except UsageError:
-            # protobuf is not installed: claim the file as Scenario protos; reading it then reports the missing package.
+            # A package is missing: claim the file as Scenario protos; reading it then reports the package.
             return self.name == SCENARIO_FORMAT
         except DataError:
             return False

@@ -17,6 +17,7 @@ import numpy as np
 
 from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
+from drivax.reading import explain_damage
 
 _Array = np.ndarray[Any, Any]
 
@@ -96,14 +97,12 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
 
     Raises:
         DataError: The file cannot be opened.
-        UsageError: A package of the extra ``womd`` is missing.
+        UsageError: A package of the extra ``womd`` is missing, or too many files are open.
     """
     crc32c = _crc32c()
     path = Path(path)
-    try:
+    with explain_damage(path, "check the path"):
         file = path.open("rb")
-    except OSError as error:
-        raise DataError(error.strerror or "cannot be opened", file=path, cure="check the path") from error
     with file:
         size = os.fstat(file.fileno()).st_size
         if size == 0:
