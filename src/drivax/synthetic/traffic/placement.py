@@ -137,7 +137,8 @@ class Density:
         vehicles: Maximum number of vehicles without ego; those nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
         cyclist_share: Share of cyclists on lanes with a limit of at most 16 m/s.
-        leader_share: Share of scenarios with a vehicle 18 to 45 m ahead of ego, of those with room on its lane.
+        leader_share: Share of scenarios, of those with room on ego's lane, in which a vehicle is first placed 18 to
+            45 m ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
