@@ -225,7 +225,8 @@ def stop_lines(
     """Return the lines ahead of ego that it must not or should not pass at some time.
 
     ``ego_m`` is the path position of ego's centre and half its length, ``passed`` the position at each time in the last
-    run, and ``coming`` the result of :func:`arrivals`. Times are on the clock of the lights.
+    run (a line with a stop sign is closed until it passes there), and ``coming`` the result of :func:`arrivals`. Times
+    are on the clock of the lights.
     """
     from_m, half_m = ego_m
     result = []
