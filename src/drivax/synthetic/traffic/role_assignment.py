@@ -37,7 +37,7 @@ from drivax.synthetic.traffic.roles import Drivers, Roles
 _FEEDER_LENGTH_M = 160.0
 #: Arrival of an unhindered ego at a place where it gives way, s after the warm-up.
 _ARRIVAL_S = (0.4, 4.0)
-#: Least position of ego along its path, m.
+#: Least position of ego along its path before the warm-up, m.
 _MIN_START_M = 12.0
 #: Largest number of further draws of a route, until ego must give way on it.
 _EXTRA_ROUTES = 4

@@ -379,7 +379,7 @@ class _Simulation:
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """Return the least acceleration for leaders, lines, obstacles, and the highest speeds here and ahead."""
+        """Return the least acceleration for leaders, lines, obstacles, gaps to open, and top speeds here and ahead."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.find(self._tables, self._position_m, active)
         leads[0] = self._speed[leader]
@@ -540,10 +540,10 @@ class _Simulation:
             return
         front = self._position_m + self._half_m
         slow_only = (has_stuck | worlds.mask(self._user_world[is_halted]))[worlds.world]
-        is_near = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
-        is_near &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
+        is_looking = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
+        is_looking &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
-        for row in is_near.nonzero()[0].tolist():
+        for row in is_looking.nonzero()[0].tolist():
             if has_halted[worlds.world[row]] or self._standing.is_blocked(
                 row, front[row], half_m[row], LOOK_M
             ):

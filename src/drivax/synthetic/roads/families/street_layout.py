@@ -272,7 +272,7 @@ class StreetFamily:
     """Settings that families of streets share.
 
     Attributes:
-        length_m: Length of the reference line; a whole route must fit the grid of a stored scenario.
+        length_m: Length of the reference line; the map of a stored scenario is a square of 640 m.
         section_m: Length of the sections into which lanes are cut.
         tightest_m: Least radius of bends, drawn per road, low and high; except on highways, the style's ``curvature``
             divides it.
