@@ -103,7 +103,7 @@ class LaneChains:
                 position += lanes[lane].length_m
                 last, lane = lane, successor[lane]
             lengths.append(position)
-            ends.append(lanes[last].ends and not lanes[last].successors)
+            ends.append(lanes[last].ends)
         return cls(
             chain=chain,
             offset_m=offset_m,
