@@ -316,6 +316,7 @@ def _to_recording(
         tracks=_tracks(motion, () if staged is None else staged.actors),
         features=map_features(network),
         lights=_lights(network, motion, (first - _WARM_UP) * DT_S + times),
+        # After a wide detour of ego, the lanes next to it follow at the end.
         route_lanes=tuple(map(feature_id, dict.fromkeys(span.lane for span in motion.paths[0].spans))),
         events=events,
         tags=tags,

@@ -257,7 +257,8 @@ def arrivals(
 ) -> dict[int, _Steps]:  # fmt: skip
     """Return, for connectors to which others yield, the steps at which a vehicle is or will be on them within 2 s.
 
-    Ego, row 0, does not count. Connectors on no other path are left out.
+    Ego, row 0, does not count. Connectors on no other path are left out. The paths are those of the last step: before a
+    lane change or detour a vehicle's positions on them are approximate.
     """
     watched = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}
