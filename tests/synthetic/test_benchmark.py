@@ -30,7 +30,7 @@ def test_sizes_follow_the_table_or_scale():
     assert sizes() == {"train": 4096, "validation": 512, "test": 1024, "test-rare": 512}
     assert sizes(64) == {"train": 64, "validation": 8, "test": 16, "test-rare": 8}
     assert sizes(1) == {"train": 1, "validation": 1, "test": 1, "test-rare": 1}
-    with pytest.raises(UsageError, match="scenarios is 0; use 1 or more"):
+    with pytest.raises(UsageError, match="the size of the training set is 0; use 1 or more scenarios"):
         sizes(0)
 
 

@@ -10,7 +10,9 @@ import pytest
 import shapely
 
 from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, RoadKind
+from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.families import FAMILIES
+from drivax.synthetic.roads.families.street_layout import Street, Strip
 from drivax.synthetic.roads.network import Control, map_features
 from drivax.synthetic.roads.style import GRID, RING
 from drivax.synthetic.traffic.paths import random_lanes
@@ -268,6 +270,15 @@ def test_lane_drops_lose_lanes_on_both_sides_and_gain_lanes():
         changes.add("gain" if forks else "left" if ending[0].left < 0 else "right")
         assert len(ending) + len(forks) == 1
     assert changes == {"gain", "left", "right"}
+
+
+def test_middle_line_of_a_one_way_street_is_marked_along_the_first_lane_to_its_left():
+    strips = (Strip(-1, True, 0, 3), Strip(1, True, 0, 3), Strip(2, True, 1, 2))
+    street = Street(straight(Pose(0.0, 0.0, 0.0), 60.0), (0, 40, 80, 120), strips, 3.5, 13.4, 0.5)
+    street.add_markings()
+    middle = [line for line in street.draft.markings if np.all(np.abs(line.xy[:, 1]) < 0.1)]
+    assert [line.kind for line in middle] == [RoadKind.LINE_BROKEN_SINGLE_WHITE]
+    assert np.allclose(middle[0].xy[[0, -1], 0], [0.0, 60.0])
 
 
 def test_highways_have_an_on_ramp_an_off_ramp_or_both():

@@ -122,7 +122,7 @@ def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_pa
     for future_s in (4.0, 61.0):
         with pytest.raises(UsageError, match=f"future_s is {future_s:g}; use 8 to 60"):
             generate(tmp_path / "no", 1, 0, Generation(future_s=future_s))
-    with pytest.raises(UsageError, match="its world is fixed but for its domain"):
+    with pytest.raises(UsageError, match="its world is fixed but for its domain; leave out other settings"):
         generation.generate_benchmark(tmp_path / "no", Generation(future_s=15.0), 1)
 
 

@@ -17,7 +17,7 @@ class Domain:
 
     Attributes:
         name: Tag of every scenario.
-        shares: Relative frequency of each road family; families without one do not occur.
+        shares: Relative frequency of each road family among draws; families without one do not occur.
         pedestrians: Pedestrians per 100 m of sidewalk and per two crossings, low and high, drawn per scenario.
         parked_share: Share of occupied bays, low and high, drawn per scenario.
         double_share: Share of scenarios with a double-parked car, of those with a bay that has room for one next to it.

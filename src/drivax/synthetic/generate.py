@@ -1,7 +1,7 @@
 """Scenario sets of the built-in world, drawn in worker processes and written in order, and the benchmark's splits.
 
-With workers, the bytes of a set depend only on its options, seed and number of scenarios: not on the number of workers
-or the processor. This module does not import JAX, so that workers start quickly; an audit that needs it is an argument.
+With workers, the bytes of a set depend only on its options, seed, size and audit: not on the number of workers or the
+processor. This module does not import JAX, so that workers start quickly; an audit that needs it is an argument.
 
 A map is drawn from (seed, number of the map), so sets of different seeds share no map. :func:`generate` refuses the
 seeds of the benchmark's splits, so no other set has their maps.
@@ -34,7 +34,8 @@ from drivax.tracking.workers import worker_pool
 #: NumPy's module with the table of CPU features, and the environment variable that disables features.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
-#: Scenarios per audited batch; in the first batch, in the first task, and at least in others but the last one.
+#: Scenarios per audited batch; scenarios of the first batch and the first task, and least number in later tasks but the
+#: last one.
 _BATCH, _FIRST = 64, 4
 #: Largest number of scenarios per task, and number of tasks per worker that smaller sets are divided into.
 _CHUNK, _TASKS = 16, 4
@@ -55,8 +56,8 @@ Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 @contextmanager
 def portable_workers() -> Iterator[None]:
     """Context in which started worker processes compute the same bits on any x86-64 processor."""
-    # The table shows features that this process disables as missing, but the variable is replaced, so add them.
-    # NumPy splits the variable at commas, too.
+    # Features that the variable already disables count as missing in the table; since it is replaced, keep them.
+    # NumPy splits the variable at commas, too. "Prescott": OpenBLAS's kernels for the oldest x86-64 processors.
     disabled = os.environ.get(_FEATURES, "").replace(",", " ").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
     settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
@@ -78,10 +79,10 @@ class Generation:
 
     Attributes:
         workers: Number of worker processes. With 0 this process draws, whose NumPy depends on the processor in its last
-            bits: only workers write the same bytes everywhere.
+            bits: only workers write the same bytes on any x86-64 processor.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
-        egos: Vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.egos``).
+        egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.egos``).
         overwrite: Replace an existing scenario set.
         world: Settings of the world.
     """
@@ -112,7 +113,7 @@ class Generation:
 
     @property
     def sizes(self) -> Capacity:
-        """Padded sizes of a scenario of this length."""
+        """Padded sizes of a scenario with these options."""
         return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
 
 
@@ -122,7 +123,7 @@ class FamilyCount:
 
     Attributes:
         kept: Number of scenarios.
-        rejected: Number of rejected draws by cause.
+        rejected: Number of rejected draws by cause, without the unsuited ones.
         unsuited: Number of draws in which the requested event could not happen or did not endanger ego.
         events: Number of scenarios with each labelled event.
     """
@@ -201,8 +202,8 @@ def generate(
         audit: Called in a thread of this process with batches of scenarios; its results are stored with them.
 
     Raises:
-        UsageError: Wrong options, ``out`` exists and is not to be overwritten, or a scenario has no clean expert.
-        DataError: The disk has too little space.
+        UsageError: Wrong arguments, ``out`` exists and is not to be overwritten, or a scenario has no clean expert.
+        DataError: The disk has too little space, or a worker died.
     """
     options = options or Generation()
     options.check()
@@ -341,7 +342,7 @@ def sizes(train: int | None = None) -> dict[str, int]:
     full = SPLITS["train"].scenarios
     train = full if train is None else train
     if train < 1:
-        raise UsageError(f"scenarios is {train}", cure="use 1 or more")
+        raise UsageError(f"the size of the training set is {train}", cure="use 1 or more scenarios")
     return {name: max(round(split.scenarios * train / full), 1) for name, split in SPLITS.items()}
 
 
@@ -354,21 +355,21 @@ def generate_benchmark(
     Args:
         out: A folder.
         options: Options with the default ``future_s``; of the world only the domain may differ from the default.
-        train: Size of the training set, for tests and trials; the other sets are scaled with it. Smaller sets are
-            prefixes of the full ones.
+        train: Size of the training set, for tests and trials; the other sets are scaled with it, to at least 1. Smaller
+            sets are prefixes of the full ones.
         progress: Called after every scenario, with counts over all splits.
         audit: See :func:`generate`.
 
     Raises:
-        UsageError: Wrong options, or one of the sets exists and is not to be overwritten.
-        DataError: The disk has too little space.
+        UsageError: Wrong arguments, or one of the sets exists and is not to be overwritten.
+        DataError: The disk has too little space, or a worker died.
     """
     options = options or Generation()
     options.check()
     if options.world != WorldConfig(domain=options.world.domain) or options.future_s != 8.0:
         raise UsageError(
             "the benchmark's future_s is 8, and its world is fixed but for its domain",
-            cure="use generate for other settings",
+            cure="leave out other settings, or generate a set that is not the benchmark",
         )
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))

@@ -52,8 +52,7 @@ class NoiseConfig:
     """Errors of recorded poses and speeds of the others: standard deviations, and correlations over one step.
 
     Deviations hold from 2 m/s on; slower users have smaller errors. The defaults are the level of vehicle tracks in
-    WOMD recordings, measured by ``experiments/world/perception_noise.py``. WOMD's speeds are noisy, because trackers
-    differentiate positions.
+    WOMD recordings, measured by ``experiments/world/perception_noise.py``.
 
     Attributes:
         level: Factor on all standard deviations; 0 switches noise off.

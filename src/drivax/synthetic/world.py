@@ -45,14 +45,14 @@ from drivax.synthetic.traffic.simulation import Run, Traffic, run_all
 
 #: Increased when the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
-#: Traffic runs this long before the recording begins, s.
+#: Traffic runs this long before a recording that does not begin at a critical step, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, largest delay after the warm-up, stride.
 _EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
 #: Steps before an event from which the first plan of ego reacts to it (:func:`expert.driver.drive_ego`).
 _LEAD_STEPS = 8
-#: Lights are recorded up to this distance from the bounding rectangle of ego's log, m.
+#: Lights are recorded within the bounding rectangle of ego's log and this margin, m.
 _LIGHTS_M = 95.0
 #: Largest number of draws of a scenario (and of roads for an event), on one map, and with one kind of event.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
@@ -76,8 +76,8 @@ class WorldConfig:
         lane_change_share: Share of random routes with room for it on which ego plans a lane change; routes past a place
             of an event or a conflict have none.
         signal_timing: Shares of ego's next light at the end of the warm-up: green, turning green, turning yellow.
-        scenarios_per_map: Number of consecutive scenarios without an event that share roads and a segment; new roads
-            are drawn after 12 rejected draws.
+        scenarios_per_map: Number of consecutive indices whose scenarios share roads and a segment, those with an event
+            excepted; new roads are drawn after 12 rejected draws.
         noise: Perception noise of the others' tracks.
         sensor: Ego's sensor.
     """
@@ -263,7 +263,7 @@ def _drive_without_event(
 def _stage_event(
     draw: _Draw, traffic: Traffic, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
-    """Return a recording of the event without perception noise, or the cause of the last failure."""
+    """Return a recording of the event without perception noise, or why none was staged or the last one failed."""
     view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
@@ -316,6 +316,7 @@ def _to_recording(
         tracks=_tracks(motion, () if staged is None else staged.actors),
         features=map_features(network),
         lights=_lights(network, motion, (first - _WARM_UP) * DT_S + times),
+        # After a wide detour of ego, the lanes next to it follow at the end.
         route_lanes=tuple(map(feature_id, dict.fromkeys(span.lane for span in motion.paths[0].spans))),
         events=events,
         tags=tags,

@@ -36,7 +36,7 @@ _APPEARANCE_M = 40.0
 _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
 #: Distance of centres below which parallel vehicles are in the way of a new actor, m.
 _SAME_LANE_M = 6.5
-#: Margins added to the length and width of a crossing vehicle, and largest distance of centres, m.
+#: Margins added to the length and width of a crossing vehicle, and largest distance of centres in overlap tests, m.
 _CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
 #: Time gap of the vehicle behind an actor that appears, s.
 _BEHIND_S = 0.8

@@ -60,7 +60,7 @@ def possible(kind: EventKind, network: RoadNetwork) -> bool:
 def destinations_for(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Destination, ...]:
     """Return candidate places for ego to pass, so that an event can be staged; empty: anywhere.
 
-    ``again`` gives destinations to kinds that can happen anywhere, too, after staging has failed.
+    ``again`` gives destinations to kinds that can happen anywhere, too, after an attempt without one has failed.
     """
     return SCRIPTS[kind].destinations(network) if again or kind in _NEEDS_DESTINATION else ()
 

@@ -33,7 +33,7 @@ class Destination:
 
     Attributes:
         along_m: Distance along the lane, low and high.
-        when_s: Time of ego's arrival at free speed since the recording's beginning, low and high.
+        when_s: Time of ego's arrival at free speed after the warm-up, low and high.
         alone: Whether ego's route must be empty ahead of it, up to the end of the lane after that of the place.
         followed: Whether a vehicle must be behind ego.
     """
@@ -49,7 +49,7 @@ class Destination:
 class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
-    Its first lanes lie behind ego's start, where the recording begins, if there are any there; the destination is on
+    Its first lanes lie behind ego's start (its place after the warm-up), if there are any there; the destination is on
     lane ``lanes[place]``.
     """
 
@@ -77,7 +77,7 @@ def open_road(
 def draw_route(
     network: RoadNetwork, destinations: Sequence[Destination], rng: np.random.Generator
 ) -> DestinationRoute | None:
-    """Draw a route past one of several destinations, or return None if none can be reached."""
+    """Draw a route past one of several destinations, or return None if :func:`route_past` fails for each."""
     order = rng.permutation(len(destinations)).tolist()
     routes = (route_past(network, destinations[index], rng) for index in order)
     return next((route for route in routes if route is not None), None)

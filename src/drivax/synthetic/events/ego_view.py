@@ -164,7 +164,10 @@ class EgoView:
 
     @cached_property
     def lane_ends(self) -> list[tuple[float, int]]:
-        """Ends of adjacent lanes: station, and side of ego's path (1 left, -1 right)."""
+        """Ends of adjacent lanes: station, and side of ego's path (1 left, -1 right).
+
+        These are lanes that end, and all sections of lanes that lead off the road.
+        """
         result = []
         for lane in self.roles.network.lanes:
             if lane.ends or lane.exit_only:

@@ -134,7 +134,7 @@ class LeadBrakes(EventScript):
 
 @dataclass(frozen=True)
 class StalledVehicle(EventScript):
-    """A car ahead of ego, at a time gap of ``headway_s`` (low and high), loses its power, comes to a halt and stays."""
+    """A car ahead of ego, at a time gap of ``headway_s`` (low and high), brakes to a halt and stays."""
 
     headway_s: tuple[float, float] = (0.9, 1.4)
 
@@ -159,8 +159,8 @@ def _propose_leader(
 ) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to an ego in free traffic. With the staging ``departure`` it drives on later; with
-    None it stays where it stopped.
+    ``headway_s`` is its time gap to ego as it drives without the event. With the staging ``departure`` it drives on
+    later; with None it stays where it stopped.
 
     Returns:
         The proposal; None near junctions, if :func:`draw_braking` returns None, or if the leader would drive on only

@@ -32,7 +32,7 @@ class _StreetScript(EventScript):
 
 
 def _is_open_street(view: EgoView, station: float) -> bool:
-    """Whether a station is on a street away from junctions and crosswalks."""
+    """Whether a station is on a street away from junctions and crossings."""
     lanes = view.roles.network.lanes
     return view.plain_road(station) and lanes[view.lane_at(station)].limit_mps <= _STREET_MPS
 
@@ -83,7 +83,7 @@ class Jaywalker(_StreetScript):
         step, station, offset = origin
         if not _is_open_street(view, station):
             return None
-        # The walk ends 0.6 m beyond the other side of the road, at most 14.6 m beyond ego's path.
+        # The walk ends 0.6 m beyond the road's or median's edge on the other side, at most 14.6 m from ego's path.
         side = -int(math.copysign(1, offset))
         walk_m = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
@@ -101,7 +101,7 @@ class Jaywalker(_StreetScript):
     ) -> float | None:
         """Return the distance from ego's front to the pedestrian's line at the first step.
 
-        None if ego, at its speed, is past the line or less than 0.5 m before it when the pedestrian enters its lane.
+        None if ego, at its speed, is past the line or less than 0.5 m before it when the pedestrian enters its path.
         """
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
@@ -247,7 +247,7 @@ class WrongWayCyclist(_StreetScript):
         if not edge < 4.5:
             return None
         times = DT_S * (np.arange(view.steps) - step)
-        # Share of the swing back after which ego's lane is clear.
+        # Share of the swing that remains when ego's lane is clear again.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
         begin_back = clear - _inverse_smooth_step(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
         swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)

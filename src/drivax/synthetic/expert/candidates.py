@@ -225,7 +225,8 @@ def stop_lines(
     """Return the lines ahead of ego that it must not or should not pass at some time.
 
     ``ego_m`` is the path position of ego's centre and half its length, ``passed`` the position at each time in the last
-    run, and ``coming`` the result of :func:`arrivals`. Times are on the clock of the lights.
+    run (a line with a stop sign is closed until it passes there), and ``coming`` the result of :func:`arrivals`. Times
+    are on the clock of the lights.
     """
     from_m, half_m = ego_m
     result = []
@@ -256,7 +257,8 @@ def arrivals(
 ) -> dict[int, _Steps]:  # fmt: skip
     """Return, for connectors to which others yield, the steps at which a vehicle is or will be on them within 2 s.
 
-    Ego, row 0, does not count. Connectors on no other path are left out.
+    Ego, row 0, does not count. Connectors on no other path are left out. The paths are those of the last step: before a
+    lane change or detour a vehicle's positions on them are approximate.
     """
     watched = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}

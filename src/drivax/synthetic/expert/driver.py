@@ -61,7 +61,7 @@ def expert_lanes(
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Return the adjacent lanes of a lane that is 70 to 100 m long and no connector; of others none."""
+    """Return the adjacent lanes of a street's section (70 to 100 m long, no connector); of other lanes none."""
     current = network.lanes[lane]
     if current.connector or not 70.0 < current.length_m < 100.0:
         return []

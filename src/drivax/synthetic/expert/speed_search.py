@@ -16,8 +16,8 @@ from drivax.scenario.schema import DT_S
 #: Steps of the recording in one step of the search.
 COARSE = 5
 _STEP_S = COARSE * DT_S
-#: Approximate spacing of speeds, m/s; it is fitted to the present speed, to at most 30 % more. Accelerations are then
-#: about 1.5 m/s2 apart.
+#: Spacing of speeds, m/s, which is fitted to the present speed by a factor of 0.65 to 1.3 (from 0.3 on below 0.5 m/s).
+#: Accelerations are 1.5 m/s2 times this factor apart.
 _SPEED_STEP_MPS = 0.75
 #: Lowest and highest acceleration, and the one below which braking costs more, m/s2.
 _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
@@ -27,7 +27,7 @@ _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
 #: Preferred time gap to places that ego must avoid ahead, added to 1.5 m, s.
 _HEADWAY_S = 1.1
-#: Cost of contact; even 0.02 of it exceeds any sum of other costs.
+#: Cost of contact; even 0.02 of it exceeds usual sums of other costs.
 TOUCH = 1e5
 
 
@@ -75,6 +75,7 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     step = speed_mps / index if index else _SPEED_STEP_MPS
     speeds = max(index, int(np.ceil(top_mps / step))) + 1
     spacing = step * _STEP_S / 2
+    # At most 40 steps at top speed: plans of more than 20 s are slower. Stored sets with such futures need this bound.
     places = max(2, min(int(reach_m / spacing), 2 * speeds * 40))
     unit = step / _STEP_S
     change = np.arange(int(np.ceil(_MIN_ACCELERATION_MPS2 / unit)), int(_MAX_ACCELERATION_MPS2 / unit) + 1)

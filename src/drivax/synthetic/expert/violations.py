@@ -26,7 +26,7 @@ EGO_SKIN_M = 0.1
 _LEAST_M = 10.0
 #: Largest speed and distance of a stop at a line, m/s and m, and largest time between the stop and passing, s.
 _STANDING_MPS, _BEFORE_LINE_M, _STOP_WINDOW_S = 0.5, 3.0, 3.0
-#: Distance against traffic within 1 s from which the metric ``wrong_way`` counts it, m.
+#: Distance against traffic within 1 s from which the metric ``direction`` falls below 1, m.
 _WRONG_WAY_M = 2.0
 #: Distance from the route's lanes beyond which ego is off its route, m; the metric uses 2.
 _OFF_ROUTE_M = 1.9

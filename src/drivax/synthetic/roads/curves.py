@@ -66,6 +66,7 @@ class Curve:
     @cached_property
     def bend(self) -> Float64[np.ndarray, " point"]:
         """Curvature: change of the heading per metre of arc."""
+        # The bound moves the first sample by a nanometre and has no use, but the bits of stored sets depend on it.
         return np.gradient(self.heading, np.maximum(self.arc_m, 1e-9))
 
     @property

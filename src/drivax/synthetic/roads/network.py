@@ -302,7 +302,7 @@ def _lane_feature(index: int, lane: Lane) -> MapFeature:
     return MapFeature(
         feature_id=feature_id(index),
         kind=lane.kind,
-        points=_flat(xy if len(xy) < 3 else np.concatenate([xy[:-1:_STRIDE], xy[-1:]])),
+        points=_flat(np.concatenate([xy[:-1:_STRIDE], xy[-1:]])),
         limit_mps=lane.limit_mps,
         width_m=lane.width_m,
         successors=tuple(map(feature_id, lane.successors)),

@@ -35,7 +35,7 @@ class SignalPlan:
     Attributes:
         phases: Indices of the groups that are green, per phase.
         green_s: Duration of green of each phase, s.
-        offset_s: Time at which phase 0 turns green, s.
+        offset_s: Time at which phase 0 turns green (without a lag), s.
         programs: Phases of each junction in order, each program on its own cycle; empty: one junction with all phases.
         lags_s: Time from ``offset_s`` until the first phase of each program turns green, s; empty: no lags.
     """

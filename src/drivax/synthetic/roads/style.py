@@ -18,7 +18,7 @@ class RoadStyle:
         width_m, shoulder_m: Width of lanes, and drivable width beyond the outer ones, low and high.
         limits_mps, fast_limits_mps: Speed limits of streets and of highways; repeated ones are drawn more often.
         curvature: Factor on the curvature of streets without junctions.
-        sidewalk_share, parking_share: Shares of roads with sidewalks and with bays, in families where they vary.
+        sidewalk_share, parking_share: Shares of roads with sidewalks and with bays, where they are optional.
     """
 
     width_m: tuple[float, float] = (3.35, 3.75)

@@ -29,12 +29,12 @@ _THRESHOLD_MPS2 = 0.25
 _SAFE_BRAKING_MPS2, _URGENT_BRAKING_MPS2 = 2.5, 4.5
 #: Distance and time from the end of a lane at which a change becomes mandatory, m and s.
 _MANDATORY_M, _MANDATORY_S = 120.0, 9.0
-#: Duration of a change, s, its least length, m, and the lowest speed of a discretionary one, m/s.
+#: Duration of a change, s, its least length, m (8 at the end of a lane), and lowest speed of a discretionary one, m/s.
 _DURATION_S, _MIN_LENGTH_M, _MIN_SPEED_MPS = 4.2, 14.0, 3.0
 #: Required bumper-to-bumper gap on the new lane, m; times added at the follower's speed behind and at the closing speed
 #: ahead, s; share by which urgency reduces the time behind.
 _GAP_M, _FOLLOWER_S, _CLOSING_S, _URGENT_SHARE = 2.0, 0.25, 1.0, 0.6
-#: Least distances of a discretionary change from the junction behind and to the one ahead, m.
+#: Least distances of a discretionary change to the beginning and the end of the new chain of lanes, m.
 _FROM_JUNCTION_M, _TO_JUNCTION_M = 12.0, 25.0
 #: Half the length of a static obstacle, m, and distance behind a vehicle up to which it counts as ahead, m.
 _HALF_OBSTACLE_M, _OBSTACLE_BEHIND_M = 2.4, 3.0
@@ -103,7 +103,7 @@ class LaneChains:
                 position += lanes[lane].length_m
                 last, lane = lane, successor[lane]
             lengths.append(position)
-            ends.append(lanes[last].ends and not lanes[last].successors)
+            ends.append(lanes[last].ends)
         return cls(
             chain=chain,
             offset_m=offset_m,

@@ -29,7 +29,8 @@ _ADJACENT_M = 60.0
 _EDGE_M, _PASS_MPS = 0.2, 6.0
 #: Gap to the first obstacle at the end of the way out, and to the last one at the beginning of the way back, m.
 _GAP_BEFORE_M, _GAP_BEHIND_M = 0.3, 0.5
-#: Least length of the way out and back: as a multiple of the steepest possible one, and as a travel time, s.
+#: Length of the way out (less where there is no room) and back: the larger of a multiple of the steepest possible one
+#: and a travel time, s.
 _OUT_FACTOR, _BACK_FACTOR, _OUT_S, _BACK_S = 2.0, 1.6, 2.4, 2.0
 #: Least length of the path after a detour, m.
 _END_MARGIN_M = 5.0
@@ -193,7 +194,7 @@ class DetourPositions(NamedTuple):
 def detour_path(
     path: Path, positions: DetourPositions, aside_m: float, adjacent: tuple[LaneSpan, ...] = ()
 ) -> Path:
-    """Build a detour to the left by ``aside_m``; ``adjacent`` are the lanes that it may enter."""
+    """Build a detour to the left by ``aside_m``; beyond 0.7 m to either side it occupies all ``adjacent`` lanes."""
     begin, out_end, back_begin, end = positions
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)

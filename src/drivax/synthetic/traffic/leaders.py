@@ -27,7 +27,7 @@ class Leaders:
         self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
         self._rows = np.arange(len(self._half_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist in the middle of each lane.
+        # Half the width of the widest car that may pass a cyclist in the middle of each lane (below 4.8 m: none may).
         widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
         self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
         self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)

@@ -20,7 +20,8 @@ _MAX_HALF_WIDTH_M = 1.3
 _RANGE_M, _SAMPLE_M, _MAX_LATERAL_M = 50.0, 2.0, 16.0
 #: Range of the search for vehicles ahead, m.
 _VEHICLE_RANGE_M = 25.0
-#: Users that leave the corridor at least this long before the vehicle arrives are ignored, s.
+#: Users that leave the corridor at least this long before the vehicle arrives are ignored, if it arrives in more than
+#: twice this time, s.
 _CLEARANCE_S = 0.8
 #: Time over which lateral motion is extrapolated, s.
 _DRIFT_S = 0.7
@@ -167,7 +168,7 @@ class StaticObstacles:
         return bool(is_blocking.any())
 
     def gap(self, front_m: PerVehicle) -> PerVehicle:
-        """Distance from the front bumper to the next obstacle in the corridor (infinite: none)."""
+        """Distance from the front bumper to the next obstacle in the corridor, above -1 m (infinite: none)."""
         gap = self.near_m - front_m[:, None]
         return np.where(gap > -1.0, gap, np.inf).min(axis=1)
 
@@ -178,8 +179,8 @@ def nearest_obstacles(
 ) -> tuple[PerVehicle, PerVehicle]:  # fmt: skip
     """Return the gap from each front bumper to the nearest obstacle in the path's corridor, and its speed along it.
 
-    Without an obstacle the gap is infinite and the speed 0, which is also the speed of obstacles that come closer.
-    ``others`` are the moving users that are not vehicles; ``by_world`` has their indices, padded with -1.
+    Without an obstacle the gap is infinite and the speed 0, which is also the speed of oncoming obstacles. ``others``
+    are pedestrians and moving scripted users; ``by_world`` has their indices, padded with -1.
     """
     count, users = len(vehicles), vehicles.concatenate(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
@@ -236,7 +237,7 @@ def _nearby_pairs(
     dy *= cos
     dx *= sin
     dy -= dx
-    # Somewhat more than the comfortable stopping distance; less for vehicles, which follow each other and the rules.
+    # Below 13 m/s it exceeds the comfortable stopping distance; less for vehicles, which follow others and the rules.
     reach = np.where(active, np.minimum(_RANGE_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
     is_near = ahead > 0.5
     is_near[:, :count] &= ahead[:, :count] < np.minimum(reach, _VEHICLE_RANGE_M)

@@ -150,7 +150,7 @@ class PathTables:
         self._enter_lanes(row, path)
         final = max(path.spans, key=lambda span: span.end_m if span.until_m == np.inf else -1.0)
         lane = self.worlds.networks[world].lanes[final.lane]
-        self.stop_m[row] = path.length_m if lane.ends and not lane.successors else np.inf
+        self.stop_m[row] = path.length_m if lane.ends else np.inf
 
     def _enter_lanes(self, row: int, path: Path) -> None:
         """Enter the spans of a path, its connectors and its marked crossings."""

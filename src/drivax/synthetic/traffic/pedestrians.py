@@ -29,7 +29,7 @@ _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 _STANDING_MPS = 0.3
 #: Accepted gap minus the crossing time, s, where drivers yield and where they do not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
-#: Largest bearing of a crossing from an approaching vehicle, and largest angle between their headings, rad.
+#: Largest bearing of a crossing from an approaching vehicle, and angle from its heading to the crossed lane's, rad.
 _MAX_BEARING, _MAX_HEADING_DIFFERENCE = math.radians(75.0), math.radians(80.0)
 #: Distance that pedestrians keep from vehicles, m.
 _CLEARANCE_M = 0.4
@@ -211,7 +211,7 @@ class Pedestrians:
         crossing_s = (self._across[waiting] - self._position_m[waiting]) / self._free_speed[waiting]
         # Starting from standstill takes v / (2 a) longer.
         crossing_s += self._free_speed[waiting] / (2 * _ACCELERATION_MPS2)
-        # Traffic matters only to those whose conflicting lights stay red.
+        # Those whose conflicting lights do not stay red for long enough keep waiting.
         stays_red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
         waiting, crossing_s = waiting[stays_red], crossing_s[stays_red]
         for world in np.unique(self.world[waiting]).tolist():

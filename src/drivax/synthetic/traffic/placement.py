@@ -26,9 +26,10 @@ _MIN_FROM_ENDS_M = 15.0
 _LENGTH_M, _GAP_M, _GAP_S = 10.0, 5.0, 0.9
 #: Free gaps on busy lanes relative to those elsewhere.
 _BUSY_GAP_SHARE = 0.4
-#: No cyclists where the speed limit is higher, m/s; their distance from the lane's right side, m.
+#: No cyclists start where the speed limit is higher, except on bicycle lanes, m/s; their distance from the lane's right
+#: side, m.
 _MAX_CYCLING_LIMIT_MPS, _KERB_M = 16.0, 0.55
-#: Time before a lane's end within which no vehicle is placed, s.
+#: Time before the end of a lane with ``ends`` within which no vehicle is placed, s.
 _MERGE_S = 5.0
 #: Free distance before and behind an obstacle in a lane, and width of the widest vehicle, m.
 _FREE_BEFORE_M, _FREE_BEHIND_M, _MAX_WIDTH_M = 30.0, 14.0, 2.55
@@ -137,7 +138,8 @@ class Density:
         vehicles: Maximum number of vehicles without ego; those nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of vehicle types; the rest are cars.
         cyclist_share: Share of cyclists on lanes with a limit of at most 16 m/s.
-        leader_share: Share of scenarios with a vehicle 18 to 45 m ahead of ego, of those with room on its lane.
+        leader_share: Share of scenarios, of those with room on ego's lane, in which a vehicle is first placed 18 to
+            45 m ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)

@@ -154,6 +154,7 @@ class Rules:
         self.conflict = ~np.isnan(self.zone_begin)
         self.rivals = [set(np.flatnonzero(conflict).tolist()) for conflict in self.conflict]
         self.control = [int(lane.control) for lane in network.lanes]
+        # Conflicts of :attr:`RoadNetwork.conflicts` that the zones, sampled at other points, miss are left out.
         self.yields_to = [
             np.array([b for b in lane.yields_to if self.conflict[a, b]], int)
             for a, lane in enumerate(network.lanes)
@@ -307,7 +308,7 @@ class RightOfWay:
     def _may_enter(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
-        """Whether stop, conflicts, room beyond the connector and priority permit a vehicle to enter."""
+        """Whether its stop, its leader, conflicts, room beyond the connector and priority permit a vehicle to enter."""
         i, connector, line = request.row, request.connector, request.line_m
         control = rules.control[connector]
         if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
@@ -319,6 +320,7 @@ class RightOfWay:
             return False
         exit_m = state.tables.connector_end[i, request.slot]
         is_full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
+        # Behind a leader that is not yet in the junction, or without a rule, vehicles follow as on other lanes.
         if is_full and tail >= line - 1.0 and control != _NONE:
             return False
         return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)

@@ -35,9 +35,9 @@ from drivax.synthetic.traffic.roles import Drivers, Roles
 
 #: Length of lanes with dense traffic before a conflict, m.
 _FEEDER_LENGTH_M = 160.0
-#: Arrival of an unhindered ego at a place where it gives way, s after the recording begins.
+#: Arrival of an unhindered ego at a place where it gives way, s after the warm-up.
 _ARRIVAL_S = (0.4, 4.0)
-#: Least position of ego along its path, m.
+#: Least position of ego along its path before the warm-up, m.
 _MIN_START_M = 12.0
 #: Largest number of further draws of a route, until ego must give way on it.
 _EXTRA_ROUTES = 4
@@ -102,7 +102,7 @@ def assign_roles(
         timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination it is green
             on arrival.
         rng: Source of randomness.
-        destinations: Candidate places for ego to pass; if it can reach none, its route is random.
+        destinations: Candidate places for ego to pass; if the draws of routes past them fail, its route is random.
         critical: Whether ego must give way to dense traffic, if the roads allow it; ``destinations`` are ignored.
     """
     driver = expert.draw_expert(rng)
@@ -141,7 +141,7 @@ def _draw_route(
     network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
     destination_route: DestinationRoute | None, attempts: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
-    """Draw ego's lanes, path and position before the warm-up; again, up to ``attempts`` times, without a conflict."""
+    """Draw ego's lanes, path and position before the warm-up, up to ``attempts`` times more until it must give way."""
     if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)

@@ -192,7 +192,7 @@ class Motion:
         valid: Mask of the steps at which a user is on the map.
         distance_m: Position along the path that each vehicle follows at the step.
         acceleration: Acceleration of each vehicle from each step to the next one.
-        paths: Path of each vehicle at the last step; empty: those of the roles.
+        paths: Path of each vehicle at the last step of the run; empty: those of the roles.
     """
 
     kind: Int8[np.ndarray, " user"]

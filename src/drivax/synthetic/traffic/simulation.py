@@ -1,7 +1,7 @@
 """Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
-The car-following law is the simulator's (:mod:`drivax.simulator.idm`). Several worlds are simulated together: one step
-is a few dozen array operations over all their vehicles, and each world evolves as it does alone.
+The car-following law is the simulator's (:mod:`drivax.simulator.idm`). Several worlds are simulated together: a step
+is mostly array operations over all their vehicles, and each world evolves as it does alone.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _DECISION_STEPS = 5
 _REST_STEPS = round(4.0 / DT_S)
 #: Braking that drivers accept for pedestrians, m/s2: to start to brake, and once they brake.
 _COMFORTABLE_MPS2, _HARDEST_MPS2 = 3.0, 8.0
-#: Limit of the braking for lines as a multiple of the required braking.
+#: Limit of the braking for lines as a multiple of the required braking, to which 0.5 m/s2 is added.
 _LINE_BRAKING_FACTOR = 1.3
 #: Longest reaction, steps.
 _MAX_REACTION_STEPS = 6
@@ -127,8 +127,8 @@ class _Log:
         users = [*roles.pedestrians, *scripted]
         kinds = [AgentKind.PEDESTRIAN] * len(roles.pedestrians) + [user.kind for user in scripted]
 
-        def by_user(values: np.ndarray, users: slice = vehicles) -> np.ndarray:
-            return np.ascontiguousarray(np.swapaxes(values[:steps, users], 0, 1))
+        def by_user(values: np.ndarray, columns: slice = vehicles) -> np.ndarray:
+            return np.ascontiguousarray(np.swapaxes(values[:steps, columns], 0, 1))
 
         def concatenate(vehicles: np.ndarray, pedestrians: np.ndarray, name: str) -> np.ndarray:
             return np.concatenate([vehicles, pedestrians, *(vars(s)[name][None, :steps] for s in scripted)])
@@ -356,6 +356,7 @@ class _Simulation:
         self._tables.replace(row, path)
         self._standing.replace(row, path)
         self._position_m[row] = position_m
+        # Where a path has more crossings than any before, all vehicles of its world decide again: stored sets need it.
         widened = self._tables.crossings[world] > crossings
         self._brakes_for_crossing[self._worlds.vehicles(world) if widened else row] = False
         self._right_of_way.reset_vehicle(row, self._tables, position_m + self._half_m[row])
@@ -378,7 +379,7 @@ class _Simulation:
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
-        """Return the least acceleration for leaders, lines, obstacles, and the highest speeds here and ahead."""
+        """Return the least acceleration for leaders, lines, obstacles, gaps to open, and top speeds here and ahead."""
         gaps, leads = self._gaps, self._leads
         gaps[0], leader = self._leaders.find(self._tables, self._position_m, active)
         leads[0] = self._speed[leader]
@@ -525,7 +526,7 @@ class _Simulation:
         self._switch_path(t, row, path, position, position + change.length_m)
 
     def _start_detours(self, t: int, may_decide: VehicleMask) -> None:
-        """Start detours of vehicles near a standing obstacle: a static one, a stuck vehicle or a halted user."""
+        """Start detours of vehicles near a standing obstacle: a static one, a stuck vehicle or a large halted user."""
         is_stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
         for row, override in self._overrides:
             is_overridden = override.first_step <= t <= override.last_step
@@ -539,10 +540,10 @@ class _Simulation:
             return
         front = self._position_m + self._half_m
         slow_only = (has_stuck | worlds.mask(self._user_world[is_halted]))[worlds.world]
-        is_near = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
-        is_near &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
+        is_looking = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
+        is_looking &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
-        for row in is_near.nonzero()[0].tolist():
+        for row in is_looking.nonzero()[0].tolist():
             if has_halted[worlds.world[row]] or self._standing.is_blocked(
                 row, front[row], half_m[row], LOOK_M
             ):

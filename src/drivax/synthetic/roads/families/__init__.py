@@ -40,7 +40,7 @@ class RoadFamily(Protocol):
         ...
 
 
-#: All families; add a new family here.
+#: All families; a new one occurs only with a share in a domain (``synthetic.domains``).
 FAMILIES: tuple[RoadFamily, ...] = (
     CurvedRoad(),
     SignalisedJunction(),

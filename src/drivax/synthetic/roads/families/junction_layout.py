@@ -107,7 +107,7 @@ class Approach:
 
     Attributes:
         mouth_m: Distance of the mouth from the arm's base.
-        middle, side: Middle line outwards: from the stop line, along the lanes, and from the mouth, along the edges.
+        middle, side: Middle line outwards, from the stop line (for the lanes) and from the mouth (for the edges).
         inward, outward: Lanes, each from the middle to the edge.
     """
 
@@ -265,7 +265,7 @@ def open_crossroads(
 
 
 def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
-    """Add the connectors.
+    """Add the connectors of a site whose approaches have at most one other approach per :class:`Turn`.
 
     Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
     outside. The innermost lane is only for left turns where fewer lanes leave straight on than arrive, and on

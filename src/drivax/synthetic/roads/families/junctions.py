@@ -67,10 +67,10 @@ def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control
 
 @dataclass(frozen=True)
 class LeftTurns:
-    """Phases of the left turns of two opposing approaches.
+    """Phases of the left turns of two opposing approaches: the first of these that is set and possible.
 
-    Protected: in a phase of their own, with arrows, where possible. Permissive: together with oncoming traffic, to
-    which they yield. Neither: one approach at a time.
+    Protected: in a phase of their own, with arrows. Permissive: together with oncoming traffic, to which they yield.
+    Neither: one approach at a time.
     """
 
     protected: bool

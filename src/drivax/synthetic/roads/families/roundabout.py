@@ -40,7 +40,7 @@ from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Least radius of the fillets of entries and exits, m, where the arc between them leaves room.
 _FILLET_M = 11.5
-#: Distances from the yield line at which a splitter island begins to narrow and ends, m.
+#: Distances from the yield line at which the gap between the directions begins to narrow and is closed, m.
 _SPLITTER_M = (13.0, 42.0)
 #: Distance from the yield line to the crosswalk's axis, m: room for a car.
 _CROSSING_M = 6.5

@@ -17,7 +17,7 @@ from drivax.synthetic.roads.network import Bay, Crossing, Draft, Line, RoadNetwo
 CROSSWALK_M = 3.2
 #: Distance from a median's kerb to the adjacent lane, m.
 _KERB_M = 0.4
-#: Least distance of a bay to a crossing's axis, m.
+#: Least distance of a bay's middle from a crossing's axis, m.
 _BAY_CLEAR_M = 8.0
 
 
@@ -56,7 +56,7 @@ class Street:
     Attributes:
         middle: The reference line: between the directions, or anywhere in a one-way road.
         cuts: Samples of the line at which sections begin, and its last sample.
-        median_m: Width of the raised median along the middle line, 0 without one.
+        median_m: Gap between the directions, for a raised median along the middle line; 0 without one.
         rows_m: Width of the parking rows beyond the lanes, right and left of the middle line.
         taper_m: Length over which the edge moves in beyond a strip that ends.
         lanes: Lanes of the draft by the place of their strip and their section.
@@ -179,7 +179,7 @@ class Street:
             self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
     def add_markings(self) -> None:
-        """Add the markings: white between lanes of one direction, yellow between directions."""
+        """Add the markings between lanes, and along the middle line: white within a direction, else yellow."""
         for strip in self.strips:
             inner = strip.place - int(np.sign(strip.place))
             if inner:
@@ -191,12 +191,11 @@ class Street:
     def _mark_middle(self) -> None:
         """Add the markings along the middle line."""
         one_way = len({strip.forward for strip in self.strips}) == 1
-        left = [strip for strip in self.strips if strip.place > 0]
+        left = next((strip for strip in self.strips if strip.place == 1), None)
         kind, lines = RoadKind.LINE_SOLID_SINGLE_YELLOW, [self.middle]
-        if one_way and left:
+        if one_way and left is not None:
             kind = RoadKind.LINE_BROKEN_SINGLE_WHITE
-            first, last = max(s.first for s in left), max(s.last for s in left)
-            lines = [self.middle.piece(self.cuts[first], self.cuts[last])]
+            lines = [self.middle.piece(self.cuts[left.first], self.cuts[left.last])]
         elif self.median_m and not one_way:
             lines = [self.middle.parallel(side * self.median_m / 2) for side in (-1, 1)]
         elif not one_way:
@@ -260,7 +259,7 @@ class Street:
     def _add_bay(self, place: int, lateral: float, at_m: float, length_m: float) -> None:
         sample = round(at_m / STEP_M)
         pose = self.middle.pose(sample).aside(lateral)
-        # Keep the view of crossings free.
+        # Keep the view of crossings free; in a bend, one far away may also be level with the bay.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
         offsets = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
         if not any(np.hypot(*offset) < 30.0 and abs(offset @ along) < _BAY_CLEAR_M for offset in offsets):
@@ -273,9 +272,10 @@ class StreetFamily:
     """Settings that families of streets share.
 
     Attributes:
-        length_m: Length of the reference line; a whole route must fit the grid of a stored scenario.
+        length_m: Length of the reference line; the map of a stored scenario is a square of 640 m.
         section_m: Length of the sections into which lanes are cut.
-        tightest_m: Radius of the tightest bend, drawn per road, low and high.
+        tightest_m: Least radius of bends, drawn per road, low and high; except on highways, the style's ``curvature``
+            divides it.
         widest_turn: Largest difference of two headings, rad.
     """
 
@@ -292,7 +292,7 @@ class StreetFamily:
         return tuple(int(k) for k in np.linspace(0, last, sections + 1).round())
 
     def draw_middle(self, rng: np.random.Generator, curvature: float = 1.0) -> Curve:
-        """Draw the reference line; ``curvature`` is the style's factor on the tightest bend."""
+        """Draw the reference line; ``curvature`` divides the least radius."""
         return draw_winding_curve(
             rng,
             self.length_m,

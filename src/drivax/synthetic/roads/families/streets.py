@@ -14,7 +14,7 @@ from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, 
 from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
 from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
-#: Limits below which curved roads may have bays, and of streets with crossings away from junctions, m/s.
+#: Limits below which curved and straight roads may have bays, and streets crossings away from junctions, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
 _CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
 #: Length over which a ramp's curvature rises and falls, m.
@@ -207,7 +207,7 @@ class _Ramp:
     """A ramp, its edges, and the nose, where its left edge meets the highway's right edge.
 
     Attributes:
-        left, right: Edges in the direction of traffic; the left one ends at the nose.
+        left, right: Edges in the direction of traffic; the left one ends (off-ramp: begins) at the nose.
         nose: Sample of the highway's middle line next to the nose.
     """
 
@@ -339,6 +339,7 @@ def _add_boundary(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp:
     """Add the median, and the boundary: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
     main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
+    # The main edge stops a metre from a nose, which blunts its tip.
     pieces, begin = [], 0
     if on_ramp is not None:
         begin = street.cuts[extra.first]
