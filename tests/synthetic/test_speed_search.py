@@ -21,6 +21,16 @@ def run(occupied, speed, preferred=12.0, bound=30.0):
     return search(occupied, np.full(places, preferred), np.full(places, bound), speed)
 
 
+def test_speed_is_kept_on_a_long_free_road():
+    """At 15 m/s a minute is 900 m, more than a plan of the built-in horizon."""
+    count, spacing = 120, 1.0
+    free = np.zeros((count * COARSE + 1, 1000), bool)
+    plan = search(
+        Occupancy(spacing, free, free.astype(float)), np.full(1000, 15.0), np.full(1000, 20.0), 15.0
+    )
+    np.testing.assert_allclose(plan.speed, 15.0)
+
+
 def test_free_path_has_no_cost():
     plan = run(occupancy(), 12.0)
     assert np.allclose(plan.speed, 12.0)

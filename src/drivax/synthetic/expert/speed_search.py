@@ -75,8 +75,7 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
     step = speed_mps / index if index else _SPEED_STEP_MPS
     speeds = max(index, int(np.ceil(top_mps / step))) + 1
     spacing = step * _STEP_S / 2
-    # At most 40 steps at top speed: plans of more than 20 s are slower. Stored sets with such futures need this bound.
-    places = max(2, min(int(reach_m / spacing), 2 * speeds * 40))
+    places = max(2, int(reach_m / spacing))
     unit = step / _STEP_S
     change = np.arange(int(np.ceil(_MIN_ACCELERATION_MPS2 / unit)), int(_MAX_ACCELERATION_MPS2 / unit) + 1)
     v, s = np.arange(speeds), np.arange(places)
