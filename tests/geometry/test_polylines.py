@@ -46,6 +46,7 @@ def test_arc_length_by_hand_restarts_at_every_polyline():
     assert lines.arc.tolist() == [0.0, 5.0, 11.0, 0.0, 1.0]
     assert lines.length.tolist() == [11.0, 1.0]
     assert lines.row.tolist() == [0, 0, 0, 1, 1]
+    assert Polylines.of([np.zeros((0, 3))]).length.tolist() == [0.0]
 
 
 def test_points_and_headings_on_a_corner_by_hand():

@@ -112,6 +112,12 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
     np.testing.assert_allclose(auc, auc_interval(SCORES, LABELS), atol=0.02)
 
 
+def test_resamples_without_negatives_are_left_out():
+    scores, labels = np.array([0.1, 0.4, 0.2, 0.9]), np.array([True, True, False, True])
+    auc, _ = bootstrap_intervals(scores, labels, np.ones(4), np.array([0, 0, 1, 1]), resamples=50)
+    assert 0.0 <= auc[0] <= auc[1] <= 1.0
+
+
 def test_interval_of_rank_correlation():
     """Approximately Fisher's interval for normal variables; repeated values add no information."""
     rng = np.random.default_rng(3)

@@ -31,13 +31,13 @@ from drivax.stats.clusters import (
 )
 
 RESAMPLES = 10_000
-#: Random numbers per chunk, which limits memory to about 16 MB.
+#: Random numbers per chunk, which limits each array of them to about 16 MB.
 _CHUNK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate, its interval, and the number of defined episodes or pairs.
+    """An estimate, its interval, and the number of defined episodes or pairs, or of trials, values or events.
 
     ``mean`` is None if there are none; ``low`` and ``high`` are None if the spread cannot be estimated.
     """
@@ -199,7 +199,7 @@ def interquartile_bootstrap(
     """
     check_draws(confidence, resamples)
     by_seed = [as_values(seed_values) for seed_values in values]
-    if not by_seed:
+    if not any(seed_values.size for seed_values in by_seed):
         return UNDEFINED
     labels = dense_labels(clusters, by_seed[0].size, "cluster")
     if any(seed_values.size != labels.size for seed_values in by_seed):
@@ -209,7 +209,7 @@ def interquartile_bootstrap(
     if not n:
         return UNDEFINED
     mean = _interquartile(np.ones(seeds, int), sums.sum(axis=1), counts.sum(axis=1))
-    if cluster_count < 2:
+    if np.count_nonzero(counts.any(axis=0)) < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
     for resample in range(resamples):

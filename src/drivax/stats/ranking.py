@@ -56,8 +56,8 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
     """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Clusters with and without positives are drawn separately, so each resample has as many of either (Davison and
-    Hinkley, Bootstrap Methods, 1997, section 3.8).
+    Clusters with and without positives are drawn separately, so each resample has as many of each as the data (Davison
+    and Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
     check_draws(confidence, resamples)
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
@@ -92,7 +92,8 @@ def _weights_by_rank(
 
 def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
     below = np.cumsum(negative) - negative
-    return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
+    with np.errstate(invalid="ignore"):  # NaN for a resample without negatives
+        return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
 
 
 def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
@@ -114,8 +115,8 @@ def correlation_interval(
 ) -> tuple[float, float]:
     """Return the cluster-bootstrap percentile interval of :func:`rank_correlation`.
 
-    The interval is (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap
-    Methods, 1997, section 3.8).
+    Davison and Hinkley, Bootstrap Methods, 1997, section 3.8. The interval is (-1, 1) for a single cluster, or if a
+    resample has constant scores.
     """
     check_draws(confidence, resamples)
     labels = np.unique(np.asarray(clusters), return_inverse=True)[1]

@@ -28,6 +28,8 @@ from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
 #: Relative difference between resampled and observed statistic below which they are tied.
 _TIE = 1e-9
+#: Standard error relative to the mean below which the differences are equal: their rounding errors are about 1e-8.
+_ROUNDING_ERROR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def paired_bootstrap_test(
         return SignificanceResult("bootstrap", 1.0, 0, exact=False)
     moments = np.stack((sums, counts, sums * sums, sums * counts, counts * counts), axis=1)
     mean, error = (float(value[0]) for value in _mean_and_error(moments.sum(axis=0)[None], sums.size))
-    if error == 0.0:
+    if error <= _ROUNDING_ERROR * abs(mean):
         return SignificanceResult("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
     rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):

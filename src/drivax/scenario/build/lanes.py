@@ -263,7 +263,7 @@ def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tupl
 def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
 
-    Links to other lanes go uncounted: they lead out of the crop.
+    Links to other lanes go uncounted: they lead out of the crop, or to lanes that are counted as not fitting.
     """
     new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
     new_index[rows] = np.arange(len(rows))
