@@ -161,6 +161,7 @@ WRONG = {
     'roads["lanes"][0]["successors"] is 0.5': lambda a, r: r["lanes"][0].update(successors=0.5),
     'roads["lanes"][0]["kind"] is <RoadKind.EDGE': lambda a, r: r["lanes"][0].update(kind=RoadKind.EDGE_BOUNDARY),
     "roads[\"lanes\"][0][\"limit_mps\"] is 'fast'": lambda a, r: r["lanes"][0].update(limit_mps="fast"),
+    'roads["stop_signs"][0]["point"] is missing': lambda a, r: r["stop_signs"][0].pop("point"),
     'roads["stop_signs"][0] names lane 9': lambda a, r: r["stop_signs"][0].update(lanes=[9]),
 }  # fmt: skip
 
@@ -190,6 +191,8 @@ def test_other_errors_name_their_argument(agents, roads):
         scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["blue"] * 91}])
     with pytest.raises(UsageError, match=r"dt_s is 0.5.*resample\(agents, 0.5\)"):
         scenario_from_arrays("a", agents, roads, dt_s=0.5)
+    with pytest.raises(UsageError, match="dt_s is nan"):
+        scenario_from_arrays("a", agents, roads, dt_s=math.nan)
     with pytest.raises(DataError, match="ego is not valid at the current step"):
         scenario_from_arrays("a", agents, roads, ego=1)
 

@@ -66,7 +66,7 @@ def recording_from_arrays(
     Raises:
         UsageError: An argument is missing or misspelt, or has another shape or an invalid value.
     """
-    if abs(dt_s - DT_S) > 1e-3:
+    if not abs(dt_s - DT_S) <= 1e-3:  # refuses NaN, too
         cure = f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out"
         raise UsageError(f"dt_s is {dt_s}, scenarios have steps of {DT_S} s", cure=cure)
     _check_keys(agents, _AGENT_KEYS, "agents")
@@ -250,7 +250,9 @@ def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     for row, sign in enumerate(roads.get("stop_signs", ())):
         what = f'roads["stop_signs"][{row}]'
         _check_keys(sign, ("point", "lanes"), what)
-        point = _points([sign.get("point")], f'{what}["point"]', 1)
+        if "point" not in sign:
+            raise UsageError(f'{what}["point"] is missing', cure="see recording_from_arrays")
+        point = _points([sign["point"]], f'{what}["point"]', 1)
         controls = _lane_indices(sign.get("lanes", ()), lanes, what)
         yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controls)
 

@@ -98,7 +98,7 @@ class ScenarioWriter:
     Raises:
         UsageError: ``path`` exists, another process writes it, a scenario has another capacity, or ``shard_size`` is
             below 1.
-        DataError: A scenario's id is in the set already, no scenario was added, or the disk is full.
+        DataError: A scenario of this data set and id is in the set already, no scenario was added, or the disk is full.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ class SignificanceResult:
 
     Attributes:
         name: Name of the test.
-        p: Two-sided p-value; None if no value is defined, an arm is empty, or the bootstrap has only one cluster.
+        p: Two-sided p-value; None if no value is defined, an arm is empty, or a bootstrap or t test has one cluster.
         units: Number of units: discordant pairs (McNemar), clusters with a difference (permutation of pairs), or
             clusters (others; 0 if all their differences are 0); 0 without a p-value.
         exact: Whether the p-value is exact (binomial, or all permutations), not sampled or by a t distribution.

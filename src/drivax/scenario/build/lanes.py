@@ -465,7 +465,7 @@ def _arc_at(
 def _heading_near(lane_segments: LaneSegments, stop: Float[Array, "3"]) -> float:
     """Heading of the nearest lane segment on the level of a stop point, NaN without one in reach.
 
-    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level.
+    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level: it may have the height of the lamp.
     """
     a, b = lane_segments.segments.a, lane_segments.segments.b
     if len(a) == 0:
