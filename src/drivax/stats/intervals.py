@@ -128,7 +128,7 @@ def bootstrap_mean(
     and weights them by ``C_h / (C_h - 1)``, which keeps the variance correct in small strata (Rao, Wu and Yue, Surv.
     Methodol. 18, 1992). Strata of a single cluster are pooled.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     x, labels = drop_undefined(values, clusters)
     if x.size == 0:
         return UNDEFINED
@@ -154,7 +154,7 @@ def split_bootstrap(
     Raises:
         UsageError: A cluster is in both arms or in two strata.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     x = as_values(values)
     cluster_labels, defined = dense_labels(clusters, x.size, "cluster"), ~np.isnan(x)
     if np.intersect1d(cluster_labels[first & defined], cluster_labels[~first & defined]).size:
@@ -197,7 +197,7 @@ def interquartile_bootstrap(
     "The pigeonhole bootstrap"). Bootstrap intervals are too narrow with few seeds; see
     :func:`~drivax.stats.seeds.seeds_interval` for means.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     by_seed = [as_values(seed_values) for seed_values in values]
     if not any(seed_values.size for seed_values in by_seed):
         return UNDEFINED
@@ -254,8 +254,8 @@ def _interquartile(draws: Labels, sums: Totals, counts: Totals) -> float:
     return math.nan if mean is None else mean
 
 
-def check_draws(confidence: float, resamples: int) -> None:
-    """Check the arguments of a bootstrap.
+def check_draws(resamples: int, confidence: float = 0.95) -> None:
+    """Check the arguments of a bootstrap or a permutation test, which has no confidence.
 
     Raises:
         UsageError: The confidence is outside (0, 1), or there are no resamples.

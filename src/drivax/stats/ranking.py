@@ -59,7 +59,7 @@ def bootstrap_intervals(
     Clusters with and without positives are drawn separately, so each resample has as many of each as the data (Davison
     and Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)
     has_positive = np.bincount(cluster, labels, len(names)) > 0
@@ -118,7 +118,7 @@ def correlation_interval(
     Davison and Hinkley, Bootstrap Methods, 1997, section 3.8. The interval is (-1, 1) for a single cluster, or if a
     resample has constant scores.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     labels = np.unique(np.asarray(clusters), return_inverse=True)[1]
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     rng, samples = np.random.default_rng(0), []

@@ -84,7 +84,7 @@ def paired_permutation(
     0/1 values in clusters of size one, this is McNemar's exact test. Otherwise ``resamples`` random patterns are drawn,
     and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010).
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0:
         return SignificanceResult("permutation", None, 0, exact=True)
@@ -114,7 +114,7 @@ def paired_bootstrap_test(
     Hall, The Bootstrap and Edgeworth Expansion, 1992, section 3.6). The standard error is that of a ratio of totals,
     ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0 or labels.max() == 0:
         return SignificanceResult("bootstrap", None, 0, exact=False)
@@ -157,7 +157,7 @@ def split_permutation(
     Raises:
         UsageError: A cluster is in both arms or in two strata.
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     keep = ~np.isnan(as_values(values))
     x, labels = drop_undefined(values, clusters)
     arm = first[keep]
