@@ -186,7 +186,7 @@ def advantage_weights(
 def scaled_policy_loss(loss: Float[Array, "*batch"], q: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """``loss / mean |Q|`` over the batch (Fujimoto and Gu 2021, arXiv 2106.06860).
 
-    A loss ``-Q`` becomes independent of the scale of rewards. No gradient reaches the divisor, at least 1e-6.
+    A loss ``-Q`` becomes independent of the scale of rewards. No gradient reaches the divisor, which is at least 1e-6.
     """
     return loss / jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(q))), 1e-6)
 

@@ -433,7 +433,8 @@ def project_on_route(
     """Project a point on the route of a row, from 6 m behind to ``ahead_m`` ahead of its last known arc length.
 
     ``near_m`` is that arc length; ``ahead_m``, of which 33 m count at most, keeps a car off the other leg of a hairpin.
-    With ``logged`` the point is projected on the logged path of the recorded ego of scenario ``row``.
+    The window stays within the array of points: near the end of the array it begins further behind. With ``logged`` the
+    point is projected on the logged path of the recorded ego of scenario ``row``.
     """
     routes, points = (bank.log_routes, bank.log_route_points) if logged else (bank.routes, bank.route_points)
     count = routes.shape[1]
