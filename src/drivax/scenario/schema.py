@@ -21,11 +21,11 @@ from drivax.errors import UsageError
 
 SCHEMA_VERSION = 3
 
-#: Steps of a full scenario: 10 past, the current one, 80 future (semantics, Time).
+#: Steps of a full scenario: 10 past, the current one, 80 future.
 STEPS = 91
 CURRENT_STEP = 10
 DT_S = 0.1
-#: Fewest steps of a log that is evaluated or trained on: 20 follow the current one (semantics, Time).
+#: Fewest steps of a log that is evaluated or trained on: 20 follow the current one.
 LEAST_STEPS = CURRENT_STEP + 1 + 20
 #: Most egos of a scenario: a bank holds a bit per ego and lane (``scenario.bank.columns.LaneRow``).
 MOST_EGOS = 8

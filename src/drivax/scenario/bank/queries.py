@@ -28,9 +28,9 @@ from drivax.scenario.record import record
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0
 LEVEL_M = 3.0
-#: Distance beyond an edge from which a corner counts as off the road (semantics, ``offroad``).
+#: Distance beyond an edge from which a corner counts as off the road (metric ``offroad``).
 OFFROAD_TOLERANCE_M = 0.3
-#: Tolerance of lane borders (semantics, ``lane_straddle``).
+#: Tolerance of lane borders (metric ``lane_straddle``).
 LANE_MARGIN_M = 0.2
 #: Largest distance to the nearest lane, m, at which its straight continuation decides whether the road goes on beyond
 #: the box of the map; the grid finds every segment up to there.

@@ -44,7 +44,7 @@ Vector = Float[Array, " 2"]
 _MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
-#: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
+#: Limits of a lane's class where the source gives none, m/s (metric ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
 #: Steps in a word of ``parked_when``.
 WORD = 32
