@@ -206,7 +206,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "agent_seen": ("?", (t, a)),  # of the valid ones, those that ego's sensors would see
         "agent_size": ("f4", (a, 3)), "agent_kind": ("i1", (a,)), "agent_id": ("i4", (a,)),
         "agent_flags": ("u1", (a,)),  # 1 ego, 2 to predict, 4 of interest
-        "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart, beyond the last logged pose, along lanes
+        "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart beyond the last logged pose, on lanes or straight
         # Agents that stay where they are: one pose, and the steps at which they are observed.
         "parked_xy": ("f4", (p, 2)), "parked_z": ("f4", (p,)), "parked_heading": ("f4", (p,)),
         "parked_size": ("f4", (p, 3)), "parked_kind": ("i1", (p,)), "parked_id": ("i4", (p,)),

@@ -189,7 +189,7 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         last_step: Last step of the log of each ego; for the recorded one that of the scenario, followed by padding.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
-        extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
+        extension: Points 4 m apart beyond the last logged pose of moving agents, along lanes or straight on: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.
