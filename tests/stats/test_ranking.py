@@ -91,6 +91,11 @@ def test_rank_correlation_equals_scipy():
     assert rank_correlation(one, other) == pytest.approx(stats.spearmanr(one, other).statistic)
 
 
+@pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0]])
+def test_constant_lists_have_no_rank_correlation(values):
+    assert np.isnan(rank_correlation(np.array(values), np.array(values)))
+
+
 def test_cluster_bootstrap_covers_the_true_value():
     """Forty scenarios of twenty steps with similar scores; intervals that ignore clusters are too short."""
     rng, truth, covered, apart = np.random.default_rng(3), 0.7592, [], []

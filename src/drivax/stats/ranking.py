@@ -105,7 +105,9 @@ def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -
 
 
 def rank_correlation(first: Numbers, second: Numbers) -> float:
-    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant."""
+    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant or empty."""
+    if len(first) < 2:  # NumPy would warn
+        return float("nan")
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
