@@ -245,6 +245,8 @@ def test_16_resampling_20_hz_keeps_every_other_step():
 def test_resampling_of_a_rounded_step_ends_at_the_last_step():
     fast = {"xy": np.zeros((1, 271, 2)), "heading": np.zeros((1, 271)), "valid": np.ones((1, 271), bool)}
     assert resample(fast, 0.033333333)["valid"].tolist() == [[True] * 91]
+    empty = {"xy": np.zeros((1, 0, 2)), "heading": np.zeros((1, 0)), "valid": np.zeros((1, 0), bool)}
+    assert resample(empty, 0.05)["xy"].shape == (1, 0, 2)
 
 
 def test_velocities_are_differences_within_observed_intervals():

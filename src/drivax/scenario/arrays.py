@@ -119,7 +119,8 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
         raise UsageError(f"dt_s is {dt_s}", cure="give the seconds between two steps")
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
-    at = np.minimum(np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s), steps - 1)
+    new_steps = int(np.floor((steps - 1) * dt_s / DT_S + 1e-6)) + 1
+    at = np.minimum(np.arange(new_steps) * (DT_S / dt_s), steps - 1)
     # Undo rounding: a new step that falls on an old one must not need its neighbour, too.
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
