@@ -237,20 +237,19 @@ def project(
 
 
 def project_monotone(
-    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"],
-    first_window_m: float = np.inf,
-) -> Float[Array, " query"]:  # fmt: skip
+    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"]
+) -> Float[Array, " query"]:
     """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
-    position is searched in ``[0, first_window_m]``, and ``window[0]`` is not used. The polyline needs two points.
+    position is searched on the whole polyline, which needs two points, and ``window[0]`` is not used.
     """
     arc = arc_lengths(points)
     (x, y), (step_x, step_y), span = points[:-1, :2].T, (points[1:, :2] - points[:-1, :2]).T, np.diff(arc)
     square = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
     divisor = np.maximum(span, 1e-12)
     result = np.zeros(len(xy))
-    low, high = 0.0, min(first_window_m, arc[-1])
+    low, high = 0.0, arc[-1]
     for k in range(len(xy)):
         if k > 0:
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
