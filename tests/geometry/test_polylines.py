@@ -46,6 +46,7 @@ def test_arc_length_by_hand_restarts_at_every_polyline():
     assert lines.arc.tolist() == [0.0, 5.0, 11.0, 0.0, 1.0]
     assert lines.length.tolist() == [11.0, 1.0]
     assert lines.row.tolist() == [0, 0, 0, 1, 1]
+    assert Polylines.of([np.zeros((0, 3))]).length.tolist() == [0.0]
 
 
 def test_points_and_headings_on_a_corner_by_hand():
@@ -193,7 +194,6 @@ def test_monotone_projection_stays_on_its_branch_and_at_the_end():
     assert project_monotone(hairpin, queries, np.full(4, 15.0)).tolist() == [10.0, 20.0, 30.0, 30.0]
     line = np.array([[0.0, 0], [2, 0], [2, 0], [4, 0]])  # with a repeated point
     assert project_monotone(line, np.array([[9.0, 0], [9, 0]]), np.full(2, 1.0)).tolist() == [4.0, 4.0]
-    assert project_monotone(line, np.array([[3.0, 5]]), np.zeros(1), first_window_m=1.0).tolist() == [1.0]
 
 
 def test_resampling_needs_memory_for_its_samples_only():

@@ -147,9 +147,9 @@ WRONG = {
     'agents["kind"] has 1 entries, not 2': lambda a, r: a.update(kind=["vehicle"]),
     "agents[\"kind\"][1] is 'lorry'": lambda a, r: a.update(kind=["vehicle", "lorry"]),
     'agents["id"] has shape (3,)': lambda a, r: a.update(id=[1, 2, 3]),
-    "agents has no 'yaw'": lambda a, r: a.update(yaw=0),
-    "roads has no 'lane'": lambda a, r: r.update(lane=[]),
-    'roads["lanes"][1] has no \'speed\'': lambda a, r: r["lanes"][1].update(speed=3),
+    "agents has an unknown key 'yaw'": lambda a, r: a.update(yaw=0),
+    "roads has an unknown key 'lane'": lambda a, r: r.update(lane=[]),
+    'roads["lanes"][1] has an unknown key \'speed\'': lambda a, r: r["lanes"][1].update(speed=3),
     'roads["lanes"][0]["successors"] names lane 3, there are 3': lambda a, r: r["lanes"][0].update(successors=[3]),
     'roads["lanes"][0]["points"] has shape (1, 2)': lambda a, r: r["lanes"][0].update(points=[(0, 0)]),
     'roads["lanes"][2]["points"] is not an array': lambda a, r: r["lanes"][2].update(points="abc"),
@@ -161,6 +161,7 @@ WRONG = {
     'roads["lanes"][0]["successors"] is 0.5': lambda a, r: r["lanes"][0].update(successors=0.5),
     'roads["lanes"][0]["kind"] is <RoadKind.EDGE': lambda a, r: r["lanes"][0].update(kind=RoadKind.EDGE_BOUNDARY),
     "roads[\"lanes\"][0][\"limit_mps\"] is 'fast'": lambda a, r: r["lanes"][0].update(limit_mps="fast"),
+    'roads["stop_signs"][0]["point"] is missing': lambda a, r: r["stop_signs"][0].pop("point"),
     'roads["stop_signs"][0] names lane 9': lambda a, r: r["stop_signs"][0].update(lanes=[9]),
 }  # fmt: skip
 
@@ -190,6 +191,8 @@ def test_other_errors_name_their_argument(agents, roads):
         scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["blue"] * 91}])
     with pytest.raises(UsageError, match=r"dt_s is 0.5.*resample\(agents, 0.5\)"):
         scenario_from_arrays("a", agents, roads, dt_s=0.5)
+    with pytest.raises(UsageError, match="dt_s is nan"):
+        scenario_from_arrays("a", agents, roads, dt_s=math.nan)
     with pytest.raises(DataError, match="ego is not valid at the current step"):
         scenario_from_arrays("a", agents, roads, ego=1)
 
@@ -237,6 +240,13 @@ def test_16_resampling_20_hz_keeps_every_other_step():
     np.testing.assert_allclose(resample(copy.deepcopy(fast), 0.1)["xy"], x, atol=1e-12)
     with pytest.raises(UsageError, match="dt_s is 0"):
         resample(fast, 0)
+
+
+def test_resampling_of_a_rounded_step_ends_at_the_last_step():
+    fast = {"xy": np.zeros((1, 271, 2)), "heading": np.zeros((1, 271)), "valid": np.ones((1, 271), bool)}
+    assert resample(fast, 0.033333333)["valid"].tolist() == [[True] * 91]
+    empty = {"xy": np.zeros((1, 0, 2)), "heading": np.zeros((1, 0)), "valid": np.zeros((1, 0), bool)}
+    assert resample(empty, 0.05)["xy"].shape == (1, 0, 2)
 
 
 def test_velocities_are_differences_within_observed_intervals():

@@ -24,6 +24,7 @@ def test_design_effect_by_hand():
     # Where nothing varies, or all is one cluster, clusters count.
     assert design_effect(np.ones(6), dense_labels([0, 0, 0, 1, 1, 1], 6, "cluster")) == 3.0
     assert design_effect(np.array([1.0, 2, 3]), np.zeros(3, np.int64)) == 3.0
+    assert design_effect(np.full(6, 0.1), np.arange(6) // 2) == 2.0, "the mean of 0.1 is rounded"
 
 
 def test_design_effect_of_equal_clusters_follows_kish():

@@ -54,6 +54,14 @@ def test_power_by_simulation():
     assert power(0.4, 40, confidence=0.9) == pytest.approx(rejected.mean(), abs=0.01)
 
 
+def test_power_of_two_pairs():
+    """One degree of freedom: T is a normal variable over the absolute value of another."""
+    rng, bound = np.random.default_rng(1), scipy.stats.t.ppf(0.975, 1)
+    for effect in (10.0, 17.0):
+        t = rng.normal(effect * math.sqrt(2), 1, 100_000) / rng.normal(0, 1, 100_000)
+        assert power(effect, 2) == pytest.approx((np.abs(t) > bound).mean(), abs=0.005)
+
+
 def test_power_at_its_ends():
     assert power(5.0, 1000) == 1.0 and power(1.0, 1) == 0.0 and power(1.0, 2, share=0.5) == 0.0
     assert power(-0.5, 34) == power(0.5, 34)

@@ -70,6 +70,7 @@ def test_undefined_values_have_no_interval():
     assert bootstrap_mean([], seed=0) == nothing
     assert bootstrap_mean([None, None], ["a", "b"], seed=0) == nothing
     assert paired_bootstrap([1.0, None], [None, 2.0], seed=0) == nothing
+    assert interquartile_bootstrap([[], []], seed=0) == nothing
     assert nothing.as_dict() == {"mean": None, "low": None, "high": None, "n": 0}
 
 
@@ -157,6 +158,8 @@ def test_pairs_agree_with_scipy_and_need_both():
 def test_a_single_cluster_has_no_interval():
     assert bootstrap_mean([1.0, 2.0], ["a", "a"], seed=0) == Interval(1.5, None, None, 2)
     assert bootstrap_mean([7.0], seed=0) == Interval(7.0, None, None, 1)
+    by_seed = [[1.0, 2.0, None], [1.0, 3.0, None]]
+    assert interquartile_bootstrap(by_seed, list("aab"), seed=0) == Interval(1.75, None, None, 4)
 
 
 def test_clusters_without_defined_episodes_are_excluded():

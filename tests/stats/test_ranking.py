@@ -91,6 +91,11 @@ def test_rank_correlation_equals_scipy():
     assert rank_correlation(one, other) == pytest.approx(stats.spearmanr(one, other).statistic)
 
 
+@pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0]])
+def test_constant_lists_have_no_rank_correlation(values):
+    assert np.isnan(rank_correlation(np.array(values), np.array(values)))
+
+
 def test_cluster_bootstrap_covers_the_true_value():
     """Forty scenarios of twenty steps with similar scores; intervals that ignore clusters are too short."""
     rng, truth, covered, apart = np.random.default_rng(3), 0.7592, [], []
@@ -110,6 +115,12 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
     assert auc[0] < roc_auc(SCORES, LABELS, weights) < auc[1]
     assert precision[0] <= precision_at_base_rate(SCORES, LABELS, weights) <= precision[1]
     np.testing.assert_allclose(auc, auc_interval(SCORES, LABELS), atol=0.02)
+
+
+def test_resamples_without_negatives_are_left_out():
+    scores, labels = np.array([0.1, 0.4, 0.2, 0.9]), np.array([True, True, False, True])
+    auc, _ = bootstrap_intervals(scores, labels, np.ones(4), np.array([0, 0, 1, 1]), resamples=50)
+    assert 0.0 <= auc[0] <= auc[1] <= 1.0
 
 
 def test_interval_of_rank_correlation():

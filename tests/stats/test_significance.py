@@ -114,6 +114,7 @@ def test_bootstrap_test_of_constant_differences():
     assert paired_bootstrap_test([1.0, 1.0], [1.0, 1.0], seed=0).p == 1.0
     assert paired_bootstrap_test([2.0, 2.0], [1.0, 1.0], seed=0).p < 0.001
     assert paired_bootstrap_test([2.0, 2.0], [1.0, 0.0], ["a", "a"], seed=0).p is None
+    assert paired_bootstrap_test(np.full(10, 0.1), np.zeros(10), seed=0).p < 0.001, "moments are rounded"
 
 
 def test_permutation_of_arms_is_every_assignment():

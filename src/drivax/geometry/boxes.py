@@ -103,8 +103,8 @@ def overlap_within(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: 
     """Return whether boxes overlap within a horizon at constant velocities and fixed headings.
 
     Separating axis theorem for ``a`` and the area that ``b`` sweeps relative to it: the axes of both boxes and the
-    normal of the relative velocity. Equal to ``time_to_overlap(...) < horizon_s`` without divisions, but a corner that
-    only touches the other box in passing counts as overlap.
+    normal of the relative velocity. Equal to ``time_to_overlap(...) < horizon_s`` for positive horizons, without
+    divisions, but a corner that only touches the other box in passing counts as overlap.
     """
     half = horizon_s / 2
     vx, vy = ((velocity_b[..., axis] - velocity_a[..., axis]) * half for axis in (0, 1))

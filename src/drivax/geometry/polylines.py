@@ -51,8 +51,8 @@ class Polylines:
     @cached_property
     def length(self) -> Float[Array, " polyline"]:
         """Length of every polyline in the plane, metres; 0 without points."""
-        if self.count == 0:
-            return np.zeros(0)
+        if len(self.points) == 0:
+            return np.zeros(self.count)
         return np.where(np.diff(self.start) > 0, self.arc[np.maximum(self.start[1:] - 1, 0)], 0.0)
 
     def line(self, row: Any) -> Float[Array, "_ dim"]:
@@ -73,9 +73,9 @@ class Polylines:
         """Find the segment at arc length ``s`` of polyline ``row``, which has two points or more.
 
         Returns:
-            The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first or
-            last segment, with a fraction outside [0, 1]: evaluation continues straight on, except where points are
-            repeated at that end.
+            The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first
+            segment with a length, or the last segment: evaluation continues straight on, but stays at a last point
+            that is repeated.
         """
         # Minimum and maximum are several times as fast as clip on few elements.
         key = np.minimum(np.maximum(s, 0.0), self.length[row]) + self._base[row]
@@ -197,7 +197,7 @@ def resample(
     """Resample a polyline of at least two points every ``spacing_m`` of arc length; the rest at the end is dropped.
 
     Returns:
-        The first ``most`` samples, and for each the index of the point at or before it.
+        The first ``most`` samples, and for each the index of the point where its segment begins.
     """
     arc = arc_lengths(points)
     # The tolerances keep rounding from dropping the last sample, or from choosing the segment before a point.
@@ -237,20 +237,19 @@ def project(
 
 
 def project_monotone(
-    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"],
-    first_window_m: float = np.inf,
-) -> Float[Array, " query"]:  # fmt: skip
+    points: Float[Array, "point dim"], xy: Float[Array, "query 2"], window_m: Float[Array, " query"]
+) -> Float[Array, " query"]:
     """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
-    position is searched in ``[0, first_window_m]``, and ``window[0]`` is not used. The polyline needs two points.
+    position is searched on the whole polyline, which needs two points, and ``window[0]`` is not used.
     """
     arc = arc_lengths(points)
     (x, y), (step_x, step_y), span = points[:-1, :2].T, (points[1:, :2] - points[:-1, :2]).T, np.diff(arc)
     square = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
     divisor = np.maximum(span, 1e-12)
     result = np.zeros(len(xy))
-    low, high = 0.0, min(first_window_m, arc[-1])
+    low, high = 0.0, arc[-1]
     for k in range(len(xy)):
         if k > 0:
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])

@@ -19,7 +19,7 @@ def rotate(xy: Any, cos: Any, sin: Any) -> Any:
 
 
 def root(squared: Any) -> Any:
-    """Square root whose gradient at zero is zero.
+    """Square root whose gradient at zero is zero; 0 for negative arguments and NaN.
 
     Reverse differentiation of ``sqrt(0)`` is infinite, and infinity times the zero that a mask sends back is not a
     number; so both the argument and the result are masked.

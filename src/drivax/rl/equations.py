@@ -54,7 +54,7 @@ def clipped_surrogate_loss(
 
 
 class NStepReturns(NamedTuple):
-    """Discounted sums of rewards, whether a failure ended the episode, numbers of steps, and ``gamma^(decisions)``."""
+    """Discounted sums of rewards, whether the episode terminated, numbers of steps, and ``gamma^(decisions)``."""
 
     reward: Float[Array, "*batch"]
     terminated: Bool[Array, "*batch"]
@@ -184,9 +184,9 @@ def advantage_weights(
 
 
 def scaled_policy_loss(loss: Float[Array, "*batch"], q: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """``loss / mean |Q|`` over the batch, independent of the scale of rewards (Fujimoto and Gu 2021, arXiv 2106.06860).
+    """``loss / mean |Q|`` over the batch (Fujimoto and Gu 2021, arXiv 2106.06860).
 
-    No gradient reaches the divisor, which is at least 1e-6.
+    A loss ``-Q`` becomes independent of the scale of rewards. No gradient reaches the divisor, which is at least 1e-6.
     """
     return loss / jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(q))), 1e-6)
 

@@ -66,7 +66,7 @@ def recording_from_arrays(
     Raises:
         UsageError: An argument is missing or misspelt, or has another shape or an invalid value.
     """
-    if abs(dt_s - DT_S) > 1e-3:
+    if not abs(dt_s - DT_S) <= 1e-3:  # refuses NaN, too
         cure = f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out"
         raise UsageError(f"dt_s is {dt_s}, scenarios have steps of {DT_S} s", cure=cure)
     _check_keys(agents, _AGENT_KEYS, "agents")
@@ -119,7 +119,8 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
         raise UsageError(f"dt_s is {dt_s}", cure="give the seconds between two steps")
     valid = _array(agents, "valid", bool, (None, None))
     count, steps = valid.shape
-    at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
+    new_steps = int(np.floor((steps - 1) * dt_s / DT_S + 1e-6)) + 1
+    at = np.minimum(np.arange(new_steps) * (DT_S / dt_s), steps - 1)
     # Undo rounding: a new step that falls on an old one must not need its neighbour, too.
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
@@ -142,7 +143,7 @@ def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
         raise UsageError(f"{what} is not a mapping", cure=f"give a dictionary with {', '.join(keys)}")
     for key in mapping:
         if key not in keys:
-            raise UsageError(f"{what} has no {key!r}", cure=f"use {', '.join(keys)}")
+            raise UsageError(f"{what} has an unknown key {key!r}", cure=f"use {', '.join(keys)}")
 
 
 def _items(values: Any, what: str) -> list[Any]:
@@ -250,7 +251,9 @@ def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     for row, sign in enumerate(roads.get("stop_signs", ())):
         what = f'roads["stop_signs"][{row}]'
         _check_keys(sign, ("point", "lanes"), what)
-        point = _points([sign.get("point")], f'{what}["point"]', 1)
+        if "point" not in sign:
+            raise UsageError(f'{what}["point"] is missing', cure="see recording_from_arrays")
+        point = _points([sign["point"]], f'{what}["point"]', 1)
         controls = _lane_indices(sign.get("lanes", ()), lanes, what)
         yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controls)
 
@@ -313,5 +316,5 @@ def _light(light: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Li
     stop, line = light.get("stop_point"), lanes[indices[0]].points
     point = line[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
     if stop is not None and len(stop) == 2:
-        point[2] = line[np.hypot(*(line[:, :2] - point[:2]).T).argmin(), 2] + 0.0
+        point[2] = line[np.hypot(*(line[:, :2] - point[:2]).T).argmin(), 2] + 0.0  # turns -0 into 0
     return Light(indices[0], point, np.array(codes, np.int8))

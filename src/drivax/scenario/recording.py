@@ -357,7 +357,7 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
     if steps == 0:
         return "there are no steps", "skip the recording"
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        return "timestamps do not increase", "repair the time base in the reader"
+        return "timestamps do not increase or are not finite", "repair the time base in the reader"
     if steps > most_steps:
         return f"{steps} steps, more than {most_steps}", "cut it with windows()"
     if not 0 <= recording.current_step < steps:

@@ -21,11 +21,11 @@ from drivax.errors import UsageError
 
 SCHEMA_VERSION = 3
 
-#: Steps of a full scenario: 10 past, the current one, 80 future (semantics, Time).
+#: Steps of a full scenario: 10 past, the current one, 80 future.
 STEPS = 91
 CURRENT_STEP = 10
 DT_S = 0.1
-#: Fewest steps of a log that is evaluated or trained on: 20 follow the current one (semantics, Time).
+#: Fewest steps of a log that is evaluated or trained on: 20 follow the current one.
 LEAST_STEPS = CURRENT_STEP + 1 + 20
 #: Most egos of a scenario: a bank holds a bit per ego and lane (``scenario.bank.columns.LaneRow``).
 MOST_EGOS = 8
@@ -206,7 +206,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "agent_seen": ("?", (t, a)),  # of the valid ones, those that ego's sensors would see
         "agent_size": ("f4", (a, 3)), "agent_kind": ("i1", (a,)), "agent_id": ("i4", (a,)),
         "agent_flags": ("u1", (a,)),  # 1 ego, 2 to predict, 4 of interest
-        "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart, beyond the last logged pose, along lanes
+        "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart beyond the last logged pose, on lanes or straight
         # Agents that stay where they are: one pose, and the steps at which they are observed.
         "parked_xy": ("f4", (p, 2)), "parked_z": ("f4", (p,)), "parked_heading": ("f4", (p,)),
         "parked_size": ("f4", (p, 3)), "parked_kind": ("i1", (p,)), "parked_id": ("i4", (p,)),

@@ -98,7 +98,7 @@ class ScenarioWriter:
     Raises:
         UsageError: ``path`` exists, another process writes it, a scenario has another capacity, or ``shard_size`` is
             below 1.
-        DataError: A scenario's id is in the set already, no scenario was added, or the disk is full.
+        DataError: A scenario of this data set and id is in the set already, no scenario was added, or the disk is full.
     """
 
     def __init__(
@@ -352,7 +352,7 @@ class ScenarioSet(Sequence[Scenario]):
             raise UsageError(problem, file=self.path, cure="leave it out")
         data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
         shards = np.searchsorted(self._starts, index, side="right") - 1
-        # A contiguous copy right after the test that brought the record into the cache; take() is slower.
+        # A contiguous copy right after the test that brought the record into the cache; np.take is slower.
         for row, (shard, number) in enumerate(zip(shards.tolist(), index.tolist(), strict=True)):
             data[row] = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         return out

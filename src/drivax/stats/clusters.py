@@ -98,9 +98,9 @@ def design_effect(x: Values, labels: Labels) -> float:
     n, clusters, mean = x.size, sums.size, float(x.mean())
     if clusters == n:
         return 1.0
-    spread = float(np.square(x - mean).mean())
-    if clusters == 1 or spread == 0.0:
+    if clusters == 1 or (x == x[0]).all():
         return n / clusters
+    spread = float(np.square(x - mean).mean())
     variance = clusters / (clusters - 1) * float(np.square(sums - mean * counts).sum()) / n**2
     return min(max(1.0, variance / (spread / n)), float(n))
 

@@ -20,7 +20,7 @@ _MAX_SCENARIOS = 10**12
 
 @dataclass(frozen=True)
 class PairedEffect:
-    """Standardised mean differences of pairs; None if nothing varies or fewer than two pairs are defined.
+    """Standardised mean differences of pairs; None if their divisor is 0 or fewer than two pairs are defined.
 
     Power depends on ``d_z``; ``d_av`` is comparable with an unpaired d.
     """
@@ -47,7 +47,7 @@ def cohens_d_paired(a: Any, b: Any) -> PairedEffect:
 def cohens_d(a: Any, b: Any) -> float | None:
     """Return Cohen's d of two independent samples, ``(m_a - m_b) / s`` with the pooled deviation (Cohen 1988, 2.5).
 
-    The result is None if nothing varies, or if a sample has fewer than two defined values.
+    The result is None if neither sample varies, or if one has fewer than two defined values.
     """
     first, second = (values[~np.isnan(values)] for values in (as_values(a), as_values(b)))
     if min(first.size, second.size) < 2:
@@ -87,9 +87,11 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         return 0.0
     noncentrality = abs(effect) * math.sqrt(n if share is None else n * share * (1 - share))
     critical = float(special.stdtrit(dof, (1 + confidence) / 2))
-    if noncentrality - critical > 10:
-        return 1.0
     below, above = (float(special.nctdtr(dof, noncentrality, t)) for t in (-critical, critical))
+    if noncentrality - critical > 10 or math.isnan(above):
+        # The numerator of T is all but constant, so its denominator decides; SciPy may return NaN.
+        return float(special.chdtr(dof, dof * (noncentrality / critical) ** 2))
+    # SciPy returns NaN for some lower tails that are negligible.
     return min(1.0, 1.0 - above + (below if math.isfinite(below) else 0.0))
 
 
@@ -98,7 +100,8 @@ def scenarios_needed(
 ) -> int:
     """Return the smallest number of independent scenarios that detects an effect with power ``target``.
 
-    It counts pairs, or the scenarios of both arms, up to about 1e12. Clustered scenarios need ``deff`` times as many.
+    It counts pairs, or the scenarios of both arms; about 1e12 means that many or more. Clustered scenarios need
+    ``deff`` times as many.
     Arguments are those of :func:`power`.
     """
     _check_target(target)

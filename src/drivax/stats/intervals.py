@@ -31,13 +31,13 @@ from drivax.stats.clusters import (
 )
 
 RESAMPLES = 10_000
-#: Random numbers per chunk, which limits memory to about 16 MB.
+#: Random numbers per chunk, which limits each array of them to about 16 MB.
 _CHUNK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate, its interval, and the number of defined episodes or pairs.
+    """An estimate, its interval, and the number of defined episodes or pairs, or of trials, values or events.
 
     ``mean`` is None if there are none; ``low`` and ``high`` are None if the spread cannot be estimated.
     """
@@ -128,7 +128,7 @@ def bootstrap_mean(
     and weights them by ``C_h / (C_h - 1)``, which keeps the variance correct in small strata (Rao, Wu and Yue, Surv.
     Methodol. 18, 1992). Strata of a single cluster are pooled.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     x, labels = drop_undefined(values, clusters)
     if x.size == 0:
         return UNDEFINED
@@ -154,7 +154,7 @@ def split_bootstrap(
     Raises:
         UsageError: A cluster is in both arms or in two strata.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     x = as_values(values)
     cluster_labels, defined = dense_labels(clusters, x.size, "cluster"), ~np.isnan(x)
     if np.intersect1d(cluster_labels[first & defined], cluster_labels[~first & defined]).size:
@@ -197,9 +197,9 @@ def interquartile_bootstrap(
     "The pigeonhole bootstrap"). Bootstrap intervals are too narrow with few seeds; see
     :func:`~drivax.stats.seeds.seeds_interval` for means.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     by_seed = [as_values(seed_values) for seed_values in values]
-    if not by_seed:
+    if not any(seed_values.size for seed_values in by_seed):
         return UNDEFINED
     labels = dense_labels(clusters, by_seed[0].size, "cluster")
     if any(seed_values.size != labels.size for seed_values in by_seed):
@@ -209,7 +209,7 @@ def interquartile_bootstrap(
     if not n:
         return UNDEFINED
     mean = _interquartile(np.ones(seeds, int), sums.sum(axis=1), counts.sum(axis=1))
-    if cluster_count < 2:
+    if np.count_nonzero(counts.any(axis=0)) < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
     for resample in range(resamples):
@@ -254,8 +254,8 @@ def _interquartile(draws: Labels, sums: Totals, counts: Totals) -> float:
     return math.nan if mean is None else mean
 
 
-def check_draws(confidence: float, resamples: int) -> None:
-    """Check the arguments of a bootstrap.
+def check_draws(resamples: int, confidence: float = 0.95) -> None:
+    """Check the arguments of a bootstrap or a permutation test, which has no confidence.
 
     Raises:
         UsageError: The confidence is outside (0, 1), or there are no resamples.

@@ -56,10 +56,10 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:  # fmt: skip
     """Return cluster-bootstrap percentile intervals of :func:`roc_auc` and :func:`precision_at_base_rate`.
 
-    Clusters with and without positives are drawn separately, so each resample has as many of either (Davison and
-    Hinkley, Bootstrap Methods, 1997, section 3.8).
+    Clusters with and without positives are drawn separately, so each resample has as many of each as the data (Davison
+    and Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     rank, rng = _ranks(scores, labels), np.random.default_rng(0)
     names, cluster = np.unique(clusters, return_inverse=True)
     has_positive = np.bincount(cluster, labels, len(names)) > 0
@@ -92,7 +92,8 @@ def _weights_by_rank(
 
 def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
     below = np.cumsum(negative) - negative
-    return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
+    with np.errstate(invalid="ignore"):  # NaN for a resample without negatives
+        return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
 
 
 def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
@@ -104,7 +105,9 @@ def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -
 
 
 def rank_correlation(first: Numbers, second: Numbers) -> float:
-    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant."""
+    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant or empty."""
+    if len(first) < 2:  # NumPy would warn
+        return float("nan")
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
@@ -114,10 +117,10 @@ def correlation_interval(
 ) -> tuple[float, float]:
     """Return the cluster-bootstrap percentile interval of :func:`rank_correlation`.
 
-    The interval is (-1, 1) for a single cluster, or if a resample has constant scores (Davison and Hinkley, Bootstrap
-    Methods, 1997, section 3.8).
+    Davison and Hinkley, Bootstrap Methods, 1997, section 3.8. The interval is (-1, 1) for a single cluster, or if a
+    resample has constant scores.
     """
-    check_draws(confidence, resamples)
+    check_draws(resamples, confidence)
     labels = np.unique(np.asarray(clusters), return_inverse=True)[1]
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     rng, samples = np.random.default_rng(0), []

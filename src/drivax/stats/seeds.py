@@ -150,7 +150,7 @@ class CrossedEffect:
         candidates = np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)
         numbers = np.unique(np.round(candidates)).astype(int).tolist()
         first = next((index for index, number in enumerate(numbers) if detects(number)), None)
-        if self.difference == 0.0 or first is None:
+        if self.difference == 0.0 or first is None:  # without an error, 0 >= 0 holds
             return None
         low, high = (numbers[first - 1] if first else present), numbers[first]
         while high - low > 1:

@@ -28,6 +28,8 @@ from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
 #: Relative difference between resampled and observed statistic below which they are tied.
 _TIE = 1e-9
+#: Standard error relative to the mean below which the differences are equal: their rounding errors are about 1e-8.
+_ROUNDING_ERROR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class SignificanceResult:
 
     Attributes:
         name: Name of the test.
-        p: Two-sided p-value; None if no value is defined, an arm is empty, or the bootstrap has only one cluster.
+        p: Two-sided p-value; None if no value is defined, an arm is empty, or a bootstrap or t test has one cluster.
         units: Number of units: discordant pairs (McNemar), clusters with a difference (permutation of pairs), or
             clusters (others; 0 if all their differences are 0); 0 without a p-value.
         exact: Whether the p-value is exact (binomial, or all permutations), not sampled or by a t distribution.
@@ -82,7 +84,7 @@ def paired_permutation(
     0/1 values in clusters of size one, this is McNemar's exact test. Otherwise ``resamples`` random patterns are drawn,
     and ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010).
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0:
         return SignificanceResult("permutation", None, 0, exact=True)
@@ -112,7 +114,7 @@ def paired_bootstrap_test(
     Hall, The Bootstrap and Edgeworth Expansion, 1992, section 3.6). The standard error is that of a ratio of totals,
     ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     x, labels = drop_undefined(paired_differences(a, b), clusters)
     if x.size == 0 or labels.max() == 0:
         return SignificanceResult("bootstrap", None, 0, exact=False)
@@ -121,7 +123,7 @@ def paired_bootstrap_test(
         return SignificanceResult("bootstrap", 1.0, 0, exact=False)
     moments = np.stack((sums, counts, sums * sums, sums * counts, counts * counts), axis=1)
     mean, error = (float(value[0]) for value in _mean_and_error(moments.sum(axis=0)[None], sums.size))
-    if error == 0.0:
+    if error <= _ROUNDING_ERROR * abs(mean):
         return SignificanceResult("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
     rng, extreme = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
@@ -155,7 +157,7 @@ def split_permutation(
     Raises:
         UsageError: A cluster is in both arms or in two strata.
     """
-    check_draws(0.95, resamples)
+    check_draws(resamples)
     keep = ~np.isnan(as_values(values))
     x, labels = drop_undefined(values, clusters)
     arm = first[keep]

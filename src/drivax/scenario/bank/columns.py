@@ -7,7 +7,10 @@ NEVER_M = 1e6
 
 
 class AgentColumn:
-    """Columns of ``ScenarioBank.agents`` and ``parked``: pose, velocity in m/s, and whether the agent is observed."""
+    """Columns of ``ScenarioBank.agents`` and ``parked``: pose, velocity in m/s, and whether the agent is observed.
+
+    Parked agents count as observed here; ``ScenarioBank.parked_when`` has the steps.
+    """
 
     X, Y, Z, COS, SIN, VX, VY, VALID = range(8)
     XY = slice(X, Z)

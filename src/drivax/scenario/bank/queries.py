@@ -3,7 +3,7 @@
 A query of edges or lanes reads the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly
 inside them. Segments beyond its cut-off (edges 3 m from a point, lanes 4 m or half their width, 8 m at the border of
 the map) never change its result, so no result depends on the grid; ``tests/scenario/test_queries.py`` compares with
-brute force. Segments more than 3 m above or below are ignored.
+brute force. Segments more than 3 m above or below are ignored. Neither holds for :func:`vertex_distances`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from drivax.scenario.record import record
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0
 LEVEL_M = 3.0
-#: Distance beyond an edge from which a corner counts as off the road (semantics, ``offroad``).
+#: Distance beyond an edge from which a corner counts as off the road (metric ``offroad``).
 OFFROAD_TOLERANCE_M = 0.3
-#: Tolerance of lane borders (semantics, ``lane_straddle``).
+#: Tolerance of lane borders (metric ``lane_straddle``).
 LANE_MARGIN_M = 0.2
-#: Largest distance to the nearest lane at which the road is known to go on beyond the box of the map, m; the grid finds
-#: every segment up to there.
+#: Largest distance to the nearest lane, m, at which its straight continuation decides whether the road goes on beyond
+#: the box of the map; the grid finds every segment up to there.
 _GOES_ON_M = 8.0
 #: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far a car may be
 #: beyond the ends of a segment, m.
@@ -433,7 +433,8 @@ def project_on_route(
     """Project a point on the route of a row, from 6 m behind to ``ahead_m`` ahead of its last known arc length.
 
     ``near_m`` is that arc length; ``ahead_m``, of which 33 m count at most, keeps a car off the other leg of a hairpin.
-    With ``logged`` the point is projected on the logged path of the recorded ego of scenario ``row``.
+    The window stays within the array of points: near the end of the array it begins further behind. With ``logged`` the
+    point is projected on the logged path of the recorded ego of scenario ``row``.
     """
     routes, points = (bank.log_routes, bank.log_route_points) if logged else (bank.routes, bank.route_points)
     count = routes.shape[1]

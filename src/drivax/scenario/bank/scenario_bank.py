@@ -44,7 +44,7 @@ Vector = Float[Array, " 2"]
 _MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
-#: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
+#: Limits of a lane's class where the source gives none, m/s (metric ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
 #: Steps in a word of ``parked_when``.
 WORD = 32
@@ -189,7 +189,7 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         last_step: Last step of the log of each ego; for the recorded one that of the scenario, followed by padding.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
-        extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
+        extension: Points 4 m apart beyond the last logged pose of moving agents, along lanes or straight on: x, y.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.

@@ -118,7 +118,7 @@ class Parts:
 
 
 def count_source(recording: Recording) -> SourceCounts:
-    """Count the steps, tracks, map features and lights of the source, before cropping and capping."""
+    """Count the steps, tracks, map features and lights (one per lane) of the source, before cropping and capping."""
     kinds = np.array([feature.kind for feature in recording.features], dtype=np.int64)
     tracks = recording.tracks
     return SourceCounts(
@@ -277,8 +277,8 @@ def _select_lanes(
 ) -> tuple[Int[Array, " lane"], int]:
     """Return the lanes to store, in order of the source, and the number that did not fit.
 
-    These are the lanes of the ``feature`` of some segment in the crop. Lanes of routes come first, then those for cars,
-    then others, the nearest to ``path`` first.
+    These are the lanes with a segment in the crop, whose features ``feature`` holds. Lanes of routes come first, then
+    those for cars, then others, the nearest to ``path`` first.
     """
     rows = np.flatnonzero(np.isin(graph.feature, feature))
     distance = np.full(graph.count, np.inf)

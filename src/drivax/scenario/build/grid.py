@@ -116,8 +116,8 @@ def arrange(
 ) -> GridSegments:
     """Sort segments into the grid; drop those that do not fit the square, the table or the runs of a query.
 
-    Those farthest from ``path``, the log of the ego, are dropped first. Lanes of routes may leave the square: what is
-    also outside the box of ``path`` widened by ``margin_m`` is not counted.
+    Those farthest from ``path``, the log of the ego, are dropped first. Segments outside both the square and the box of
+    ``path`` widened by ``margin_m``, where lanes of routes may lead, are not counted.
 
     Raises:
         DataError: A road edge near ``path`` does not fit.

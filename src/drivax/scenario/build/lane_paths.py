@@ -199,7 +199,7 @@ class LaneSearch:
         return any(not is_change(self.graph, *lane_path.lanes[-2:]) for lane_path in children)
 
     def _signature(self, lane_path: LanePath) -> tuple[int, ...]:
-        """Lanes at a third, two thirds and all of the required length; a lane left by a change is its neighbour."""
+        """Lanes at a third, two thirds and all of the required length; lanes left by a change do not count."""
         graph = self.graph
         ends, reach = [], -lane_path.s
         for lane, next_lane in zip(lane_path.lanes, (*lane_path.lanes[1:], -1), strict=True):
@@ -352,7 +352,7 @@ def precede(
         if not options:
             break
         distances = [project(graph.lines.line(option), history)[1].mean() for option in options]
-        # Rounded: of options that differ by less than a metre the first is taken on every processor.
+        # Rounded to metres: of options that are about equally near the first is taken, also on other processors.
         best = options[int(np.argmin([round(float(metres)) for metres in distances]))]
         result.insert(0, best)
         total += float(graph.lines.length[best])

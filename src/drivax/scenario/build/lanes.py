@@ -263,7 +263,7 @@ def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tupl
 def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
 
-    Links to other lanes go uncounted: they lead out of the crop.
+    Links to other lanes go uncounted: they lead out of the crop, or to lanes that are counted as not fitting.
     """
     new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
     new_index[rows] = np.arange(len(rows))
@@ -465,7 +465,7 @@ def _arc_at(
 def _heading_near(lane_segments: LaneSegments, stop: Float[Array, "3"]) -> float:
     """Heading of the nearest lane segment on the level of a stop point, NaN without one in reach.
 
-    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level.
+    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level: it may have the height of the lamp.
     """
     a, b = lane_segments.segments.a, lane_segments.segments.b
     if len(a) == 0:

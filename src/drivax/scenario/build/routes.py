@@ -1,9 +1,9 @@
 """Routes along the lane graph from the pose of the ego, one point per metre.
 
-Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. If no route leads to the
-goal, row 0 is the log, too. All but the route of the log depend on the poses up to the current step and on the goal
-region only; among routes that reach the goal equally well the nearest to the log is taken. Candidates come from this
-project's search (``graph``) or the ``published`` one.
+Row 0 leads to the goal, or along the intended route if the source has one; row 1 is the log itself (privileged), the
+others are alternatives. Without a route to the goal, row 0 is the log, too. All but the route of the log depend on the
+poses up to the current step, the goal region and the intended route only; among routes that reach the goal equally
+well the nearest to the log is taken. Candidates come from this project's search (``graph``) or the ``published`` one.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def find_routes(
 def _search_routes(
     lane_segments: LaneSegments, ego: EgoLog, intent: Intent, most_routes: int, most_points: int
 ) -> tuple[Route | None, list[Route]]:
-    """Route to the goal, if any, and alternatives, by best-first search from the current step."""
+    """Intended route, or else route to the goal, if any, and alternatives, by search from the current step."""
     pose = ego.xyz[ego.current], float(ego.heading[ego.current])
     need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
     search = LaneSearch.start(lane_segments, *pose, need, intent.corridor)

@@ -68,7 +68,7 @@ FINDINGS: Mapping[str, Quantity] = {
         "number", "step at which the first such overlap (`log_collides`) begins"
     ),
     "log_offroad_fraction": Quantity("number", "share of the evaluated steps with a corner off the road"),
-    "first_offroad_step": Quantity("number", "first step with a corner off the road"),
+    "first_offroad_step": Quantity("number", "first evaluated step with a corner off the road"),
     "first_onroad_step": Quantity("number", "first step, from the current one on, that is on the road"),
     "log_left_map": Quantity("truth", "the log leaves the mapped area"),
     "log_runs_red": Quantity("truth", "the log runs a red light"),
