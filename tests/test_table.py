@@ -32,6 +32,7 @@ def test_bounds_are_words_where_there_is_no_interval():
 def test_latex_escapes_special_characters():
     assert escape_latex("a_b & 5 %") == r"a\_b \& 5 \%"
     assert escape_latex("[0.5]") == "{[}0.5]", "behind the end of a row a bracket would begin an option"
+    assert escape_latex("*") == "{*}", "behind the end of a row a star would belong to it"
     assert escape_latex("−1.5 m/s²") == r"$-$1.5 m/s$^2$"
     assert escape_latex("\\x{}") == r"\textbackslash{}x\{\}"
     assert escape_latex("é😀\n") == r"é\texttt{U+1F600}\texttt{U+000A}"

@@ -136,13 +136,14 @@ def dotted_name(thing: Any) -> str:
     """Return the dotted name of a function or class.
 
     Raises:
-        UsageError: The object is a lambda, or defined inside a function.
+        UsageError: The name does not lead to the object: a lambda, an instance, or defined inside a function.
     """
     name = f"{getattr(thing, '__module__', None)}:{getattr(thing, '__qualname__', None)}"
     with contextlib.suppress(UsageError):
         if find_named(name) is thing:
             return name
-    label, cure = getattr(thing, "__qualname__", repr(thing)), "define it at the top level of a module"
+    label = getattr(thing, "__qualname__", repr(thing))
+    cure = "define it by def or class, at the top level of a module"
     raise UsageError(f"{label} cannot be saved in a configuration", cure=cure)
 
 

@@ -184,7 +184,7 @@ def test_closed_pipe_is_not_an_error():
 
 
 @pytest.mark.parametrize(
-    "command", ["evaluate --planner idm --data none --out run", "inspect none", "doctor"]
+    "command", ["evaluate --planner idm --data none --out run", "inspect none", "doctor", "convert none out"]
 )
 @pytest.mark.parametrize("limit", ["500000", "1300000"])
 def test_low_memory_limit_is_one_line(limit, command):

@@ -7,6 +7,7 @@ import math
 import re
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.result_tables import metric_label
 from drivax.metrics.catalogue import METRICS
-from drivax.report.pages.report import write_report
+from drivax.report.pages.report import _provenance, write_report
 from drivax.report.pictures.palette import LIGHT
 from drivax.report.pictures.player_data import ABSENT
-from drivax.report.runs import read_runs
+from drivax.report.runs import Training, read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
@@ -374,3 +375,8 @@ def test_canvases_are_not_empty(runs, tmp_path, width):
     for name in ("ego", "vehicle", "edge", "red", "parked"):
         wanted = [int(LIGHT[name][i : i + 2], 16) for i in (1, 3, 5)]
         assert (np.abs(image - wanted).max(axis=-1) <= 2).sum() > 60, name
+
+
+def test_provenance_names_the_data_of_a_training():
+    training = Training(Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {})
+    assert "sets/a 0123456789ab<" in _provenance([training])

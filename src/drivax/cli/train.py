@@ -57,7 +57,7 @@ class Train:
     """Run folder to write."""
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
     """Scenario set for the choice of the best checkpoint. By default DATA holds out whole recordings, about a tenth of
-    its scenarios (at most 256); `none` trains on all of them."""
+    its scenarios (at most 256), or if none is so small the smallest of several; `none` trains on all of them."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc and offline algorithms draw logged steps by their weights."""
     scale: Literal["step", "scenario"] | None = None

@@ -238,9 +238,10 @@ def bins(values: Values, maximum: int = BINS) -> Values:
         return np.arange(low - 0.5, high + 1.0)
     # Begin at zero, unless all values are far above it.
     start = min(low, 0.0) if low < 0.5 * high else low
-    edges = ticks(start, high, maximum - 1)
+    edges = np.array(ticks(start, high, maximum - 1))
     width = edges[1] - edges[0]
-    return np.append(edges, edges[-1] + width) if edges[-1] <= high else np.array(edges)
+    edges[0] = min(edges[0], start)  # rounding may place it above the least value
+    return np.append(edges, edges[-1] + width) if edges[-1] <= high else edges
 
 
 def short(value: Any) -> str:
