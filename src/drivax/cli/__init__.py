@@ -92,7 +92,7 @@ def console() -> Console:
     from rich.console import Console
 
     width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
-    return Console(width=width, highlight=False, markup=False)
+    return Console(width=width, highlight=False, markup=False, emoji=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

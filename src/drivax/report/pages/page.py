@@ -107,7 +107,8 @@ def player_html() -> str:
         "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the stored motion, with the "
         "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
         "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
-        "maximum of the action space; of trajectories in m/s² and rad, of direct states x and y, cut at 32 m.</small></p>"
+        "maximum of the action space; of trajectories in m/s² and rad, of direct states x and y, cut at 32 m."
+        "</small></p>"
     )
 
 
