@@ -261,15 +261,21 @@ def test_crashes_are_shown_with_step_and_error(runs, tmp_path):
 @needs_browser
 def test_crash_error_is_the_title_of_its_cell(runs, tmp_path):
     crash(runs[2], 2, 55, "ValueError: too <fast>")
+    with np.load(runs[2] / "trajectories.npz") as stored:
+        arrays = dict(stored)
+    arrays["ego"][2, 46:] = np.nan
+    np.savez(runs[2] / "trajectories.npz", **arrays)
     act = """
       const cell = document.querySelector("#rows tr td");
       const scrub = document.querySelector("[data-control=scrub]");
       scrub.value = 60; scrub.dispatchEvent(new Event("input"));
-      const note = document.querySelector("figure.pane:last-child .note").textContent;
-      document.title = JSON.stringify([cell.textContent, cell.title, note]);"""
+      const [note, speed] = [".note", ".speed"].map((name) => (
+        document.querySelector(`figure.pane:last-child ${name}`).textContent));
+      document.title = JSON.stringify([cell.textContent, cell.title, note, speed]);"""
     dom = browse(acted(write_report(runs, tmp_path / "report.html"), act), tmp_path, "--dump-dom")
     found = json.loads(unescape(re.search(r"<title>(.*?)</title>", dom)[1]))
-    assert found == ["planner crashed", "step 55: ValueError: too <fast>", "✕ planner crashed at 5.5 s"]
+    note = "✕ planner crashed at 5.5 s"
+    assert found == ["planner crashed", "step 55: ValueError: too <fast>", note, "gone"]
 
 
 def react(run):
