@@ -50,8 +50,8 @@ def find_named(name: str, trust: Collection[str] | None = None) -> Any:
         trust: None for a name that the user wrote; for a name in data, the modules that the user trusts.
 
     Raises:
-        UsageError: The name is not dotted or not trusted, its module cannot be imported, or the module lacks the
-            object.
+        UsageError: The name is not dotted or not trusted, its module cannot be imported or lacks the object, or the
+            object is none that data may name.
     """
     if not is_dotted(name):
         raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")

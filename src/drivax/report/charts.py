@@ -135,7 +135,7 @@ class Axes:
 def ticks(low: float, high: float, maximum: int) -> list[float]:
     """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten.
 
-    They have at most ``maximum + 1`` steps between them. A single value gets an interval around it.
+    They enclose it up to rounding, with at most ``maximum + 1`` steps. A single value gets an interval around it.
     """
     if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
         pad = max(0.5 * abs(low), 0.5)

@@ -94,8 +94,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
         return groups[: int(count)]
     if matches := [group for group in groups if group.scenario_id == which]:
         return matches
-    ids, forms = [group.scenario_id for group in groups], "write worst:N, all, or an id of its episodes.csv"
-    cure = did_you_mean(which, ids, otherwise=forms)
+    ids = [group.scenario_id for group in groups]
+    cure = did_you_mean(which, ids, otherwise="write worst:N, all, or an id of its episodes.csv")
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
 
 
