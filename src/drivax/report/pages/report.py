@@ -111,7 +111,8 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
     policy = runs[-1]
     path = Path(str(policy.data.get("path", "its scenario set")))
     name, data_name = escape(policy.name), escape(str(policy.data.get("name") or path.name))
-    for metric, verb in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
+    verbs = {"success": "succeeds in", "accuracy": "has no collision, off-road step or red light in"}
+    for metric, verb in verbs.items():
         interval = result_tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
