@@ -69,6 +69,10 @@ def test_markdown_has_one_cell_per_column():
     ]  # fmt: skip
 
 
+def test_markdown_without_a_caption_is_the_table_alone():
+    assert Table("x", (Column("a"),), ((Cell("1"),),)).markdown() == "| a |\n| ---: |\n| 1 |\n"
+
+
 def test_latex_stacks_number_interval_and_n():
     assert (
         r"success $\uparrow$ & \shortstack[r]{50.0 \% \\ \scriptsize (25.0--75.0) \\ \scriptsize n 4}"

@@ -133,7 +133,8 @@ class Table:
             _markdown_row(["---" if column.label else "---:" for column in self.columns]),
             *(_markdown_row([" ".join(_cell_texts(cell)) for cell in row]) for row in self.rows),
         ]
-        return f"{_escape_markdown(self.caption)}.\n\n" + "\n".join(lines) + "\n"
+        caption = f"{_escape_markdown(self.caption)}.\n\n" if self.caption else ""
+        return caption + "\n".join(lines) + "\n"
 
     def latex(self) -> str:
         r"""Return a ``tabular`` to ``\input``; it needs no package."""

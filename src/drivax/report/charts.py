@@ -236,7 +236,7 @@ def bins(values: Values, maximum: int = BINS) -> Values:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
     if integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
-    # Begin at zero, unless all values are far above it.
+    # Begin at zero or below, unless all values are far above it.
     start = min(low, 0.0) if low < 0.5 * high else low
     edges = np.array(ticks(start, high, maximum - 1))
     width = edges[1] - edges[0]
@@ -245,7 +245,7 @@ def bins(values: Values, maximum: int = BINS) -> Values:
 
 
 def short(value: Any) -> str:
-    """Return a number with about three figures."""
+    """Return a number with three figures, but no more than two decimals and all digits before them."""
     value = float(value)
     if abs(value) >= 100 or value == round(value):
         return f"{value:,.0f}"

@@ -90,7 +90,7 @@ class RunFolder:
         """Check, before any work, that a run can be written to a folder.
 
         With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), and other runs
-        only by other runs.
+        only by other runs, as far as both kinds are known.
 
         Raises:
             UsageError: The folder exists and cannot be replaced.
