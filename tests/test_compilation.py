@@ -76,6 +76,16 @@ def test_a_file_in_place_of_the_folder_is_not_used(tmp_path: Path) -> None:
     assert use_compilation_cache(tmp_path / "top") is None
 
 
+@pytest.mark.usefixtures("no_environment")
+def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    assert use_compilation_cache() is None
+
+
 def test_folder_of_the_environment_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
     assert use_compilation_cache(tmp_path / "top") is None

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivax import files
-from drivax.errors import DataError, UsageError, explain_system
+from drivax.errors import DataError, UsageError, explain_system, missing_package
 from drivax.files import (
     PartialFolder,
     allow_open_files,
@@ -449,17 +449,23 @@ def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.Mo
     for error, text in (
         (
             OSError(errno.EMFILE, "x"),
-            "too many open files (limit of open files: 2048); raise the limit: ulimit -n",
+            "too many open files (limit of open files: 2048); raise the limit: ulimit -n 4096, or",
         ),
         (MemoryError(), "cannot allocate memory (limit of memory in kB: 2); use fewer --workers"),
         (
             RuntimeError("can't start new thread"),
-            "(limit of processes and threads: 2048); raise the limit: ulimit -u",
+            "(limit of processes and threads: 2048); raise the limit: ulimit -u 4096, or",
         ),
     ):
         explained = explain_system(error)
         assert isinstance(explained, UsageError) and text in str(explained)
     assert explain_system(ValueError("x")) is None and explain_system(RuntimeError("x")) is None
+
+
+def test_only_a_package_that_is_not_installed_is_missing():
+    missing = missing_package(ModuleNotFoundError("no module", name="av"))
+    assert missing is not None and missing.cure == "pip install 'drivax[show]'"
+    assert missing_package(ImportError("libavformat.so: not found", name="av._core")) is None
 
 
 def test_hidden_names_are_those_of_the_output(tmp_path: Path):

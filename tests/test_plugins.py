@@ -100,7 +100,7 @@ def test_named_objects_round_trip():
         assert find_named(dotted_name(thing)) is thing
     for thing in (lambda x: x, load.__get__(1)):
         with pytest.raises(
-            UsageError, match="cannot be saved in a configuration; define it at the top level"
+            UsageError, match="cannot be saved in a configuration; define it by def or class, at the top"
         ):
             dotted_name(thing)
 

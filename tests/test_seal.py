@@ -219,7 +219,7 @@ def test_edited_rollouts_and_added_or_deleted_crashes_are_seen(tmp_path):
     seal(run, "crashes.json")
     assert json.loads(seal_file.read_text())["crashes.json"] is None and EpisodeTable.read(run).crashes == ()
     crashes.write_bytes(content)
-    with pytest.raises(DataError, match=r"crashes\.json: changed since"):
+    with pytest.raises(DataError, match=r"crashes\.json: was added since drivax wrote its folder"):
         EpisodeTable.read(run)
 
 

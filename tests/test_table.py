@@ -32,6 +32,7 @@ def test_bounds_are_words_where_there_is_no_interval():
 def test_latex_escapes_special_characters():
     assert escape_latex("a_b & 5 %") == r"a\_b \& 5 \%"
     assert escape_latex("[0.5]") == "{[}0.5]", "behind the end of a row a bracket would begin an option"
+    assert escape_latex("*") == "{*}", "behind the end of a row a star would belong to it"
     assert escape_latex("−1.5 m/s²") == r"$-$1.5 m/s$^2$"
     assert escape_latex("\\x{}") == r"\textbackslash{}x\{\}"
     assert escape_latex("é😀\n") == r"é\texttt{U+1F600}\texttt{U+000A}"
@@ -66,6 +67,10 @@ def test_markdown_has_one_cell_per_column():
         "| metric | a | b\\|c |", "| --- | ---: | ---: |", "| success ↑ | 50.0 % (25.0–75.0) n 4 | – n 0 |",
         "| speed \\[m/s\\] | 1.50 (all equal) n 2 | – |",
     ]  # fmt: skip
+
+
+def test_markdown_without_a_caption_is_the_table_alone():
+    assert Table("x", (Column("a"),), ((Cell("1"),),)).markdown() == "| a |\n| ---: |\n| 1 |\n"
 
 
 def test_latex_stacks_number_interval_and_n():

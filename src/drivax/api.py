@@ -117,7 +117,7 @@ def evaluate(
         task: Action space, observation and reward; a trained policy has its own.
         traffic: As for :func:`make_simulator`; the bank is prepared for it.
         start: Start of the episodes: as logged by default, or ``simulator.starts.NoisyStart()``.
-        sample: Whether a policy by name samples its actions instead of taking the mode.
+        sample: Whether a trained policy samples its actions instead of taking the mode; not for other planners.
         metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
         trust: Modules outside drivax whose code trained policies, as planner or traffic, may name.
         options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
@@ -126,7 +126,7 @@ def evaluate(
     if isinstance(planner, str | Path):
         planner, task = find_planner(str(planner), loaded.bank, sample, task, trust)
     elif sample:
-        raise UsageError("only a policy by name can sample", cure="leave out sample=")
+        raise UsageError("only a trained policy by name can sample", cure="leave out sample=")
     planner = as_planner(planner, getattr(planner, "__name__", "planner"))
     return runner.evaluate(
         planner,
@@ -147,14 +147,18 @@ def find_planner(
     Args:
         name: Name, ``module:name``, run folder (``RUN`` or ``RUN@STEP``) or ``zoo:NAME``.
         bank: Scenarios of the evaluation, which determine the shapes of a policy.
-        sample: Whether a trained policy samples its actions.
+        sample: Whether a trained policy samples its actions; not for other planners.
         task: Task of a named planner; None for the default task with the planner's own action space.
         trust: Modules outside drivax whose code a trained policy may name.
 
     Raises:
-        UsageError: Unknown planner, folder or policy, a task for a trained policy, or code that is not trusted.
+        UsageError: Unknown planner, folder or policy, a task for a trained policy, ``sample`` for another planner, or
+            code that is not trusted.
+        DataError: The folder is no run, or is damaged.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
+        if sample:
+            raise UsageError(f"{name!r} is no trained policy to sample", cure="leave out --sample (sample=)")
         planner = make_planner(name, task and task.actions)
         return planner, task or default_task(planner)
     folder, step = run_and_step(name)
@@ -174,7 +178,7 @@ def generate(
     Args:
         out: Folder to write.
         scenarios: Number of scenarios.
-        seed: Scenario ``i`` of a seed is the same in every set.
+        seed: Scenario ``i`` of a seed is the same in every set with the same options.
         options: World, workers, capacity, length, egos, and whether to overwrite ``out``.
 
     Raises:
@@ -209,7 +213,7 @@ def compare(
     Args:
         a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
         b: The other run.
-        plan: Metrics and decision rule.
+        plan: Metrics and decision rule; ``a`` and ``b`` replace its runs.
         data: Path of the scenario set, for a stratified split, if it has moved.
         settings: Fields of the plan to change, for example ``primary="success"``.
 
@@ -217,7 +221,7 @@ def compare(
         DataError: A run folder is missing or damaged.
         UsageError: The evaluations cannot be compared, or a setting is impossible.
     """
-    plan = replace(plan or ComparisonPlan(), **settings)
+    plan = replace(plan or ComparisonPlan(), a=Path(a), b=Path(b), **settings)
     first, second = (EpisodeTable.read_seeds(Path(run)) for run in (a, b))
     entries = first[0].open_set(data).entries if plan.split == "stratified" else ()
     return compare_evaluations(plan, first, second, entries)
@@ -229,7 +233,7 @@ def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> curat
     Args:
         method: Name of a method, for example ``kinematic``.
         data: The set, or its folder.
-        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``.
+        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``, ``training``.
 
     Raises:
         DataError: The method cannot score this set.

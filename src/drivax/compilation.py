@@ -40,21 +40,21 @@ def use_compilation_cache(folder: str | Path | None = None, *, max_bytes: int = 
         max_bytes: Total size of the cache after this call.
 
     Returns:
-        The folder of this version and processor; None if it cannot be used (read-only, or owned by another user) or
-        if ``JAX_COMPILATION_CACHE_DIR`` is set, which JAX itself follows.
+        The folder of this version and processor; None if it cannot be used (read-only, owned by another user, or
+        without a home folder) or if ``JAX_COMPILATION_CACHE_DIR`` is set, which JAX itself follows.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return None
-    top = _default_folder() if folder is None else Path(folder)
-    programs = top / f"jax-{metadata.version('jaxlib')}-{_processor()}"
     try:
+        top = _default_folder() if folder is None else Path(folder)
+        programs = top / f"jax-{metadata.version('jaxlib')}-{_processor()}"
         for private in (top, programs):
             private.mkdir(0o700, parents=True, exist_ok=True)
             if private.stat().st_uid != os.getuid():
                 return None
             private.chmod(0o700)
         _prune(top, max_bytes, keep=programs)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return None
     # JAX may not have been imported yet: the environment reaches it, and the processes that this one starts.
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(programs)

@@ -37,11 +37,11 @@ _DISK_CURES = {
     **dict.fromkeys(_UNREACHABLE, "mount the disk again or check it, then repeat the command"),
 }
 _LESS_MEMORY = "use fewer --workers or a smaller --batch, or raise the limit: ulimit -v unlimited"
-#: Limits of a process (name, resource) and their cures.
+#: Limits of a process (name, resource) and their cures, with a place for twice the limit.
 _LIMITS = {
-    errno.EMFILE: ("open files", resource.RLIMIT_NOFILE, "raise the limit: ulimit -n 4096, or use fewer --workers"),
+    errno.EMFILE: ("open files", resource.RLIMIT_NOFILE, "raise the limit: ulimit -n {}, or use fewer --workers"),
     errno.ENOMEM: ("memory in kB", resource.RLIMIT_AS, _LESS_MEMORY),
-    errno.EAGAIN: ("processes and threads", resource.RLIMIT_NPROC, "raise the limit: ulimit -u 4096"),
+    errno.EAGAIN: ("processes and threads", resource.RLIMIT_NPROC, "raise the limit: ulimit -u {}, or end processes"),
 }  # fmt: skip
 #: Address space below which JAX aborts a process (bytes).
 _LEAST_MEMORY = 1400 << 20
@@ -112,8 +112,8 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
         name, kind, cure = _LIMITS[number]
         limit = resource.getrlimit(kind)[0]
         size = limit // 1024 if number == errno.ENOMEM else limit
-        text = "none" if limit == resource.RLIM_INFINITY else size
-        return UsageError(f"{problem} (limit of {name}: {text})", file=file, cure=cure)
+        text, twice = ("none", "unlimited") if limit == resource.RLIM_INFINITY else (size, 2 * size)
+        return UsageError(f"{problem} (limit of {name}: {text})", file=file, cure=cure.format(twice))
     return DataError(problem, file=file, cure=_DISK_CURES[number]) if number in _DISK_CURES else None
 
 
@@ -127,9 +127,9 @@ def check_memory_limit() -> None:
 
 
 def missing_package(error: ImportError) -> UsageError | None:
-    """Return the error for an optional package that is not installed, or None if no extra has it."""
+    """Return the error for an optional package that is not installed; None if it is damaged, or if no extra has it."""
     package = (error.name or str(error)).split(".")[0]
-    if package not in _EXTRAS:
+    if package not in _EXTRAS or not isinstance(error, ModuleNotFoundError):
         return None
     name = "protobuf" if package == "google" else package
     return UsageError(f"{name} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")

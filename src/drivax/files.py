@@ -144,7 +144,7 @@ def _is_full_disk(error: Exception) -> bool:
 
 @contextlib.contextmanager
 def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[bytes]]:
-    """Yield a binary file that appears as ``path`` when the block ends; an error leaves nothing behind.
+    """Yield a binary file that appears as ``path`` when the block ends; an error leaves no file behind.
 
     A full disk is reported with ``size`` in bytes, and with the space that is free once the incomplete file is deleted.
     With ``follow``, a symbolic link stays, and the file that it leads to is written.
@@ -384,7 +384,7 @@ def _hidden_path(path: Path) -> Path:
 
 
 def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
-    """Open a file, create it if it is missing, and lock it; BlockingIOError if another process has it."""
+    """Open or create a file, and lock it; while another process has it, ``wait`` or raise BlockingIOError."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as cleanup:

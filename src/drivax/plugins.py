@@ -50,8 +50,8 @@ def find_named(name: str, trust: Collection[str] | None = None) -> Any:
         trust: None for a name that the user wrote; for a name in data, the modules that the user trusts.
 
     Raises:
-        UsageError: The name is not dotted or not trusted, its module cannot be imported, or the module lacks the
-            object.
+        UsageError: The name is not dotted or not trusted, its module cannot be imported or lacks the object, or the
+            object is none that data may name.
     """
     if not is_dotted(name):
         raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")
@@ -136,13 +136,14 @@ def dotted_name(thing: Any) -> str:
     """Return the dotted name of a function or class.
 
     Raises:
-        UsageError: The object is a lambda, or defined inside a function.
+        UsageError: The name does not lead to the object: a lambda, an instance, or defined inside a function.
     """
     name = f"{getattr(thing, '__module__', None)}:{getattr(thing, '__qualname__', None)}"
     with contextlib.suppress(UsageError):
         if find_named(name) is thing:
             return name
-    label, cure = getattr(thing, "__qualname__", repr(thing)), "define it at the top level of a module"
+    label = getattr(thing, "__qualname__", repr(thing))
+    cure = "define it by def or class, at the top level of a module"
     raise UsageError(f"{label} cannot be saved in a configuration", cure=cure)
 
 

@@ -113,7 +113,7 @@ def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name; checksums are tested, objects are refused.
 
     Raises:
-        DataError: It is missing or damaged, or its arrays have more than ``most`` bytes.
+        DataError: It is missing or damaged, or it or its content has more than ``most`` bytes.
     """
     content = io.BytesIO(read_bytes(file, cure, most))
     with explain_damage(file, cure, "not an .npz file, or damaged"), zipfile.ZipFile(content) as archive:

@@ -59,8 +59,9 @@ def check_seal(file: Path) -> None:
         DataError: The file changed, appeared or disappeared since, or the seal is damaged; not in :func:`allow_edited`.
     """
     entries = _read(file.parent / SEAL)
-    if file.name in entries and (digest := _digest(file)) != entries[file.name]:
-        refuse_edited(file, "is missing" if digest is None else "changed since drivax wrote it")
+    if file.name in entries and (digest := _digest(file)) != (sealed := entries[file.name]):
+        problem = "changed since drivax wrote it" if sealed else "was added since drivax wrote its folder"
+        refuse_edited(file, "is missing" if digest is None else problem)
 
 
 def refuse_edited(file: Path, problem: str) -> None:

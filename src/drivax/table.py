@@ -133,7 +133,8 @@ class Table:
             _markdown_row(["---" if column.label else "---:" for column in self.columns]),
             *(_markdown_row([" ".join(_cell_texts(cell)) for cell in row]) for row in self.rows),
         ]
-        return f"{_escape_markdown(self.caption)}.\n\n" + "\n".join(lines) + "\n"
+        caption = f"{_escape_markdown(self.caption)}.\n\n" if self.caption else ""
+        return caption + "\n".join(lines) + "\n"
 
     def latex(self) -> str:
         r"""Return a ``tabular`` to ``\input``; it needs no package."""
@@ -274,7 +275,7 @@ def _latex_cell(texts: Sequence[str]) -> str:
 _LATEX: Mapping[str, str] = MappingProxyType(
     {
         "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-        "[": "{[}",  # after the end of a row it would start an option
+        "[": "{[}", "*": "{*}",  # after the end of a row they would belong to it
         "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
         "|": r"\textbar{}", '"': "''", "−": r"$-$", "–": "--", "²": "$^2$", "³": "$^3$", "±": r"$\pm$",
         "↑": r"$\uparrow$", "↓": r"$\downarrow$", "“": "``", "”": "''", "’": "'", "≥": r"$\geq$", "≤": r"$\leq$",

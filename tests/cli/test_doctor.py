@@ -324,6 +324,7 @@ def test_a_missing_extra_names_its_pip_line(monkeypatch):
     [
         ("import time; time.sleep(9)", "does not answer"),
         ("raise SystemExit('no driver')", "does not start: no driver"),
+        ("print('a message of a plugin')", "its list of devices cannot be read"),
         ('print(\'[["gpu", "NVIDIA H100"], ["cpu", "cpu"]]\')', "gpu: NVIDIA H100, cpu"),
     ],
 )

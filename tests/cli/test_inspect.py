@@ -231,3 +231,25 @@ def test_samples_are_evenly_spread(sets, monkeypatch):
     speeds = inspection.read_speeds(one)
     assert speeds.scenarios == 2
     np.testing.assert_allclose(speeds.ego, [0.0] * 91 + [3.0] * 91, atol=1e-5)
+
+
+def test_the_picture_shows_the_current_step_of_a_short_log(tmp_path, inspect, monkeypatch):
+    log = straight_road([car(speed=5.0)])
+    short = assemble(replace(log, scenario_id="short"))
+    record = short.record.copy()
+    record["current_step"] = 7
+    with ScenarioWriter(tmp_path / "set", CAPACITIES["default"]) as writer:
+        writer.add(replace(short, record=record))
+    drawn = []
+
+    class Picture:
+        def savefig(self, path):
+            path.touch()
+
+    def draw(task, bank, title, step):
+        drawn.append((title, step))
+        return Picture()
+
+    monkeypatch.setattr("drivax.report.pictures.observation.draw_log_observation", draw)
+    inspect(tmp_path / "set", "--observations", "--draw", tmp_path / "seen.png")
+    assert drawn == [("short, step 7", 7)]

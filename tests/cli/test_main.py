@@ -178,6 +178,11 @@ def test_help_imports_nothing_heavy():
     assert result.stdout.splitlines()[-1] == "[]"
 
 
+def test_console_prints_text_as_it_is(capsys):
+    cli.console().print("scenario:car:1 [bold]")
+    assert capsys.readouterr().out == "scenario:car:1 [bold]\n"
+
+
 def test_closed_pipe_is_not_an_error():
     """``drivax --help | head -1``: no traceback, nothing on standard error."""
     pipeline = f"'{sys.executable}' -m drivax --help | head -c 1"
@@ -186,7 +191,7 @@ def test_closed_pipe_is_not_an_error():
 
 
 @pytest.mark.parametrize(
-    "command", ["evaluate --planner idm --data none --out run", "inspect none", "doctor"]
+    "command", ["evaluate --planner idm --data none --out run", "inspect none", "doctor", "convert none out"]
 )
 @pytest.mark.parametrize("limit", ["500000", "1300000"])
 def test_low_memory_limit_is_one_line(limit, command):

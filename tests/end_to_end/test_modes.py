@@ -71,7 +71,7 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
     found = drivax.evaluate(planner, data, sample=True, **options)
     np.testing.assert_array_equal(found.trajectories.ego, sampled["ego"])
     assert list(found.own_metrics) == ["nearest_other"]
-    with pytest.raises(UsageError, match="only a policy by name can sample"):
+    with pytest.raises(UsageError, match="only a trained policy by name can sample"):
         drivax.evaluate(find_planner(planner, load(data).bank)[0], data, sample=True)
     (out / "crashes.json").write_text("[]")
     capsys.readouterr()

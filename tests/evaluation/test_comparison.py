@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+import drivax
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.comparison import compare
@@ -408,3 +409,17 @@ def test_own_metric_may_be_called_partial():
     own = {"own_metrics": {"cost_partial": {"unit": "-", "better": "low", "text": "cost"}}}
     a, b = (table(name, about=own, cost_partial=np.full(N, k)) for k, name in enumerate(("one", "two")))
     assert compare(dataclasses.replace(PLAN, primary="cost_partial"), [a], [b]).decision.recommendation == "A"
+
+
+def test_compared_runs_replace_those_of_the_plan(monkeypatch):
+    monkeypatch.setattr("drivax.api.EpisodeTable.read_seeds", lambda path: [path])
+    plans = []
+
+    def compare_by(plan, *_):
+        plans.append(plan)
+        raise UsageError("stop")
+
+    monkeypatch.setattr("drivax.api.compare_evaluations", compare_by)
+    with pytest.raises(UsageError, match="stop"):
+        drivax.compare("x", "y", ComparisonPlan(a=Path("old"), primary="success"))
+    assert plans == [ComparisonPlan(a=Path("x"), b=Path("y"), primary="success")]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from drivax.api import find_planner
+from drivax.errors import UsageError
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
@@ -220,3 +222,8 @@ def test_held_planner_decides_at_every_other_step(simulator):
     np.testing.assert_array_equal(taken[1::2], taken[::2])
     assert (np.asarray(fresh[1::2]) != np.asarray(taken[1::2])).any()
     assert hold(planner, 1) is planner and planner.name == "idm" and not planner.replays
+
+
+def test_only_a_trained_policy_can_be_sampled():
+    with pytest.raises(UsageError, match="'idm' is no trained policy to sample; leave out --sample"):
+        find_planner("idm", bank_of(straight_road([car()])), sample=True)

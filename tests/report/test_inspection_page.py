@@ -35,6 +35,11 @@ def test_bins_hold_every_value_once(numbers):
     assert counts.sum() == len(values)
 
 
+def test_rounding_of_the_first_edge_drops_no_value():
+    values = np.array([0.7, 1.0, 1.3])  # 14 bins of 0.05 begin at 0.7000000000000001
+    assert np.histogram(values, bins(values))[0].sum() == 3
+
+
 @pytest.mark.parametrize(
     ("values", "edges"),
     [

@@ -98,7 +98,11 @@ def test_small_observation_can_be_drawn():
     full = observed()
     cut = {name: full[name] for name in ("agents_mask", "road_mask", "lights_mask")}
     cut |= {name: full[name][..., :2] for name in ("agents", "road", "lights")} | {"ego": full["ego"][:, 4:6]}
-    image = pixels(draw_observation(lean, cut))
+    figure = draw_observation(lean, cut)
+    labels = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"agent", "road", "unknown light"} < labels
+    assert labels.isdisjoint({"lane", "edge", "crosswalk", "red light", "light on the route"})
+    image = pixels(figure)
     assert share(image, "vehicle") > 20 and share(image, "ego") > 20
 
 

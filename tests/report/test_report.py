@@ -7,6 +7,7 @@ import math
 import re
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.result_tables import metric_label
 from drivax.metrics.catalogue import METRICS
-from drivax.report.pages.report import write_report
+from drivax.report.pages.report import _provenance, write_report
 from drivax.report.pictures.palette import LIGHT
 from drivax.report.pictures.player_data import ABSENT
-from drivax.report.runs import read_runs
+from drivax.report.runs import Training, read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
@@ -260,15 +261,21 @@ def test_crashes_are_shown_with_step_and_error(runs, tmp_path):
 @needs_browser
 def test_crash_error_is_the_title_of_its_cell(runs, tmp_path):
     crash(runs[2], 2, 55, "ValueError: too <fast>")
+    with np.load(runs[2] / "trajectories.npz") as stored:
+        arrays = dict(stored)
+    arrays["ego"][2, 46:] = np.nan
+    np.savez(runs[2] / "trajectories.npz", **arrays)
     act = """
       const cell = document.querySelector("#rows tr td");
       const scrub = document.querySelector("[data-control=scrub]");
       scrub.value = 60; scrub.dispatchEvent(new Event("input"));
-      const note = document.querySelector("figure.pane:last-child .note").textContent;
-      document.title = JSON.stringify([cell.textContent, cell.title, note]);"""
+      const [note, speed] = [".note", ".speed"].map((name) => (
+        document.querySelector(`figure.pane:last-child ${name}`).textContent));
+      document.title = JSON.stringify([cell.textContent, cell.title, note, speed]);"""
     dom = browse(acted(write_report(runs, tmp_path / "report.html"), act), tmp_path, "--dump-dom")
     found = json.loads(unescape(re.search(r"<title>(.*?)</title>", dom)[1]))
-    assert found == ["planner crashed", "step 55: ValueError: too <fast>", "✕ planner crashed at 5.5 s"]
+    note = "✕ planner crashed at 5.5 s"
+    assert found == ["planner crashed", "step 55: ValueError: too <fast>", note, "gone"]
 
 
 def react(run):
@@ -374,3 +381,8 @@ def test_canvases_are_not_empty(runs, tmp_path, width):
     for name in ("ego", "vehicle", "edge", "red", "parked"):
         wanted = [int(LIGHT[name][i : i + 2], 16) for i in (1, 3, 5)]
         assert (np.abs(image - wanted).max(axis=-1) <= 2).sum() > 60, name
+
+
+def test_provenance_names_the_data_of_a_training():
+    training = Training(Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {})
+    assert "sets/a 0123456789ab<" in _provenance([training])

@@ -18,7 +18,7 @@ from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import RED, car, straight_road
 
-CLEAN = {"log_collides": False, "log_offroad_fraction": 0.0, "first_offroad_step": -1, "log_runs_red": None}
+CLEAN = {"log_collides": False, "log_offroad_fraction": 0.0, "first_offroad_step": None, "log_runs_red": None}
 FOUL = CLEAN | {
     "log_collides": True, "first_collision_step": 40, "log_offroad_fraction": 0.25, "first_offroad_step": 30,
     "log_runs_red": True,
@@ -67,7 +67,7 @@ def test_details_list_tags_flags_audit_and_overflow(page):
     assert "<b>3</b> recorded scenarios; the audit finds violations in 1 of 2." in text
     calm, bad, new = re.findall(r"<div hidden>(.*?)</div>", text, re.S)
     assert "<dt>log runs red</dt><dd>undefined</dd>" in calm
-    assert "<dt>first offroad step</dt><dd>never</dd>" in calm
+    assert "<dt>first offroad step</dt><dd>none</dd>" in calm
     assert "<dt>log collides</dt><dd>yes</dd>" in bad
     assert "<dt>log offroad fraction</dt><dd>0.25</dd>" in bad and "<dt>parked</dt><dd>3</dd>" in bad
     assert "not audited" in new and "<p>nothing</p>" in new and "<dd>lead_brakes</dd>" in new

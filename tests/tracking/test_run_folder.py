@@ -177,6 +177,12 @@ def test_seeds_are_ordered_by_number_without_other_folders(tmp_path: Path):
     assert [path.name for path in runs.seed_folders(run.path)] == ["seed--1", "seed-9", "seed-10"]
 
 
+def test_a_run_of_seeds_without_seeds_is_refused(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config(), kind="seeds", seeds=4)
+    with pytest.raises(DataError, match="run: no folder seed-N"):
+        runs.seed_folders(run.path)
+
+
 def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A temporary repository with a clean commit, a run next to it, a new file, and a change."""
 
@@ -229,6 +235,8 @@ def test_steps_of_runs(tmp_path):
         "runs/a",
         20,
     )
+    (tmp_path / "a@5").mkdir()
+    assert runs.run_and_step(f"{tmp_path}/a@5") == (f"{tmp_path}/a@5", None)
     with pytest.raises(UsageError, match="'best' is not a checkpoint step; write RUN@STEP"):
         runs.run_and_step("runs/a@best")
 

@@ -52,7 +52,9 @@ def test_pool_runs_tasks():
 def test_dead_worker_is_one_line(tasks):
     """Also where a later task is submitted to the broken pool."""
     with (
-        pytest.raises(DataError, match=r"a worker process died .*; use fewer --workers or --cores$"),
+        pytest.raises(
+            DataError, match=r"a worker process died .*; use fewer --workers or --cores, or add the guard$"
+        ),
         worker_pool(1) as pool,
     ):
         futures = [pool.submit(os._exit, 1)]

@@ -93,7 +93,7 @@ def console() -> Console:
     from rich.console import Console
 
     width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
-    return Console(width=width, highlight=False, markup=False)
+    return Console(width=width, highlight=False, markup=False, emoji=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -294,8 +294,7 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
     if not use_cache:
         # Also for a folder of JAX's own variable, which is read when a command imports JAX.
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-    if name != "convert":  # All others import JAX at once or later.
-        check_memory_limit()
+    check_memory_limit()  # nearly all commands use JAX
     module = importlib.import_module(f"drivax.cli.{name}")
     if cache and "jax" in sys.modules:
         report_compilation(partial(show, file=sys.stderr))

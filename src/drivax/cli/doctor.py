@@ -117,8 +117,10 @@ def devices(timeout_s: float = 60.0) -> str:
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])
             return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)
-    except (subprocess.TimeoutExpired, ValueError, IndexError):
+    except subprocess.TimeoutExpired:
         return f"JAX does not answer (within {timeout_s:.0f} s); check the driver, or set JAX_PLATFORMS=cpu"
+    except (ValueError, IndexError):
+        return "JAX starts, but its list of devices cannot be read"
     message = (result.stderr.strip() or "no message").splitlines()[-1]
     return f"JAX does not start: {message}"
 

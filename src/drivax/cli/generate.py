@@ -52,7 +52,7 @@ class Generate:  # noqa: D101
     out: tyro.conf.Positional[Path]
     """Scenario set to write (a folder); with --benchmark the folder of the four sets."""
     scenarios: int | None = None
-    """How many scenarios, 256 by default; with --benchmark those of train, the other splits in proportion."""
+    """How many scenarios, 256 by default; with --benchmark those of train, by default 4,096, others in proportion."""
     seed: int | None = None
     """Seed of the set, 0 by default; scenario i of a seed does not depend on the number of scenarios."""
     config: Path | None = None

@@ -151,7 +151,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
         _print_observations(statistics)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
-        draw_log_observation(task, bank, title).savefig(args.draw)
+        draw_log_observation(task, bank, title, step=int(scenarios[0].current_step)).savefig(args.draw)
         show(args.draw, sys.stderr if args.json else sys.stdout)
 
 

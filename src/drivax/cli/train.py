@@ -57,9 +57,9 @@ class Train:
     """Run folder to write."""
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
     """Scenario set for the choice of the best checkpoint. By default DATA holds out whole recordings, about a tenth of
-    its scenarios (at most 256); `none` trains on all of them."""
+    its scenarios (at most 256), or if none is so small the smallest of several; `none` trains on all of them."""
     scores: Path | None = None
-    """Scores of DATA by drivax curate: bc and offline algorithms draw logged steps by their weights."""
+    """Scores of DATA by drivax curate: bc, offline algorithms and sac with demonstrations draw logged steps by them."""
     scale: Literal["step", "scenario"] | None = None
     """Weigh single steps (the default) or whole scenarios; with --scores."""
     arm: Annotated[ArmName | None, tyro.conf.arg(aliases=["--agent"])] = None
@@ -67,7 +67,7 @@ class Train:
     weighting: WeightConfig = field(default_factory=WeightConfig)
     """Conversion of scores to weights; with --scores or --arm."""
     seeds: int = 1
-    """Number of consecutive seeds to train in one program; each has a folder in OUT."""
+    """Number of consecutive seeds to train in one program; of several, each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
     """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()

@@ -135,7 +135,7 @@ class Axes:
 def ticks(low: float, high: float, maximum: int) -> list[float]:
     """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten.
 
-    They have at most ``maximum + 1`` steps between them. A single value gets an interval around it.
+    They enclose it up to rounding, with at most ``maximum + 1`` steps. A single value gets an interval around it.
     """
     if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
         pad = max(0.5 * abs(low), 0.5)
@@ -236,15 +236,16 @@ def bins(values: Values, maximum: int = BINS) -> Values:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
     if integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
-    # Begin at zero, unless all values are far above it.
+    # Begin at zero or below, unless all values are far above it.
     start = min(low, 0.0) if low < 0.5 * high else low
-    edges = ticks(start, high, maximum - 1)
+    edges = np.array(ticks(start, high, maximum - 1))
     width = edges[1] - edges[0]
-    return np.append(edges, edges[-1] + width) if edges[-1] <= high else np.array(edges)
+    edges[0] = min(edges[0], start)  # rounding may place it above the least value
+    return np.append(edges, edges[-1] + width) if edges[-1] <= high else edges
 
 
 def short(value: Any) -> str:
-    """Return a number with about three figures."""
+    """Return a number with three figures, but no more than two decimals and all digits before them."""
     value = float(value)
     if abs(value) >= 100 or value == round(value):
         return f"{value:,.0f}"

@@ -92,7 +92,7 @@ def sort_worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> 
 
 
 def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
-    """Choose ``count`` episodes of the last run: failures of every kind in turn, worst score first, then successes.
+    """Choose at most ``count`` episodes of the last run: failures, each kind in turn and worst first, then successes.
 
     Unjudged episodes count as a kind of failure. At least a quarter (rounded) are successes if there are enough. Among
     equal failures, those where other planners succeed come first; among successes, those where they fail.

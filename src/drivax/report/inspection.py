@@ -317,7 +317,7 @@ def with_distinct_names(inspections: Sequence[Inspection]) -> list[Inspection]:
 
 
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Return tables of four sets each: sizes, averages per scenario, shares of audit findings, tags and flags."""
+    """Return tables of at most four sets: sizes, averages per scenario, shares of audit findings, tags and flags."""
     inspections = with_distinct_names(inspections)
     groups = [
         inspections[first : first + SETS_PER_TABLE] for first in range(0, len(inspections), SETS_PER_TABLE)

@@ -35,7 +35,7 @@ def load(
         cls: The dataclass to build; its defaults apply to keys that ``source`` lacks.
         source: A YAML file, the name of a preset, or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
-            count as underscores. A new ``kind`` discards the settings of the previous one.
+            count as underscores. A ``kind`` other than that in ``source`` discards the settings of its section.
         trust: None for a source that the user wrote. Otherwise it is data, as of a run: its names lead only to drivax
             and to these modules, and it extends no other file.
 

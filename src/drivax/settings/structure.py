@@ -166,7 +166,7 @@ def _to_item(value: Any, cls: Any, place: str) -> Any:
 
 
 def _to_union(value: Any, cls: Any) -> Any:
-    """Convert to a user-defined object, to a record by its kind, or to the first scalar type that fits."""
+    """Convert to a user-defined object, to a record by its kind, or to the first other type that fits."""
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
     # A flag may hold a section, {kind: ...}. Without records its type decides, so that text stays text.

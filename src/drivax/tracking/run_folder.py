@@ -90,7 +90,7 @@ class RunFolder:
         """Check, before any work, that a run can be written to a folder.
 
         With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), and other runs
-        only by other runs.
+        only by other runs, as far as both kinds are known.
 
         Raises:
             UsageError: The folder exists and cannot be replaced.
@@ -229,12 +229,18 @@ def _json(info: Mapping[str, Any]) -> str:
 
 
 def seed_folders(path: str | Path) -> list[Path]:
-    """Return the run folders of a path: those of its seeds for a run with ``--seeds``, otherwise the path itself."""
+    """Return the run folders of a path: those of its seeds for a run with ``--seeds``, otherwise the path itself.
+
+    Raises:
+        DataError: The run of several seeds has none.
+    """
     path = Path(path)
     if _kind(path) != "seeds":
         return [path]
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
     seeds = {f: int(match[1]) for f in folders if (match := re.fullmatch(r"seed-(-?\d+)", f.name))}
+    if not seeds:
+        raise DataError("no folder seed-N in a run of several seeds", file=path, cure="train again")
     return sorted(seeds, key=seeds.__getitem__)
 
 
@@ -246,16 +252,16 @@ def _kind(path: Path) -> str | None:
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
-    """Split ``RUN@STEP``; the step of ``RUN``, whose path may contain ``@``, is None.
+    """Split ``RUN@STEP``; the step is None without ``@STEP``, or if a folder has the whole name.
 
     Raises:
         UsageError: The step is not a number.
     """
     run, at, step = name.rpartition("@")
-    if at and step.isdecimal():
-        return run, int(step)
     if not at or "/" in step or Path(name).is_dir():
         return name, None
+    if step.isdecimal():
+        return run, int(step)
     cure = "write RUN@STEP, for example runs/a@100000"
     raise UsageError(f"{step!r} is not a checkpoint step", cure=cure)
 

@@ -43,7 +43,7 @@ class WorkerPool(ProcessPoolExecutor):
         if isinstance(error, BrokenProcessPool):
             time.sleep(_INTERRUPT_S)
             problem = "a worker process died (out of memory, or a script without a main guard)"
-            raise DataError(problem, cure="use fewer --workers or --cores") from error
+            raise DataError(problem, cure="use fewer --workers or --cores, or add the guard") from error
 
     def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
         """Submit a call; a worker that starts for it gets Ctrl-C only when it has set up its signals."""

@@ -160,7 +160,7 @@ def _test_sentence(comparison: Comparison) -> str:
     """Return the result of the test of the primary metric."""
     metric, label = comparison.primary, _label(comparison.primary)
     if metric.difference.mean is None or metric.evidence.p is None:
-        return f"{label.text} cannot be tested: a test needs at least two recordings."
+        return f"{label.text} cannot be tested: it is defined in fewer than two recordings."
     p = _p_text(metric.evidence.p)
     p_sentence = f"p {p}" if p.startswith("<") else f"p = {p}"
     test = f"{bounds(metric.difference, label.unit, signed=True)}, {p_sentence}"

@@ -104,10 +104,11 @@ def player_html() -> str:
     return (
         f"<div id=stage></div>{controls}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
         "<noscript><p>The player needs JavaScript; its code is part of this page.</p></noscript>"
-        "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
+        "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the stored motion, with the "
         "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
         "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
-        "maximum of the action space.</small></p>"
+        "maximum of the action space; of trajectories in m/s² and rad, of direct states x and y, cut at 32 m."
+        "</small></p>"
     )
 
 

@@ -111,7 +111,8 @@ def _lead(runs: Sequence[EpisodeTable]) -> str:
     policy = runs[-1]
     path = Path(str(policy.data.get("path", "its scenario set")))
     name, data_name = escape(policy.name), escape(str(policy.data.get("name") or path.name))
-    for metric, verb in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
+    verbs = {"success": "succeeds in", "accuracy": "has no collision, off-road step or red light in"}
+    for metric, verb in verbs.items():
         interval = result_tables.summarise(policy, metric)
         if interval.mean is not None:
             share = number(interval.mean, "rate") + suffix("rate")
@@ -169,8 +170,8 @@ def _differences(runs: Sequence[EpisodeTable]) -> str:
     note = (
         "Mean of the differences by scenario, over the scenarios where both are defined (n pairs), with a "
         f"{result_tables.CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse”: the interval "
-        "excludes zero; it is not widened for the number of comparisons. “All equal”: all pairs have the same "
-        "difference, which leaves the bootstrap without width."
+        "excludes zero; it is not widened for the number of comparisons. “All equal”: the mean difference is "
+        "the same in all recordings, which leaves the bootstrap without width."
     )
     table = result_tables.differences_table(policy, others, names).html()
     return section(f"{escape(policy.name)} against the others", table, note=note)
@@ -198,7 +199,7 @@ def _collisions(runs: Sequence[EpisodeTable]) -> str:
     meanings = definitions((name, f"{meaning[:1].upper()}{meaning[1:]}.") for name, meaning in kinds)
     types = [(run, run.metrics["collision_type"]) for run in runs if "collision_type" in run.metrics]
     counts = ", ".join(f"{escape(run.name)} {int((kind > 0).sum())} of {len(run)}" for run, kind in types)
-    parts = f"<p>Episodes with a collision: {counts}.</p>", table.html(), meanings
+    parts = f"<p>Episodes with a collision of known kind: {counts}.</p>", table.html(), meanings
     return section("Kinds of collision", *parts, note=f"{escape(table.caption)} (Wilson's).")
 
 
@@ -267,7 +268,7 @@ def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
     """Return the provenance of the numbers: commands, data, versions and every ``run.json``."""
     rows = []
     for run in runs:
-        data = run.data if isinstance(run, EpisodeTable) else {}
+        data = run.data if isinstance(run, EpisodeTable) else next(iter(run.info.get("data") or ()), {})
         command, versions = run.info.get("command"), run.info.get("versions")
         texts = (
             " ".join(map(str, command)) if isinstance(command, list) else str(command or ""),

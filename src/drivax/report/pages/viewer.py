@@ -42,8 +42,7 @@ def select_rows(
         row_of.setdefault(entry["scenario_id"], row)
     for name in ids:
         if name not in row_of:
-            hint = did_you_mean(name, row_of)
-            cure = hint if hint.startswith("did") else "list them with `drivax inspect SET --json`"
+            cure = did_you_mean(name, row_of, otherwise="list them with `drivax inspect SET --json`")
             raise UsageError("is not in the set", file=data.path, record=name, cure=cure)
     rows = [row_of[name] for name in ids] if ids else list(range(len(data)) if order is None else order)
     return rows[:limit]
@@ -137,9 +136,9 @@ def _details(scenario: Scenario, extra: str) -> str:
         "steps": int(scenario.steps), "tracks": source.tracks, "tracks now": source.tracks_valid_now,
         "map points": source.map_points, "lights": source.lights,
     }  # fmt: skip
-    # The step of an event that never happened is stored as -1.
+    # A step is None if its event never happened, or needs a map that is missing.
     audit = {
-        name: "never" if name.endswith("_step") and value == -1 else value
+        name: "none" if name.endswith("_step") and value is None else value
         for name, value in scenario.audit.items()
     }
     sections = (

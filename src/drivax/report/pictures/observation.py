@@ -305,10 +305,13 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, groups: Obse
     if groups.has("agents", "velocity") or groups.has("ego", "velocity"):
         handles.append(line("ink", "motion in 1 s", marker=">", markersize=5, linewidth=0.9))
     if groups.has("road", "position"):
-        handles += [line(colour, name, linewidth=width) for name, (colour, width) in _ROADS.items()]
+        roads = _ROADS if groups.has("road", "type", "direction") else {"road": ("edge", 1.6)}
+        handles += [line(colour, name, linewidth=width) for name, (colour, width) in roads.items()]
         handles.append(line("lane", "reach of the road", linestyle="--", linewidth=0.9))
     if groups.has("lights", "position"):
-        handles += [symbol(colour, f"{name} light") for name, colour in _STATES.items()]
+        states = _STATES if groups.has("lights", "state") else {"unknown": "unknown"}
+        handles += [symbol(colour, f"{name} light") for name, colour in states.items()]
+    if groups.has("lights", "position", "on_route"):
         marker: dict[str, Any] = {"markeredgecolor": LIGHT["ink"], "markeredgewidth": 1.4}
         handles.append(symbol("ground", "light on the route", **marker))
     if groups.has("route", "position"):

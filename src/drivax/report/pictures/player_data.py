@@ -82,7 +82,7 @@ def pack_episode(scenario: Scenario, rollouts: Sequence[Rollout], title: str) ->
         "title": title,
         "id": scenario.id,
         "steps": int(scenario.steps),
-        "dt": round(float(scenario.dt_s), 4) or 0.1,
+        "dt": round(float(scenario.dt_s), 4),
         "unit": scale.unit_m,
         "centre": scale.centre,
         "map": {name: _lines(scale, drawing.layers[name]) for name in LAYERS},

@@ -94,8 +94,8 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
         return groups[: int(count)]
     if matches := [group for group in groups if group.scenario_id == which]:
         return matches
-    hint = did_you_mean(which, [group.scenario_id for group in groups])
-    cure = hint if hint.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
+    ids = [group.scenario_id for group in groups]
+    cure = did_you_mean(which, ids, otherwise="write worst:N, all, or an id of its episodes.csv")
     raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
 
 
@@ -277,7 +277,7 @@ class Scenery:
 
 
 def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Picture:
-    """Return one planner's rollout at a step, with its name, speed, time and past events."""
+    """Return one planner's rollout at a step, with its name, outcome, speed, time and past events."""
     canvas = scenery.canvas
     canvas.clear()
     scale = (min(canvas.width, canvas.height) - _BAR) / VIEW_M

@@ -237,7 +237,8 @@
   function updateTexts() {
     const step = Math.floor(state.time);
     for (const { rollout, speed, note } of state.panes) {
-      speed.textContent = `${(rollout.speed[step] / 100).toFixed(1)} m/s`;
+      const present = rollout.pose[3 * step] !== ABSENT;
+      speed.textContent = present ? `${(rollout.speed[step] / 100).toFixed(1)} m/s` : "gone";
       const past = Object.entries(rollout.events).filter(([, at]) => at <= state.time);
       note.textContent = past.map(([name, at]) => `✕ ${EVENTS[name]} at ${seconds(at)}`).join(", ");
     }
