@@ -2,7 +2,7 @@
 
 The functions reproduce metrics of nuplan-devkit 1.2 (``planning/metrics/evaluation_metrics``), including their
 quirks: the first sample counts, agents that overlap ego from the start count as collisions, and comfort has no logged
-past. ``nuplan_score`` is our own definition of the same score (semantics, Metrics).
+past. ``nuplan_score`` is our own definition of the same score (docs/guide/metrics.md).
 """
 
 from __future__ import annotations

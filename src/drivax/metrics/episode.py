@@ -21,7 +21,7 @@ from drivax.simulator.ahead import has_route
 from drivax.simulator.types import SimState, Situation
 
 _NEVER = 32767
-#: Steps in a second (semantics, ``wrong_way``).
+#: Steps in a second, the window of ``wrong_way``.
 _SECOND = 10
 
 

@@ -18,7 +18,7 @@ from drivax.simulator.types import Frame
 TTC_HORIZON_S = 5.0
 #: Largest gap, m.
 FARTHEST_GAP_M = 50.0
-#: Below this speed an agent is stopped (semantics, ``at_fault_collision`` and ``ttc``).
+#: Below this speed an agent is stopped, for ``at_fault_collision`` and ``ttc``.
 STOPPED_MPS = 0.05
 #: Tangent of 30 and cosine of 45 degrees.
 _TAN_30, _COS_45 = 3.0**-0.5, 0.5**0.5
@@ -146,7 +146,7 @@ def classify_contacts(
 
 
 def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
-    """Return the time to the first overlap at constant velocities and headings, s, at most 5 (semantics, ``ttc``).
+    """Return the time to the first overlap at constant velocities and headings, s, at most 5.
 
     Agents entirely behind the rear axle are followers and do not count, nor do those in ``ignored``, such as one that
     ran into the agent without its fault. All others count, in any direction: one that overlaps within the horizon is

@@ -80,7 +80,7 @@ def follow(motion: Motion, target: Motion, next_target: Motion) -> tuple[Scalar,
     """Return the acceleration and curvature that follow a log, from its motions one and two steps ahead.
 
     The acceleration closes the speed error in one step, plus 1/s^2 times the along-track error; the curvature is that
-    of the circle through the second position, 0 for moves below 0.1 m (semantics, ``expert_actions``).
+    of the circle through the second position, 0 for moves below 0.1 m.
     """
     cos, sin = jnp.cos(motion[2]), jnp.sin(motion[2])
     # Position of the log relative to that of the car at the mean speed.

@@ -1,4 +1,4 @@
-"""Red-light violations (semantics, ``red_light``): stop lines, right turns after a stop, lights off the route."""
+"""Red-light violations: stop lines, right turns after a stop, lights off the route."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _ON_ROUTE_M = 2.0
 _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
-#: Steps in a second; distance below which a log stands still, m (semantics, ``progress_ratio``).
+#: Steps in a second; distance below which a log stands still, m, for ``progress_ratio``.
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that compare with the log's schedule.
 _SCHEDULE = frozenset({"late_m", "early_m", "completed"})

@@ -26,7 +26,7 @@ from drivax.simulator.controller import TrackingConfig
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 from drivax.simulator.types import Action, AgentContext, History, Motion
 
-#: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
+#: Wheelbase as a share of the length, for steering angles of ``published``.
 _WHEELBASE = 0.6
 #: Tolerance of the bounds [-1, 1].
 _ROUNDING = 1e-4

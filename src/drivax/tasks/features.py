@@ -250,7 +250,7 @@ def route_curvature(
 
 
 def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the published speed at a curvature k in 1/m, ``clip(30 - 25 |k|, 5, 30)`` m/s (semantics)."""
+    """Return the published speed at a curvature k in 1/m, ``clip(30 - 25 |k|, 5, 30)`` m/s."""
     return jnp.clip(30.0 - 25.0 * jnp.abs(curvature), 5.0, 30.0)
 
 

@@ -1,4 +1,4 @@
-"""Reward terms and their weights: functions of the facts before and now (semantics, Reward).
+"""Reward terms and their weights: functions of the facts before and now (docs/guide/rewards.md).
 
 A term is in [0, 1] where it can be; its weight gives sign and size. A term whose facts are undefined (unknown limit, no
 lanes, no route) is 0.
@@ -39,7 +39,7 @@ _LATE_M, _EARLY_M, _EARLY_SLACK_M = 2.0, 8.0, 1.0
 _ROUTE_OFFSET_M, _URGENT_S = 1.0, 2.0
 #: Maximum of distances from the log, m.
 _MAX_LOG_DISTANCE_M = 10.0
-#: The goal is reached within this distance, m (semantics, ``reached_goal``).
+#: The goal is reached within this distance, m.
 _GOAL_M = 3.0
 #: Options of terms, and the largest value of each.
 OPTIONS = {

@@ -208,7 +208,7 @@ def _check_info(info: Any) -> None:
             raise ValueError("a recording that is not named by its data set and its segment")
     if divergence is not None and [type(divergence[name]) for name in ("step", "problem")] != [int, str]:
         raise ValueError("a divergence without its step or problem")
-    if not 1 <= (info.get("seeds") or 1) <= _MOST_SEEDS:
+    if not 1 <= info.get("seeds", 1) <= _MOST_SEEDS:
         raise ValueError(f"{info['seeds']} seeds")
 
 

@@ -87,7 +87,7 @@ def export(
         return write_part(scenarios, rows, out, options.overwrite, progress)
     _refuse_existing(out, options)
     partial = PartialFolder(out)
-    partial.open()
+    partial.open(restart=options.overwrite)
     try:
         work = _Work(scenarios, rows, partial.content, out.name, options, progress)
         with explain_full_disk(out):

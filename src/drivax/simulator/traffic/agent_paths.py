@@ -27,7 +27,7 @@ PATH_POINTS = 96
 #: Columns of paths. Those that the look-ahead reads are a separate array: most reads touch half as many cache lines.
 PATH_X, PATH_Y, PATH_COS, PATH_SIN = range(4)
 PROFILE_Z, PROFILE_SPEED = range(2)
-#: Length of a path beyond the last logged pose (semantics, Traffic), and spacing of its points, m.
+#: Length of a path beyond the last logged pose, and spacing of its points, m.
 EXTENSION_M, _EXTENSION_STEP_M = 60.0, 4.0
 #: An agent reacts if it travels further than this in the rest of its log, m.
 TRAVELS_M = 2.0
