@@ -2,8 +2,8 @@
 
 Jerk is the derivative over 15 samples of accelerations that are smoothed over 8 samples. A simulation therefore
 evaluates step t - 11 at step t, and the last twelve steps at the end of the episode, as in SciPy's ``interp`` mode. The
-result equals ``scipy.signal.savgol_filter`` over the whole episode (tests). Windows and orders are those of nuPlan's
-devkit (decision 0011).
+result equals ``scipy.signal.savgol_filter`` over logged past and episode (tests). Windows and orders are those of
+nuPlan's devkit (decision 0011).
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ class NuPlanLane(_Edge):
 
     @property
     def index(self) -> int:
-        """Number of lanes to the left in the roadblock."""
+        """Number of lanes to the left, from neighbour to neighbour."""
         visited, lane = {self.row}, self
         while (lane := lane.adjacent_edges[0]) is not None and lane.row not in visited:
             visited.add(lane.row)

@@ -1,6 +1,6 @@
 """Drive by a planner with nuPlan's interface (``AbstractPlanner``), called outside the compiled program.
 
-Each episode gets its own instance. The controller of the task tracks the planned trajectory.
+Each episode gets its own instance. The controller of the action space ``trajectory`` tracks the planned poses.
 """
 
 from __future__ import annotations
@@ -120,11 +120,10 @@ class Host:
         try:
             planner = self._make()
             self.name = str(planner.name())
+            observed = getattr(planner, "observation_type", lambda: None)()
         except Exception as error:
             raise UsageError(f"planner {name!r}: {error_text(error)}", cure="fix the planner") from error
-        observation = ""
-        if hasattr(planner, "observation_type"):
-            observation = getattr(planner.observation_type(), "__name__", "")
+        observation = getattr(observed, "__name__", "")
         if observation not in ("", "DetectionsTracks"):
             cure = "only DetectionsTracks are known"
             raise UsageError(f"planner {name!r} observes {observation}", cure=cure)
