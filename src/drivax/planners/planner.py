@@ -84,7 +84,10 @@ class RuleBased(Memoryless, ABC):
 
 @record
 class Held:
-    """A planner whose decisions are executed for several steps (``Task.hold``)."""
+    """A planner whose decisions are executed for several steps (``Task.hold``).
+
+    Repeated poses of ``trajectory`` and ``direct_state`` do not move on: a held plan begins at the present again.
+    """
 
     planner: Any
     steps: int = static()

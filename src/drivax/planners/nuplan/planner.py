@@ -74,7 +74,7 @@ class NuplanPlanner:
     def act(
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any, key: Array
     ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
-        """Return the action that follows the plan, or NaN if the planner raises an error."""
+        """Return the action that follows the plan; errors of the planner as in :func:`python_actions`."""
         context, frame = situation.context, situation.surroundings.frame
         trajectory = self.actions if isinstance(self.actions, Trajectory) else None
         steps = trajectory.steps if trajectory else 2

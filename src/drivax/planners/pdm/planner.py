@@ -210,5 +210,6 @@ class PdmPlanner:
         return self.actions if isinstance(self.actions, Trajectory) else None
 
     def _wheelbase(self, length_m: Scalar) -> Scalar:
+        """Return the wheelbase for a length, m; empty slots have length 0 and count as 1 m long."""
         tracking = self._plan_space.controller if self._plan_space else self.config.tracking
         return tracking.wheelbase * jnp.maximum(length_m, 1.0)
