@@ -86,7 +86,7 @@ class RuleBased(Memoryless, ABC):
 class Held:
     """A planner whose decisions are executed for several steps (``Task.hold``).
 
-    Repeated poses of ``trajectory`` and ``direct_state`` do not move on: a held plan begins at the present again.
+    Poses of ``trajectory`` and ``direct_state`` are repeated as they are: a plan is tracked from its first pose again.
     """
 
     planner: Any
