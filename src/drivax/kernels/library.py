@@ -87,7 +87,7 @@ def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) ->
 
 
 def constants(values: Mapping[str, float]) -> dict[str, Any]:
-    """Return attributes of a kernel: truths, integers of 32 bits, and floats."""
+    """Return attributes of a kernel: booleans, 32-bit integers and floats."""
     types = {bool: bool, int: np.int32, float: np.float32}
     return {
         name: next(types[kind] for kind in types if isinstance(value, kind))(value)
