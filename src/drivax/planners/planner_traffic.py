@@ -82,6 +82,10 @@ class PlannerTraffic:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise UsageError(f"traffic with {self.count} driven vehicles", cure="use count=1 or more")
+        if isinstance(self.base, PlannerTraffic):  # a bank has one TrafficPolicy
+            raise UsageError(
+                "the base of driven traffic is driven, too", cure="use another base, such as IdmTraffic()"
+            )
 
     @property
     def name(self) -> str:
