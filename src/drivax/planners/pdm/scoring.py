@@ -133,7 +133,7 @@ def _has_short_ttc(
 ) -> Bool[Array, ""]:  # fmt: skip
     """Return whether some step has a short time to collision with an agent that is not behind ego.
 
-    The first such step decides for each agent. Few sources mark intersections, so agents next to ego always count.
+    The first such step decides for each agent. Not all sources mark intersections, so agents next to ego always count.
     """
     steps = jnp.arange(motion.shape[0])
     is_short = is_imminent & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
