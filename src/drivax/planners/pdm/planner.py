@@ -40,7 +40,7 @@ _STRIDE = 5
 
 @dataclass(frozen=True)
 class PdmConfig:
-    """Settings of PDM-Closed; defaults as published.
+    """Settings of PDM-Closed; defaults as published, except ``agents`` and ``scoring.ground_every``.
 
     Attributes:
         fractions: Target speeds of the proposals, relative to the speed limit.
