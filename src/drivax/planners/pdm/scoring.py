@@ -31,7 +31,7 @@ _BEHIND_COS = -(3.0**0.5) / 2.0
 
 @dataclass(frozen=True)
 class ScoringConfig:
-    """Weights and limits; defaults as published, except ``ground_every``. Comfort: nuPlan's limits (``metrics.comfort``).
+    """Weights and limits; defaults as published, except ``ground_every``. Comfort limits: ``metrics.comfort``.
 
     Attributes:
         progress, ttc, comfort: Weights of the mean.
