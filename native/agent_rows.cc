@@ -61,7 +61,7 @@ namespace drivax::TARGET {
 
 enum { kSizeHeight = 2, kSizeColumns = 4, kMotionSpeed = 3, kTypes = 4 };
 
-// Writes the slots of the nearest agents in ascending order, and returns how many there are, at most `count`.
+// Writes the slots of the nearest agents, nearest first, and returns how many there are, at most `count`.
 //
 // The rank of an agent is the number of agents that are nearer, or as near with a lower slot.
 INLINE int64_t find_nearest(const AgentRows& a, int64_t sample, const View& view, const AgentScratch& scratch) {

@@ -55,7 +55,7 @@ constexpr int8_t next_contact(int before, int now) {
   const bool was_hit = before == kHit || before == kAtFault || before == kParted || before == kGone;
   if (now == kEmpty) return was_hit ? kGone : kAbsent;
   if (now == kSeparate) return was_hit ? kParted : kApart;
-  // A slot that overlaps as it appears is ignored. A second contact is never a new fault.
+  // A slot that overlaps as it appears is ignored. A contact after kParted is never a new fault.
   if (before == kIgnored || before == kAbsent || before == kGone) return kIgnored;
   if (before == kApart) return now == kTouchingAtFault ? kAtFault : kHit;
   return before == kParted ? (int)kHit : before;

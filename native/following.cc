@@ -54,6 +54,7 @@ EACH_TARGET(void look_ahead(const Following& arguments, int64_t first, int64_t l
 
 #ifdef TARGET
 
+#include "angle.h"
 #include "order.h"
 #include "overlap.h"
 #include "route.h"
@@ -83,7 +84,7 @@ static void read_path(const Following& a, int64_t sample, Path* path) {
   const float along_m = a.route_m[sample];
   const int32_t last = a.route_points[row] - 1;
   path->count = 0;
-  // The first point counts for curves and leaders even where the route has ended.
+  // The first point counts for leaders even where the route has ended.
   for (int i = 0; i < kPoints; ++i) {
     const float at = along_m + a.step_m * i;
     const bool is_on_route = at <= (float)last && last > 0;
@@ -256,20 +257,6 @@ static float stop_line_m(const Following& a, int64_t sample, float half_length) 
     if (distance > 0 && distance < kPoints * a.step_m && distance < nearest) nearest = distance;
   }
   return nearest;
-}
-
-// The arctangent of y / x for y of at least zero, in [0, pi]; relative error below 3e-7.
-INLINE Floats arctangent(Floats y, Floats x) {
-  const Floats width = absolute(x);
-  const Ints is_steep = y > width;
-  const Floats ratio = select(is_steep, width, y) / larger(select(is_steep, y, width), splat(1e-30f));
-  // To at most tan(pi / 8), then the polynomial of Cephes.
-  const Ints is_large = ratio > 0.41421356f;
-  const Floats t = select(is_large, (ratio - 1.0f) / (ratio + 1.0f), ratio), t2 = t * t;
-  Floats angle = (((8.05374449538e-2f * t2 - 1.38776856032e-1f) * t2 + 1.99777106478e-1f) * t2 - 3.33329491539e-1f);
-  angle = angle * t2 * t + t + select(is_large, splat(0.78539816339f), Floats{});
-  angle = select(is_steep, 1.57079632679f - angle, angle);
-  return select(x < 0, 3.14159265359f - angle, angle);
 }
 
 // The present speed limit, or the lower speed that the curves ahead require.

@@ -266,6 +266,13 @@ class Sized(RouteIdm):
         self.size = size
 
 
+class Blind(RouteIdm):
+    """Has no observation."""
+
+    def observation_type(self):
+        raise NotImplementedError("no observation")
+
+
 class Broken(RouteIdm):
     """Cannot be made."""
 

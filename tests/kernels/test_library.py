@@ -2,12 +2,14 @@ import os
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from drivax import kernels
+from drivax.kernels import library
 from drivax.networks.encoders import max_pool
 from kernels.compare import needs_kernels, run_tests
 
@@ -31,10 +33,21 @@ def test_zero_switches_the_kernels_off():
 
 def test_a_missing_or_damaged_library_is_not_used(tmp_path):
     program = f"from pathlib import Path; from drivax.kernels import library; library.PATH = Path({{}}); {PRINT_STATE}"
-    assert run(program.format(repr(str(tmp_path / "libdrivax.so")))) == "False none: make native"
+    assert (
+        run(program.format(repr(str(tmp_path / "libdrivax.so"))))
+        == "False none: make native (on Linux x86-64)"
+    )
     damaged = tmp_path / "libdrivax.so"
     damaged.write_bytes(b"\x7fELF" + b"no library" * 50)
     assert run(program.format(repr(str(damaged)))) == "False none: libdrivax.so does not load here"
+
+
+def test_a_library_that_programs_do_not_call_is_not_in_use(monkeypatch):
+    functions = {"drivax_target": lambda: b"AVX2", "drivax_hash": lambda: b"0123"}
+    monkeypatch.setattr(library, "_library", lambda: SimpleNamespace(**functions))
+    assert kernels.state() == "AVX2, build 0123"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert kernels.state() == "none: AVX2, build 0123 is for float32 on CPUs"
 
 
 @needs_kernels

@@ -98,6 +98,8 @@ def test_planners_unfit_for_traffic_are_refused(bank):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="traffic with 0 driven vehicles"):
         PlannerTraffic(TASK, count=0)
+    with pytest.raises(UsageError, match="the base of driven traffic is driven, too; use another base"):
+        PlannerTraffic(base=PlannerTraffic())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
         TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
 

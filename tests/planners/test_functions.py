@@ -138,6 +138,8 @@ def test_planner_functions_are_loaded_by_name():
         assert isinstance(planner, Planner) and planner.name == name and not planner.replays
     with pytest.raises(UsageError, match=r"takes \(situation, observation\).*put @drivax.python_planner or"):
         make_planner("own_drivers:plain")
+    with pytest.raises(UsageError, match=r"takes \(function: .*; name a function that makes drivax.planners"):
+        make_planner("drivax.planners.functions:FunctionPlanner")
     with pytest.raises(UsageError, match="unknown planner 'ide'; did you mean 'idm'"):
         make_planner("ide")
     assert make_planner("own_drivers:fragile").name == "fragile"

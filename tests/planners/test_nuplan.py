@@ -230,6 +230,7 @@ def test_errors_of_the_planner_fail_its_episode(scenarios):
     ("name", "words"),
     [
         ("Seeing", "'nuplan_planners:Seeing' observes Sensors; only DetectionsTracks"),
+        ("Blind", "planner 'nuplan_planners:Blind': NotImplementedError: no observation"),
         ("Sized", "is called with \\(\\); name a function that makes nuplan_planners:Sized"),
         (
             "Broken",

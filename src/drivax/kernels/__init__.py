@@ -1,4 +1,4 @@
-"""Optional native kernels for CPUs, with the results of the JAX functions that call them.
+"""Optional native kernels for CPUs, with the results of the JAX functions that call them, up to rounding.
 
 ``library`` finds, registers and calls them; each other module is a kernel. The sources are in ``native``.
 """

@@ -34,7 +34,7 @@ def measure_contacts(
     agents: Agents, previous: tuple[Float[Array, "S 2"], Bool[Array, " S"]], slot: Int[Array, ""],
     speed: Float[Array, ""], unlawful: Bool[Array, ""], before: Int[Array, " S"], rules: Mapping[str, float],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """Return new contact codes, whether a contact that begins is at fault, its type, and time to collision.
+    """Return contact codes, whether a new contact is at fault, the type of the nearest one, and time to collision.
 
     Args:
         agents: All agents.

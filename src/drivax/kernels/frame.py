@@ -26,7 +26,7 @@ def read_frame(
 ) -> FrameArrays:  # fmt: skip
     """Return the agents at a step, with the driven one at its motion, but at the height of the log.
 
-    Without the height, the frame depends on nothing that measuring changes: XLA computes it once for both.
+    Without the height, the frame depends on nothing that measuring changes: XLA computes it once per step.
 
     Args:
         logs: Arrays of all scenarios.

@@ -1,4 +1,4 @@
-"""The compiled library: found next to this file or not, and called through XLA's foreign functions."""
+"""The compiled library, if it is installed, and calls of its kernels through XLA's foreign function interface."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jax.sharding import AxisType, PartitionSpec
 
 #: ``make native`` and the wheels for Linux on x86-64 put it here; tests build others.
 PATH = Path(os.environ.get("DRIVAX_NATIVE_LIBRARY", Path(__file__).parent / "libdrivax.so"))
-#: 0: no kernels; a target: the best one up to it; anything else, or not set: the best one.
+#: ``0``: no kernels; ``sse4.2`` or ``avx2``: at most this target; anything else, or not set: the best one.
 VARIABLE = "DRIVAX_NATIVE"
 
 _allowed: ContextVar[bool] = ContextVar("kernels are allowed", default=True)
@@ -51,10 +51,11 @@ def state() -> str:
     """Return what is in use, as in ``drivax doctor``."""
     library = _library()
     if library is not None:
-        return f"{library.drivax_target().decode()}, build {library.drivax_hash().decode()}"
+        build = f"{library.drivax_target().decode()}, build {library.drivax_hash().decode()}"
+        return build if in_use() else f"none: {build} is for float32 on CPUs"
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
-    return "none: make native" if not PATH.exists() else f"none: {PATH.name} does not load here"
+    return f"none: {PATH.name} does not load here" if PATH.exists() else "none: make native (on Linux x86-64)"
 
 
 def in_use() -> bool:
@@ -86,7 +87,7 @@ def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) ->
 
 
 def constants(values: Mapping[str, float]) -> dict[str, Any]:
-    """Return attributes of a kernel: truths, integers of 32 bits, and floats."""
+    """Return attributes of a kernel: booleans, 32-bit integers and floats."""
     types = {bool: bool, int: np.int32, float: np.float32}
     return {
         name: next(types[kind] for kind in types if isinstance(value, kind))(value)

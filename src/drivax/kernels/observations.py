@@ -26,7 +26,7 @@ class Ego:
         row: Row of its route.
         slot: Slot in frames.
         route_m: Arc length along its route, m.
-        has_route: Whether that lies on lanes.
+        has_route: Whether it has a route on lanes.
         motion: x, y, heading, speed.
         direction: Cosine and sine of the heading.
     """

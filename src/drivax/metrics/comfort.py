@@ -2,8 +2,8 @@
 
 Jerk is the derivative over 15 samples of accelerations that are smoothed over 8 samples. A simulation therefore
 evaluates step t - 11 at step t, and the last twelve steps at the end of the episode, as in SciPy's ``interp`` mode. The
-result equals ``scipy.signal.savgol_filter`` over the whole episode (tests). Windows and orders are those of nuPlan's
-devkit (decision 0011).
+result equals ``scipy.signal.savgol_filter`` over logged past and episode (tests). Windows and orders are those of
+nuPlan's devkit (decision 0011).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivax.scenario.schema import DT_S
 WINDOW, TAIL = 15, 12
 #: Window, order and derivative of smoothed acceleration, jerk, yaw rate and yaw acceleration.
 SMOOTH, JERK, YAW_RATE, YAW_ACCELERATION = (8, 2, 0), (15, 2, 1), (5, 2, 1), (5, 3, 2)
-#: Number of motions that the last steps depend on, and index of the first acceleration with a final smoothed value.
+#: Number of motions that the last steps depend on, and samples of a filter; its first sample with a whole window of 8.
 _SAMPLES, _FIRST_FINAL = 23, 4
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)

@@ -24,7 +24,7 @@ class MetricSelection:
     Attributes:
         names: The requested metrics.
         metrics: The requested metrics and their inputs, inputs first.
-        reads: Facts that their step values read; all facts for the full set, so that planners can read them.
+        reads: Facts that their step values read; for the full set all of ``FACTS``, so that planners can read them.
     """
 
     names: tuple[str, ...]

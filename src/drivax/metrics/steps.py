@@ -66,7 +66,7 @@ class StepValue:
         name: Name of the quantity.
         unit: Unit, ``-`` for booleans and codes.
         read: From a moment to the value, and whether it is defined.
-        reads: Names of the facts that ``read`` needs; all facts by default.
+        reads: Names of the facts that ``read`` needs; by default all but those measured on request.
         delayed: Whether the value is computed several steps later, at the end of an episode for several steps at once.
     """
 

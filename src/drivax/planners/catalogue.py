@@ -71,7 +71,7 @@ def as_planner(candidate: Any, name: str) -> Planner:
             check_arguments(candidate, name, ())
         except ValueError as error:
             cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
-            if is_nuplan(candidate):
+            if isinstance(candidate, type):
                 cure = f"name a function that makes {name} without arguments"
             raise UsageError(str(error), cure=cure) from None
         if not is_nuplan(candidate) and (is_nuplan(result_class(candidate)) or makes(candidate, Planner)):

@@ -84,7 +84,10 @@ class RuleBased(Memoryless, ABC):
 
 @record
 class Held:
-    """A planner whose decisions are executed for several steps (``Task.hold``)."""
+    """A planner whose decisions are executed for several steps (``Task.hold``).
+
+    Poses of ``trajectory`` and ``direct_state`` are repeated as they are: a plan is tracked from its first pose again.
+    """
 
     planner: Any
     steps: int = static()

@@ -63,8 +63,9 @@ class PlannerTraffic:
 
     It drives vehicles that are logged at the start of the episode and travel more than 2 m in the rest of the log. They
     see all agents, hold each decision for ``task.hold`` steps, and follow the task's dynamics to the end of the
-    episode. Only further egos of the set have a route: for other vehicles, use a policy that can follow lanes without
-    one. In the action space ``route``, only egos with a route on lanes are driven.
+    episode. If the simulator drives several agents, earlier frames have all but the first from ``base``. Only further
+    egos of the set have a route: for other vehicles, use a policy that can follow lanes without one. In the action
+    space ``route``, only egos with a route on lanes are driven.
 
     Attributes:
         task: Observation and action space of the planner.
@@ -81,6 +82,10 @@ class PlannerTraffic:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise UsageError(f"traffic with {self.count} driven vehicles", cure="use count=1 or more")
+        if isinstance(self.base, PlannerTraffic):  # a bank has one TrafficPolicy
+            raise UsageError(
+                "the base of driven traffic is driven, too", cure="use another base, such as IdmTraffic()"
+            )
 
     @property
     def name(self) -> str:
@@ -124,7 +129,7 @@ class PlannerTraffic:
 
         def drive(agent: AgentContext, carry: Any) -> tuple[AgentContext, Any]:
             """Return an agent's context one step later, after an action of the planner, and the planner's carry."""
-            # Earlier contacts matter to metrics only, so none is kept.
+            # No earlier contacts are kept: they matter only to the facts of collisions and time to collision.
             no_contact = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
             lights = remember_lights(bank, agent)
             situation, contacts, lights = measure(bank, agent, frame, frames(1), no_contact, lights)

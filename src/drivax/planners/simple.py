@@ -105,8 +105,8 @@ class ConstantSpeed(RuleBased):
 class RandomActions(Memoryless):
     """Draw every component of an action uniformly from [-1, 1), independently at every step.
 
-    In ``delta_local`` negative draws of the first component do not move. ``direct_state`` and ``trajectory`` have no
-    such bounds: there the draws mean nothing.
+    In ``delta_local`` negative draws of the first component do not move ahead. ``direct_state`` and ``trajectory`` have
+    no such bounds: there the draws mean nothing.
     """
 
     name: str = static(default="random")

@@ -179,7 +179,10 @@ def project(
 
 
 def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
-    """Return whether the driven agent has a route on lanes. Otherwise the bank holds its logged path: privileged."""
+    """Return whether the driven agent has a route on lanes.
+
+    Otherwise its row of the bank has ego's logged path, which is privileged, or the route of another agent.
+    """
     return bank.on_lanes[context.row] & (context.slot == bank.ego_slot(context.row))
 
 

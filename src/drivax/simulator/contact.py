@@ -39,7 +39,8 @@ class Contact(enum.IntEnum):
 
     ``IGNORED``: has overlapped since it appeared and does not count until it separates; ``HIT``: overlaps without the
     evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED``: separated again after ``HIT`` or ``AT_FAULT``;
-    ``GONE``: absent after any of these three.
+    ``GONE``: absent after any of these three. An agent that was gone and reappears in an overlap is ``IGNORED``, then
+    ``APART``: its earlier hit is forgotten.
     """
 
     ABSENT = 0
@@ -81,7 +82,7 @@ def overlaps(frame: Frame, slot: Integer) -> Bool[Array, " S"]:
 
 
 def first_contacts(before: Int[Array, " S"], touching: Bool[Array, " S"]) -> Bool[Array, " S"]:
-    """Mask of the overlaps that begin at this step and count: with agents that were apart and were never hit."""
+    """Mask of the overlaps that begin at this step and count: those with agents in the state ``APART``."""
     return touching & (before == Contact.APART)
 
 
@@ -93,7 +94,7 @@ def next_contacts(
     ``fault`` marks the evaluated agent's fault in contacts that begin at this step.
     """
     c = Contact
-    # A slot that overlaps as it appears is ignored. A second contact is never a new fault.
+    # A slot that overlaps as it appears is ignored. A contact after ``PARTED`` is never a new fault.
     is_ignored = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
     code = jnp.where(before == c.PARTED, c.HIT, before)
     code = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), code)

@@ -29,7 +29,7 @@ Actuators = Float[Array, " 3"]
 ACCELERATION, STEERING, RATE = range(3)
 #: Regularisation of the first curvature, which a plan without motion does not determine.
 _FIRST_CURVATURE = 1e-10
-#: Steps over which initial acceleration and steering are measured; distance below which they are a standstill, m.
+#: Steps over which initial acceleration and steering are measured; largest distance in them for a steering of 0, m.
 _RECENT, _STILL_M = 5, 0.5
 #: Settings that cannot be 0: most divide, or keep a divisor away from 0.
 _POSITIVE = (
@@ -88,7 +88,7 @@ def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> S
 
 
 def speed_command(speed: Scalar, desired: Scalar, config: TrackingConfig) -> tuple[Scalar, Bool[Array, ""]]:
-    """Return the commanded acceleration, m/s2, and whether the car is stopping, in which it does not steer."""
+    """Return the commanded acceleration, m/s2, and whether the car is stopping: its wheels then keep their angle."""
     is_stopping = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
     stopping = config.stopping_gain * (desired - speed)
     return jnp.where(is_stopping, stopping, acceleration_to(speed, desired, config)), is_stopping

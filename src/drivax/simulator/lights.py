@@ -73,7 +73,7 @@ def check_lights(
     arc = line[LightRow.ARC + bank.ego_number(context.row)]
     violation = (crossed & red & (arc < NEVER_M)).any() & on_route
 
-    # Steps since a line was crossed off the route: positive if at red, else negative.
+    # As in :class:`LightMemory`: 1 at the step of the crossing, negative if that was lawful.
     age = jnp.where(crossed & ~on_route, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
     # Crossings that are undecided when the log ends are decided then.
     due = (jnp.abs(age) > _DECISION_STEPS) | ((age != 0) & (context.step >= last))

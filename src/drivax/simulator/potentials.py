@@ -2,7 +2,7 @@
 
 A potential is positive wherever the metric of the same name holds, zero beyond a margin, and in between
 ``max(0, 1 - d / margin)^2`` of a distance d that grows away from the violation. Its gradient is continuous except where
-two road edges are equally far away. Optimised trajectories are still evaluated by the metrics.
+two road edges are equally far away, or an edge is 3 m away. Optimised trajectories are still evaluated by the metrics.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LEAST_MARGIN_M = 0.3
 
 
 def separation(box: Float[Array, " 6"], others: Float[Array, "S 6"]) -> Float[Array, " S"]:
-    """Return the gap between boxes along the best of the four separating axes, m; negative where they overlap.
+    """Return the gap between boxes along the best of the four separating axes, m; negative for deep overlaps.
 
     A smooth upper bound of ``max over axes of (|centre offset| - reach)``, whose sign decides overlap (separating axis
     theorem) and which is the distance between the boxes, or less where they face each other corner to corner. The

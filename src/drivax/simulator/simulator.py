@@ -284,7 +284,7 @@ def slots_of(
 ) -> Int[Array, " K"]:
     """Return the slots of the first ``count`` moving agents in a mask that the log has at ``step``.
 
-    If there are fewer, the result is padded with A, an empty slot.
+    If there are fewer, the result is padded with A, the slot of no moving agent.
     """
     present = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
     return jnp.nonzero(present, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)

@@ -35,7 +35,7 @@ from drivax.simulator.types import (
     Surroundings,
 )
 
-#: Lights of the route count while the agent is within this distance of it, m.
+#: Only lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
 #: Rows of the history, the present one included, in which a lane change may begin before an episode.
 _ENTRY_STEPS = 16
@@ -61,8 +61,8 @@ def measure(
     """Measure the driven agent.
 
     ``context`` has the present step and motion; its ``route_m`` and ``z``, ``contacts``, ``lights`` and the fact
-    ``strand`` (None at the start of an episode) are those of the step before. ``frame`` and ``previous`` are all agents
-    now and one step before. Facts that ``reads`` does not name are None and not computed.
+    ``strand`` (None in a reset, -1 where a collector begins an episode) are those of the step before. ``frame`` and
+    ``previous`` are all agents now and one step before. Facts that ``reads`` does not name are None and not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
@@ -73,8 +73,7 @@ def measure(
     offroad_m, left_map, offroad = measure_offroad(bank, context.index, ego, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
-    # Not ``offroad``, which is false without a map: there, too, a lateral hit is a fault.
-    unlawful = lanes.leaving_lane | (offroad_m > queries.OFFROAD_TOLERANCE_M)
+    unlawful = lanes.leaving_lane | offroad
     codes, fault, kind, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
     routed = has_route(bank, context)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
@@ -148,7 +147,7 @@ def _measure_contacts(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
-    """Return contact codes, whether a new contact is at fault, its type, and time to collision.
+    """Return contact codes, whether a new contact is at fault, the type of the nearest one, and time to collision.
 
     Values that ``reads`` does not need are zero; if it needs no contacts, the codes stay unchanged.
     """
@@ -211,7 +210,7 @@ def _requested_facts(
 
 
 def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, strand: Any) -> dict[str, Array]:
-    """Return the facts of lane passages; ``strand`` is that of the step before, None at the start of an episode."""
+    """Return the facts of lane passages; ``strand`` is that of the step before, None in a reset."""
     ego, ground = frame.box[context.slot], _ground(bank, context, frame)
     if strand is None:
         # An agent that changes lanes at the start comes from its pose 15 steps ago.
@@ -223,7 +222,7 @@ def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, stra
 
 
 def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
-    """Return the facts that compare the progress on the route with that of the log at the same step."""
+    """Return the facts that compare the progress on the route with that of the log."""
     log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
     step = jnp.minimum(context.step + _SECOND, last)
     velocity = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]

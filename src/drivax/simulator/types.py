@@ -32,7 +32,8 @@ class AgentContext:
         step: Time step t in the log.
         slot: Slot of the driven agent (0: ego).
         history: x, y, heading, speed of the driven agent over the last 23 steps; the last row is the present step.
-        action: Last executed action, within bounds and actuator rates; D components (2 by default).
+        action: Last executed action, within bounds and actuator rates, or that given to ``Simulator.replay``; D
+            components (2 by default).
         route_m: Arc length of the agent along its route, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple for log replay.
@@ -90,8 +91,8 @@ class Facts:
 
     Facts outside ``Task.reads`` are None and not computed, except that ``lane_changed`` and ``merged`` need ``strand``.
     ``ttc_defined`` is false at standstill; ``limit_mps`` is -1 if unknown; ``routed``: the agent has a route on lanes,
-    without which progress and ``off_route`` are undefined; ``logged``: the log has the agent at this step; ``ignored``
-    counts ignored overlaps.
+    without which facts of progress, route and goal are undefined; ``logged``: the log has the agent at this step;
+    ``ignored`` counts ignored overlaps.
 
     Measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m`` behind the log
     along the agent's heading (negative: ahead of it); ``late_m`` behind the log along the route, and ``early_m`` ahead
@@ -168,8 +169,8 @@ class LightMemory:
     """Memory of stop lines."""
 
     pause: Int[Array, "*batch L"]  # Steps since the agent last stood before the line; saturates
-    # Steps since the agent crossed the line off its route, until the crossing is decided: positive at red, negative
-    # otherwise, 0 without a crossing
+    # Steps since the agent crossed the line off its route, from 1 on, until the crossing is decided: positive if it
+    # was against a red light, negative otherwise, 0 without a crossing
     crossed: Int[Array, "*batch L"]
 
 
@@ -204,7 +205,7 @@ class SimState:
 
 @record
 class Transition:
-    """One step; ``after`` is the resulting state, never a reset state.
+    """One step; ``after`` is the resulting state, a reset one only where a collector begins the next episode.
 
     Attributes:
         before, after: States before and after the step.
@@ -228,7 +229,7 @@ class Transition:
 class Traffic(Protocol):
     """Motion of the agents that are not driven.
 
-    A model that needs precomputed data also has ``prepare(bank) -> bank``, which evaluation calls.
+    A model that needs precomputed data also has ``prepare(bank) -> bank``, which evaluation and training call.
     """
 
     @property

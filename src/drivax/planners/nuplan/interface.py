@@ -56,7 +56,7 @@ class TrackedObjectType(enum.Enum):
 
 
 AGENT_TYPES = (TrackedObjectType.VEHICLE, TrackedObjectType.PEDESTRIAN, TrackedObjectType.BICYCLE)
-#: Sources do not distinguish cones, barriers and signs.
+#: Stored kinds do not distinguish cones, barriers and signs.
 TYPE_OF_KIND = {
     AgentKind.VEHICLE: TrackedObjectType.VEHICLE,
     AgentKind.PEDESTRIAN: TrackedObjectType.PEDESTRIAN,

@@ -26,7 +26,7 @@ Points = Float[np.ndarray, "point 2"]
 
 
 class SemanticMapLayer(enum.IntEnum):
-    """Layers of the map; the layer of car parks is empty, since sources have none."""
+    """Layers of the map; the layer of car parks is empty, since scenarios store none."""
 
     LANE = 0
     INTERSECTION = 1
@@ -104,7 +104,7 @@ class _Edge(DevkitObject):
 
     @property
     def stop_lines(self) -> list[Any]:
-        """Empty list, since sources have no stop lines."""
+        """Empty list, since scenarios store no polygons of stop lines."""
         return []
 
 
@@ -166,7 +166,7 @@ class NuPlanLane(_Edge):
 
     @property
     def index(self) -> int:
-        """Number of lanes to the left in the roadblock."""
+        """Number of lanes to the left, from neighbour to neighbour."""
         visited, lane = {self.row}, self
         while (lane := lane.adjacent_edges[0]) is not None and lane.row not in visited:
             visited.add(lane.row)

@@ -1,6 +1,6 @@
 """Drive by a planner with nuPlan's interface (``AbstractPlanner``), called outside the compiled program.
 
-Each episode gets its own instance. The controller of the task tracks the planned trajectory.
+Each episode gets its own instance. The controller of the action space ``trajectory`` tracks the planned poses.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class NuplanPlanner:
     def act(
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any, key: Array
     ) -> tuple[Float[Array, " D"], Any]:  # fmt: skip
-        """Return the action that follows the plan, or NaN if the planner raises an error."""
+        """Return the action that follows the plan; errors of the planner as in :func:`python_actions`."""
         context, frame = situation.context, situation.surroundings.frame
         trajectory = self.actions if isinstance(self.actions, Trajectory) else None
         steps = trajectory.steps if trajectory else 2
@@ -120,11 +120,10 @@ class Host:
         try:
             planner = self._make()
             self.name = str(planner.name())
+            observed = getattr(planner, "observation_type", lambda: None)()
         except Exception as error:
             raise UsageError(f"planner {name!r}: {error_text(error)}", cure="fix the planner") from error
-        observation = ""
-        if hasattr(planner, "observation_type"):
-            observation = getattr(planner.observation_type(), "__name__", "")
+        observation = getattr(observed, "__name__", "")
         if observation not in ("", "DetectionsTracks"):
             cure = "only DetectionsTracks are known"
             raise UsageError(f"planner {name!r} observes {observation}", cure=cure)

@@ -139,6 +139,7 @@ class EmergencyBrake:
         path = self._forecast(motion, steered_action, context.action, box[LENGTH])
         is_touching = overlaps(frame, context.slot)
         others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _OTHERS, _RADIUS_M)
+        # The lanes at the present pose stand for those along the path.
         is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
         fault_s = jnp.min(Contacts.along(path, box[LENGTH : WIDTH + 1], others).fault_times(is_unlawful))
         speed = motion[MOTION_SPEED]

@@ -46,9 +46,9 @@ _FAR_M = 1e6
 class Ground:
     """Position relative to lanes and road at each step of a motion."""
 
-    is_in_several_lanes: Bool[Array, "*T"]  # No lane holds all corners
+    is_in_several_lanes: Bool[Array, "*T"]  # A lane is driven, but none holds all corners
     is_offroad: Bool[Array, "*T"]  # Some corner is off the road
-    is_astray: Bool[Array, "*T"]  # The centre is outside the lanes in the route's direction
+    is_astray: Bool[Array, "*T"]  # Outside the corridor; where there is no route: wrong-way driving
 
 
 def ground_at(
@@ -56,7 +56,8 @@ def ground_at(
 ) -> Ground:
     """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
 
-    ``row`` is that of the route. Beyond its end (not ``on_route``) only wrong-way driving is astray.
+    ``row`` is that of the route. If it is not on lanes, or beyond its end (not ``on_route``), only wrong-way driving is
+    astray.
     """
     index, points = bank.scenario_of(row), corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z, row=row)

@@ -34,13 +34,13 @@ from drivax.tasks.actions import ActionSpace, Physical, Trajectory, action_of
 
 #: IDM of the proposals.
 PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_mps2=3.0)
-#: Stride of the route points that are compared with forecasts.
+#: Stride of the points of the first line that are compared with forecasts.
 _STRIDE = 5
 
 
 @dataclass(frozen=True)
 class PdmConfig:
-    """Settings of PDM-Closed; defaults as published.
+    """Settings of PDM-Closed; defaults as published, except ``agents`` and ``scoring.ground_every``.
 
     Attributes:
         fractions: Target speeds of the proposals, relative to the speed limit.
@@ -50,8 +50,8 @@ class PdmConfig:
         steps: Horizon of the proposals, steps of 0.1 s. Their lines end about 160 m ahead.
         leader_every: Steps between updates of a proposal's leader.
         radius_m: Largest distance of agents to consider.
-        agents: Number of agents to consider, those that come nearest to the route. The publication uses the nearest 50
-            vehicles, 25 pedestrians, 10 cyclists and 50 other objects.
+        agents: Number of agents to consider, those that come nearest to the line of the first offset. The publication
+            uses the nearest 50 vehicles, 25 pedestrians, 10 cyclists and 50 other objects.
         tracking: Tracker and vehicle model.
         scoring: Weights and limits of the score.
         brake: The emergency brake.
@@ -104,8 +104,8 @@ class ScoredProposals:
 class PdmPlanner:
     """Drive the best proposal (of 15 by default), or brake.
 
-    Reads the true situation, not observations. Other agents are predicted at constant velocity; the planner does not
-    read the log's future.
+    Reads the true situation, not observations. Other agents are predicted at constant velocity; the planner reads the
+    log's future only in scenarios without a route on lanes, where it follows the path of the log.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -210,5 +210,6 @@ class PdmPlanner:
         return self.actions if isinstance(self.actions, Trajectory) else None
 
     def _wheelbase(self, length_m: Scalar) -> Scalar:
+        """Return the wheelbase for a length, m; empty slots have length 0 and count as 1 m long."""
         tracking = self._plan_space.controller if self._plan_space else self.config.tracking
         return tracking.wheelbase * jnp.maximum(length_m, 1.0)

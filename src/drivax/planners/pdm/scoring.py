@@ -31,7 +31,7 @@ _BEHIND_COS = -(3.0**0.5) / 2.0
 
 @dataclass(frozen=True)
 class ScoringConfig:
-    """Weights and limits; defaults as published. Comfort has nuPlan's limits (``metrics.comfort``).
+    """Weights and limits; defaults as published, except ``ground_every``. Comfort limits: ``metrics.comfort``.
 
     Attributes:
         progress, ttc, comfort: Weights of the mean.
@@ -133,7 +133,7 @@ def _has_short_ttc(
 ) -> Bool[Array, ""]:  # fmt: skip
     """Return whether some step has a short time to collision with an agent that is not behind ego.
 
-    The first such step decides for each agent. Sources do not mark intersections, so agents next to ego always count.
+    The first such step decides for each agent. Not all sources mark intersections, so agents next to ego always count.
     """
     steps = jnp.arange(motion.shape[0])
     is_short = is_imminent & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]

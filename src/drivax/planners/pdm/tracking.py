@@ -1,8 +1,9 @@
 """Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
 The tracker is that of ``simulator.controller``. The car moves as in the simulator, so the first step of a tracked
-proposal equals the executed one: by ``simulator.dynamics.bicycle``, along the speeds and curvatures of a proposal, or,
-in the action space ``trajectory``, about its rear axle, along speeds and curvatures that are fitted to the plan.
+proposal equals the executed one if the action space can express it: by ``simulator.dynamics.bicycle``, along the speeds
+and curvatures of a proposal, or, in the action space ``trajectory``, about its rear axle, along speeds and curvatures
+that are fitted to the plan.
 """
 
 from __future__ import annotations

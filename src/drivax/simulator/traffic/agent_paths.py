@@ -182,7 +182,7 @@ def _key_steps(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -
 
 
 def _last_key(key: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
-    """Return the last key step at or before each step; the first key step before it."""
+    """Return the last key step at or before each step; for steps before the first one, that one."""
     last = np.maximum.accumulate(np.where(key, np.arange(key.shape[1]), -1), axis=1)
     return np.where(last < 0, np.argmax(key, axis=1)[:, None], last)
 

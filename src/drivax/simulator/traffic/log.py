@@ -90,7 +90,7 @@ def frame_of(
         target = jnp.where(match.any(axis=0), row, len(slots))
     # No other agent is valid before the recording.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
-    # Heights in their own array: measuring changes only them, so XLA computes the rest of the frame once for both.
+    # Heights in their own array: measuring changes only them, so that XLA computes the rest once per step.
     z = agents[:, AgentColumn.Z].at[target].set(driven.z, mode="drop")
     agents = agents.at[target].set(rows, mode="drop")
     is_parked = ((words >> (log_step % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)

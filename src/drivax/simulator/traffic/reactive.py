@@ -187,7 +187,7 @@ def _stop_gap(
     """Return the distance from the front bumper to the nearest stop line that requires a stop, m; 10 km for none.
 
     Red requires a stop of all vehicles that can still stop, yellow of those that can stop comfortably. At red the
-    distance is 0 for a vehicle that stands with its front over the line.
+    distance is 0 for a vehicle that stands with its front, but not its centre, over the line.
     """
     paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
