@@ -23,15 +23,6 @@ def test_the_best_batch_is_the_best_of_all():
     ]  # fmt: skip
 
 
-def test_cores_are_counted_without_affinities(monkeypatch):
-    sizes = {}
-    monkeypatch.delattr(bench.os, "sched_getaffinity", raising=False)
-    monkeypatch.setattr(bench.os, "cpu_count", lambda: 3)
-    monkeypatch.setattr(bench.jax.config, "update", sizes.__setitem__)
-    bench.use_all_cores()
-    assert sizes == {"jax_num_cpu_devices": 3}
-
-
 @pytest.mark.parametrize("name", ["batch", "steps", "repeats"])
 def test_numbers_below_one_are_refused(name):
     with pytest.raises(UsageError, match=f"{name} is 0; use 1 or more"):

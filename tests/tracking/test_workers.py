@@ -17,7 +17,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import CAPACITIES
 from drivax.synthetic import generate
 from drivax.tracking import workers
-from drivax.tracking.workers import one_core_each, worker_pool
+from drivax.tracking.workers import available_cores, one_core_each, worker_pool
 
 PROGRAM = """
 import sys, time
@@ -119,6 +119,13 @@ def test_closed_terminal_ends_a_pool_silently(tmp_path):
     os.killpg(process.pid, signal.SIGHUP)
     assert process.communicate(timeout=60)[1] == "" and process.returncode == 129
     assert group_is_gone(process.pid, 10.0)
+
+
+def test_cores_are_counted_without_affinities(monkeypatch):
+    """As on macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    assert available_cores() == [0, 1, 2]
 
 
 def test_each_task_has_one_core():

@@ -139,7 +139,7 @@ def observation_statistics(
     steps = bank.steps - 1 - CURRENT_STEP
     if not 1 <= every <= steps:
         raise UsageError(f"every {every} steps", cure=f"use 1 to {steps}")
-    if hasattr(planner, "prepare"):
+    if getattr(planner, "prepare", None) is not None:
         problem = f"planner {planner.name} needs stored scenarios"
         raise UsageError(problem, cure="choose another planner")
     traffic = traffic or LogTraffic()

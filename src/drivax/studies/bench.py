@@ -6,7 +6,6 @@ device, which is faster: most operations of a step are too small to divide betwe
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -37,6 +36,7 @@ from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
+from drivax.tracking.workers import available_cores
 
 #: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table.
 METRIC_SETS, BATCHES = ("none", "training", "full"), (32, 128)
@@ -80,10 +80,8 @@ class BenchConfig:
 
 def use_all_cores() -> None:
     """Make every core of this process a JAX device; has no effect once JAX has started."""
-    # macOS has no affinities.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", cores)
+        jax.config.update("jax_num_cpu_devices", len(available_cores()))
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:

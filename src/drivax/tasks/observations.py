@@ -1,8 +1,8 @@
 """Observations: named groups of features with masks, in the ego frame, scaled to about [-1, 1].
 
 Each group is an array with features on its last axis; groups with missing rows have a boolean mask over their rows
-(docs/guide/observations.md). Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (road
-pieces by 10 m); ``tasks.features`` has the units of the optional features.
+(docs/guide/observations.md). Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m
+(road pieces by 10 m); ``tasks.features`` has the units of the optional features.
 """
 
 from __future__ import annotations

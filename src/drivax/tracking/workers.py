@@ -88,6 +88,12 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
         raise UsageError(problem, file="/dev/shm", cure=cure) from error
 
 
+def available_cores() -> list[int]:
+    """Return the cores of this process; all of the machine where a system has no affinities (macOS)."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    return sorted(os.sched_getaffinity(0)) if has_affinity else list(range(os.cpu_count() or 1))
+
+
 def one_core_each(
     call: Callable[[Task], Result], tasks: Sequence[Task], cores: int | None = None
 ) -> Iterator[tuple[Task, Result]]:
@@ -101,7 +107,7 @@ def one_core_each(
     """
     if cores is not None and cores < 1:
         raise UsageError(f"the number of cores is {cores}", cure="use 1 or more")
-    available = sorted(os.sched_getaffinity(0))[:cores]
+    available = available_cores()[:cores]
     with worker_pool(len(available), available) as pool:
         futures = {pool.submit(call, task): task for task in tasks}
         for future in as_completed(futures):
@@ -120,7 +126,7 @@ def _block(number: signal.Signals) -> Iterator[None]:
 
 def _start(core_queue: Any) -> None:
     """Set up a worker process: its core, if there is a queue of cores, its signals, and its end."""
-    if core_queue is not None:
+    if core_queue is not None and hasattr(os, "sched_setaffinity"):
         # JAX starts one thread per core, so restrict the cores first.
         os.sched_setaffinity(0, {core_queue.get()})
     # On Ctrl-C, workers exit at once and silently; the parent cleans up, unless it ignores the signal (cmd &).
