@@ -12,7 +12,7 @@ from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import open_policy, policy_traffic
-from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.planners.planner_traffic import TrafficDriver
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
@@ -55,8 +55,8 @@ def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     assert hash(with_logged) == hash(policy_traffic(run.path, count=2))
     loaded = drivax.load(tmp_path / "set")
     bank = prepare_bank(with_idm, loaded.bank)
-    assert data_of(bank, AgentPaths).kinds and data_of(bank, TrafficPolicy).planner.name == "bold"
-    assert jax.tree.leaves(data_of(bank, TrafficPolicy).planner.parameters)
+    assert data_of(bank, AgentPaths).kinds and data_of(bank, TrafficDriver).planner.name == "bold"
+    assert jax.tree.leaves(data_of(bank, TrafficDriver).planner.parameters)
     results = drivax.evaluate("idm", loaded, traffic=with_logged)
     logged = drivax.evaluate("idm", loaded)
     assert results.summary()["traffic"] == "driven_by_bold"

@@ -25,7 +25,7 @@ from drivax.learning.policies import (
     load_policy,
     policy_traffic,
 )
-from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.planners.planner_traffic import TrafficDriver
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
@@ -210,7 +210,7 @@ def test_shipped_policies_drive_and_have_provenance(name, bank):
         with pytest.raises(UsageError, match="cannot drive others without routes"):
             prepare_bank(among, bank)
     else:
-        assert data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
+        assert data_of(prepare_bank(among, bank), TrafficDriver).planner.name == planner.name
 
 
 @pytest.mark.slow

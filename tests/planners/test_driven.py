@@ -12,7 +12,7 @@ from flax import nnx
 
 from drivax.errors import UsageError
 from drivax.planners.functions import NetworkPlanner
-from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_driver
+from drivax.planners.planner_traffic import PlannerTraffic, TrafficDriver, with_driver
 from drivax.planners.simple import Expert, RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -100,7 +100,7 @@ def test_planners_unfit_for_traffic_are_refused(bank):
         PlannerTraffic(TASK, count=0)
     with pytest.raises(UsageError, match="the base of driven traffic is driven, too; use another base"):
         PlannerTraffic(base=PlannerTraffic())
-    with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
+    with pytest.raises(UsageError, match="the bank has no TrafficDriver; use planners"):
         TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
 
 
@@ -141,7 +141,7 @@ def test_driven_traffic_equals_agents_stepped_together(bank):
         def one(states, _):
             seen = stacked.observe_together(bank, states)
             network = nnx.merge(
-                data_of(bank, TrafficPolicy).planner.graph, data_of(bank, TrafficPolicy).planner.parameters
+                data_of(bank, TrafficDriver).planner.graph, data_of(bank, TrafficDriver).planner.parameters
             )
             act = jax.vmap(lambda groups: network(groups).mode())
             actions = act(seen).at[0].set(ego)

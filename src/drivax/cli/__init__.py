@@ -166,10 +166,12 @@ def _stop_at_signals() -> Iterator[None]:
 class _SignalHandler:
     """Raises :class:`Stopped`, or KeyboardInterrupt at Ctrl-C, when an exception does no harm.
 
-    A signal waits until an import is done, because modules of C++ crash when an exception interrupts their
-    initialisation, until a worker process has its arguments, until a semaphore is created and known to Python's
-    process that removes them, or removed and forgotten there, and until Orbax has closed an event loop; those two would
-    print errors of their own. It waits 10 s at most.
+    A signal waits, 10 s at most, for the end of
+
+    - an import: modules of C++ crash when an exception interrupts their initialisation;
+    - the start of a worker process, which else misses its arguments;
+    - the creation or removal of a semaphore, of which Python's process that removes them else has a wrong list;
+    - the use of an event loop by Orbax, which else reports a loop that is not closed.
     """
 
     def __init__(self, signals: Sequence[signal.Signals]) -> None:

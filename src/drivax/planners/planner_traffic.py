@@ -30,12 +30,12 @@ _MIN_TRAVEL_M = 2.0
 
 
 @record
-class TrafficPolicy(TrafficData):
+class TrafficDriver(TrafficData):
     """The planner that drives agents other than ego."""
 
     planner: Planner
 
-    def part(self, rows: Int[Array, " n"]) -> TrafficPolicy:
+    def part(self, rows: Int[Array, " n"]) -> TrafficDriver:
         """Return the planner: all scenarios share it."""
         return self
 
@@ -82,7 +82,7 @@ class PlannerTraffic:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise UsageError(f"traffic with {self.count} driven vehicles", cure="use count=1 or more")
-        if isinstance(self.base, PlannerTraffic):  # a bank has one TrafficPolicy
+        if isinstance(self.base, PlannerTraffic):  # a bank has one TrafficDriver
             raise UsageError(
                 "the base of driven traffic is driven, too", cure="use another base, such as IdmTraffic()"
             )
@@ -110,7 +110,7 @@ class PlannerTraffic:
         Raises:
             UsageError: The bank has no driver.
         """
-        data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
+        data_of(bank, TrafficDriver, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
         carry = () if self.task.hold == 1 else ((), jnp.zeros_like(contexts.action))
@@ -120,7 +120,7 @@ class PlannerTraffic:
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> PlannerTrafficState:
         """Advance all agents by one step of 0.1 s from the present frame."""
         traffic = context.traffic
-        planner = hold(data_of(bank, TrafficPolicy).planner, self.task.hold)
+        planner = hold(data_of(bank, TrafficDriver).planner, self.task.hold)
 
         def frames(back: int, slots: Int[Array, " K"] | None = None) -> Frame:
             """Return the frame ``back`` steps ago, of all slots or of some."""
@@ -187,4 +187,4 @@ def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
     if not isinstance(driver, Memoryless) or driver.replays:
         cure = "use a trained policy, or a Memoryless planner that does not replay the log"
         raise UsageError(f"planner {driver.name!r} cannot drive others", cure=cure)
-    return with_data(bank, TrafficPolicy(driver))
+    return with_data(bank, TrafficDriver(driver))
