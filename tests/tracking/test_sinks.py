@@ -86,20 +86,24 @@ def test_a_fresh_log_replaces_an_old_one(tmp_path: Path):
     assert [row["x"] for row in read_rows(tmp_path / "metrics.jsonl")] == [2]
 
 
-def test_tensorboard_events(tmp_path: Path):
+@pytest.mark.parametrize(("resume_step", "first"), [(None, 0), (5, 6)])
+def test_tensorboard_events(tmp_path: Path, resume_step, first):
+    """Earlier events are dropped from ``first`` on, also where no step is resumed."""
     pytest.importorskip("tensorboardX")
-    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-    with MetricLog(tmp_path) as log:
+    with MetricLog(tmp_path, resume_step) as log:
         log.write(7, {"train/loss": 0.25})
     (file,) = (tmp_path / "tensorboard").iterdir()
-    data, result = file.read_bytes(), []
+    data, result, starts = file.read_bytes(), [], []
     while data:  # a TFRecord: length, its CRC, the payload, its CRC
         size = int.from_bytes(data[:8], "little")
         event = Event.FromString(data[12 : 12 + size])
+        if event.session_log.status == SessionLog.START:
+            starts.append(event.step)
         result += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
         data = data[16 + size :]
-    assert result == [(7, "train/loss", 0.25)]
+    assert result == [(7, "train/loss", 0.25)] and starts == [first]
 
 
 FAILING_CLOSE = """

@@ -1,7 +1,8 @@
-"""Evaluate planners (``episode_table`` writes ``episodes.csv``), compare evaluations, and audit scenarios.
+"""Evaluate planners, compare evaluations, and audit scenarios.
 
-``comparison`` runs the tests; ``plan`` decides on significance (``MetricComparison.with_winner``), then ``decide``
-recommends a planner.
+``runner`` evaluates, and ``episode_table`` writes ``episodes.csv``, ``summary.json`` and trajectories. ``comparison``
+runs the tests; ``plan`` decides on significance (``MetricComparison.with_winner``), then ``decide`` recommends a
+planner.
 """
 
 import lazy_loader

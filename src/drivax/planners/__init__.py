@@ -1,4 +1,7 @@
-"""Planners with one interface: expert, rule-based, network, and functions of the user."""
+"""Planners with one interface: expert, rule-based, network, and functions of the user.
+
+``catalogue.PLANNERS`` has the built-in ones by name. :mod:`drivax.learning.policies` loads trained policies.
+"""
 
 import lazy_loader
 

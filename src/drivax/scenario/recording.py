@@ -418,7 +418,8 @@ def _check_extent(recording: Recording) -> Finding:
     ego, row = _ego_position(recording), recording.ego
     lost = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
     if len(lost):
-        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s at step {lost[0]}", _UNITS
+        steps = f"between steps {lost[0]} and {lost[-1]}" if len(lost) > 1 else f"at step {lost[0]}"
+        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s {steps}", _UNITS
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
     if stops and np.nanmax(np.abs(np.array(stops) - ego), initial=0.0) > EXTENT_M:
         return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS

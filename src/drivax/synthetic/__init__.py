@@ -1,4 +1,8 @@
-"""The built-in traffic world: procedural roads, traffic and events."""
+"""The built-in traffic world: procedural roads, traffic and events.
+
+``world`` draws a scenario, of roads and drivers of one of the ``domains``; ``generate`` writes sets, and has the splits
+of the benchmark.
+"""
 
 import lazy_loader
 

@@ -1,6 +1,8 @@
 """Driving tasks: action spaces, observations, rewards and termination.
 
-``observations`` scales features by constants; ``drivax.networks.encoders`` normalises them by statistics.
+``actions`` has the action spaces with their bounds and actuator rates, ``rewards`` the terms. ``features`` names the
+columns of observation groups; ``observations`` fills them and scales them by constants, ``drivax.networks.encoders``
+normalises them by statistics.
 """
 
 import lazy_loader

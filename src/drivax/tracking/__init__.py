@@ -1,4 +1,8 @@
-"""Run folders, checkpoints, metric logs, progress and worker processes."""
+"""Run folders, checkpoints, metric logs, progress and worker processes.
+
+``run_folder`` writes ``run.json`` and ``config.yaml``, ``sinks`` writes ``metrics.jsonl``; :mod:`drivax.files` replaces
+outputs, and :mod:`drivax.seal` finds edits.
+"""
 
 import lazy_loader
 

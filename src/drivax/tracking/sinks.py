@@ -71,10 +71,10 @@ class TensorBoard:
         self._event = event_pb2.Event
         self._file = EventsWriter(str(folder / "events"))
         self._next_flush = 0.0
-        if resume_step is not None:
-            start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
-            now = time.time()
-            self._file.write_event(self._event(wall_time=now, step=resume_step + 1, session_log=start))
+        # TensorBoard drops the events of earlier processes from this step on.
+        first = 0 if resume_step is None else resume_step + 1
+        start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+        self._file.write_event(self._event(wall_time=time.time(), step=first, session_log=start))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Add a scalar for each value."""
