@@ -123,7 +123,7 @@ class Driving:
     def _reset(self, data: ScenarioBank, key: Array, count: int) -> tuple[SimState, Bool[Array, " B"]]:
         """Return states at random steps of their logs, none of them over."""
         start = self._draw(data, key, count, self.earliest_start)
-        return jax.vmap(_of_agent(self.simulator.reset, data))(*start), jnp.zeros(count, bool)
+        return jax.vmap(_bind_bank(self.simulator.reset, data))(*start), jnp.zeros(count, bool)
 
     def stored(self, state: SimState) -> AgentContext:
         """Return the context: index, step, history, and reactive traffic."""
@@ -179,7 +179,7 @@ class Driving:
         """Take the first step of a decision, or start a new episode where the last one is over."""
         start = self._draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
         step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
-        fresh = map_where(now.over, _of_agent(self.simulator.new_episode, data), *start)
+        fresh = map_where(now.over, _bind_bank(self.simulator.new_episode, data), *start)
         return step_all(data, now.state, action, now.over, fresh, cache)
 
     def _step_on(
@@ -209,7 +209,7 @@ class Driving:
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
         *index, _ = self._draw(data, key, count, CURRENT_STEP)
-        return jax.vmap(_of_agent(demonstrate, data))(*index)
+        return jax.vmap(_bind_bank(demonstrate, data))(*index)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
@@ -312,7 +312,7 @@ def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
     return jax.vmap(lambda mask, old, new: jax.tree.map(partial(jnp.where, mask), old, new))(mask, old, new)
 
 
-def _of_agent(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:
+def _bind_bank(function: Callable[..., Any], bank: ScenarioBank) -> Callable[..., Any]:
     """Return ``function`` with its first argument bound to the bank; a slot of None becomes 0."""
 
     def call(index: Array, step: Array, slot: Any, *rest: Array) -> Any:

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: report, comparison, contents of sets, viewer."""
+"""Self-contained HTML pages: ``report`` of runs, ``comparison``, ``inspection`` and player (``viewer``) of sets."""
 
 import lazy_loader
 

@@ -1,4 +1,7 @@
-"""Tags, selections and splits of scenario sets."""
+"""Tags, selections and splits of scenario sets.
+
+``tags`` computes the tags of a scenario, ``selection`` filters a set by them, and ``splits`` divides it by recording.
+"""
 
 import lazy_loader
 

@@ -52,6 +52,7 @@ def draw_braking(
 ) -> tuple[float, float] | None:
     """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
 
+    The deceleration is that of a leader which stops first; one that is close and slow requires more than the severity.
     Return None if that range hardly overlaps ``SEVERITY_MPS2``, or the leader would have to stop at once.
     """
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
