@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import types
 from multiprocessing import resource_tracker, synchronize
@@ -305,6 +306,19 @@ def test_two_signals_in_an_import_wake_the_main_thread(tmp_path, monkeypatch):
         importlib.import_module("both")
         time.sleep(20)
     assert time.monotonic() - started < 10
+
+
+def test_two_signals_at_once_leave_none_ignored():
+    """The second one must not interrupt the removal of the handlers."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    previous = [signal.getsignal(number) for number in numbers]
+    with pytest.raises(KeyboardInterrupt), cli._stop_at_signals():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+        for number in numbers:
+            signal.pthread_kill(threading.get_ident(), number)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        time.sleep(5)
+    assert [signal.getsignal(number) for number in numbers] == previous
 
 
 def test_interrupt_at_exit_prints_no_traceback():

@@ -166,7 +166,7 @@ def test_usable_steps_are_the_drawn_steps(data):
     with pytest.raises(UsageError, match="PpoConfig does not draw logged steps by weight"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
     with pytest.raises(
-        UsageError, match=r"BcSacConfig does not draw logged steps by weight; .* sac with demons"
+        UsageError, match=r"BcSacConfig does not draw logged steps by weight; .* or bc_sac with demons"
     ):
         usable_steps(replace(config, algorithm=BcSacConfig()), data)
 

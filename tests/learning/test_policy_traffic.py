@@ -8,7 +8,7 @@ import pytest
 
 import drivax
 from drivax import settings
-from drivax.errors import DataError, UsageError
+from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import open_policy, policy_traffic
@@ -41,7 +41,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 def test_a_run_of_seeds_that_was_killed_at_its_start_is_refused(tmp_path):
     RunFolder.create(tmp_path / "run", TrainConfig(), kind="seeds", seeds=2)
-    with pytest.raises(UsageError, match="contains 0 seeds; continue the training with --resume"):
+    with pytest.raises(DataError, match=r"no folder seed-N .*; continue the training with --resume"):
         open_policy(tmp_path / "run")
 
 

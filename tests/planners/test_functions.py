@@ -108,7 +108,8 @@ def test_invalid_actions_are_reported(bank, moments):
     def none(situation, observation):
         pass
 
-    for planner, words in ((three, "[3] is not an action; give 2 numbers"), (none, "[] is not an action")):
+    messages = "returned 3 numbers; return 2", "returned nothing; return 2 numbers"
+    for planner, words in zip((three, none), messages, strict=True):
         with collect_errors() as errors:
             assert np.isnan(actions(planner, bank, moments)).all()
         assert len({who for who, _ in errors}) == 2

@@ -18,7 +18,7 @@ import textwrap
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib import metadata
@@ -147,8 +147,8 @@ class Stopped(KeyboardInterrupt):
 def _stop_at_signals() -> Iterator[None]:
     """Raise Stopped at SIGTERM or SIGHUP, and KeyboardInterrupt at Ctrl-C, so that partial output is removed.
 
-    After the first, SIGTERM and SIGHUP are ignored. A signal that the process ignores already (nohup) stays ignored.
-    Python handles signals in its main thread only.
+    After the first of the three, SIGTERM and SIGHUP are ignored. A signal that the process ignores already (nohup)
+    stays ignored. Python handles signals in its main thread only.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     signals = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT) if in_main_thread else ()
@@ -158,9 +158,13 @@ def _stop_at_signals() -> Iterator[None]:
         stop.install()
         yield
     finally:
-        stop.remove()
-        for number in stop.signals:
-            signal.signal(number, previous[number])
+        removed = False
+        while not removed:  # a further Ctrl-C may interrupt it
+            try:
+                stop.remove(previous)
+                removed = True
+            except KeyboardInterrupt:
+                continue
 
 
 class _SignalHandler:
@@ -186,12 +190,14 @@ class _SignalHandler:
         for number in self.signals:
             signal.signal(number, self)
 
-    def remove(self) -> None:
-        """Send no signal again."""
+    def remove(self, previous: Mapping[signal.Signals, Any]) -> None:
+        """Send no signal again, and restore the handlers of before."""
         for timer in self._timers.values():
             timer.cancel()
         if sys.unraisablehook == self._raise_again:
             sys.unraisablehook = self._report_unraisable
+        for number in self.signals:
+            signal.signal(number, previous[number])
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal in the main thread, which executes ``frame``."""
@@ -201,10 +207,13 @@ class _SignalHandler:
             # Ever later, because on a busy machine a signal every 10 ms takes all of the time.
             self._send_later(number, max(_RESEND_S, waited_s / 2))
             return
+        # Another exception would interrupt the removal of partial output, or of this handler.
+        for other in {signal.SIGTERM, signal.SIGHUP}.intersection(self.signals):
+            signal.signal(
+                other, lambda *_: None
+            )  # SIG_IGN would be printed for a signal that has come already
         if number == signal.SIGINT:
             raise KeyboardInterrupt
-        for other in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(other, signal.SIG_IGN)
         raise Stopped(signal.Signals(number))
 
     def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:

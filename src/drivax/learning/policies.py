@@ -39,14 +39,12 @@ def open_policy(run: str | Path) -> RunFolder:
 
     Raises:
         UsageError: The folder contains several seeds, or the zoo has no such policy.
-        DataError: It is not a run folder.
+        DataError: It is not a run folder, or of several seeds and without any.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        # A process that was killed at its start may not have created any.
-        cure = f"name one, as {inside[0]}" if inside else "continue the training with --resume"
-        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=cure)
+        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
     return folder
 
 

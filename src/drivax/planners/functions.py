@@ -150,9 +150,12 @@ def _call_batch(
     for index in np.ndindex(identity.shape):
         try:
             scenario_arguments = jax.tree.map(lambda leaf, index=index: leaf[index], arguments)
-            action = np.asarray(function(*scenario_arguments), np.float32)
+            result = function(*scenario_arguments)
+            if result is None:
+                raise ValueError(f"the function returned nothing; return {size} numbers")
+            action = np.asarray(result, np.float32)
             if action.size != size:
-                raise ValueError(f"{list(action.shape)} is not an action; give {size} numbers")
+                raise ValueError(f"the function returned {action.size} numbers; return {size}")
             actions[index] = action.ravel()
         except Exception as error:
             if not _collectors:

@@ -1,4 +1,7 @@
-"""Statistics of episodes in clusters: intervals, significance tests, effect sizes, seeds and rankings."""
+"""Statistics of episodes in clusters: intervals, significance tests, effect sizes, seeds and rankings.
+
+``intervals`` resamples clusters (recordings, labelled by ``clusters``), and ``significance`` tests differences.
+"""
 
 import lazy_loader
 

@@ -208,7 +208,7 @@ def _check_info(info: Any) -> None:
             raise ValueError("a recording that is not named by its data set and its segment")
     if divergence is not None and [type(divergence[name]) for name in ("step", "problem")] != [int, str]:
         raise ValueError("a divergence without its step or problem")
-    if not 1 <= info.get("seeds", 1) <= _MOST_SEEDS:
+    if info.get("seeds") is not None and not 1 <= info["seeds"] <= _MOST_SEEDS:
         raise ValueError(f"{info['seeds']} seeds")
 
 
@@ -240,7 +240,9 @@ def seed_folders(path: str | Path) -> list[Path]:
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
     seeds = {f: int(match[1]) for f in folders if (match := re.fullmatch(r"seed-(-?\d+)", f.name))}
     if not seeds:
-        raise DataError("no folder seed-N in a run of several seeds", file=path, cure="train again")
+        # As a training that was killed at its start leaves it.
+        cure = "continue the training with --resume"
+        raise DataError("no folder seed-N in a run of several seeds", file=path, cure=cure)
     return sorted(seeds, key=seeds.__getitem__)
 
 

@@ -221,7 +221,10 @@ def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _
 
 
 def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[ScriptedUser, ...]) -> bool:
-    """Whether a parked car is in the lane up to 30 m ahead of a position or up to 14 m behind it."""
+    """Whether a parked car is in a straight strip, a vehicle wide, from 14 m behind a position to 30 m ahead.
+
+    Bends are ignored: cars in bays on their outside may count, and cars in the lane further ahead may not.
+    """
     curve = network.lanes[lane].curve
     index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[index]), np.sin(curve.heading[index])
@@ -234,20 +237,23 @@ def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scr
 
 
 def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles that are too close behind the first vehicle of the next lane."""
+    """Drop vehicles too close to the next one across a lane's end: behind the first of that lane, or ahead of ego."""
     remaining = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}
     for lane, along in [*vehicles, ego]:
         first[lane], last[lane] = min(along, first.get(lane, np.inf)), max(along, last.get(lane, 0.0))
+    ego_lane, ego_along_m = ego
+    ego_to_end_m = network.lanes[ego_lane].length_m - ego_along_m
     for lane, along in vehicles:
         current = network.lanes[lane]
         minimum = _least_spacing_m(current)
+        # Only the last vehicle of a lane can be too close to the first one of the next lane.
         next_along = min((first.get(b, np.inf) for b in current.successors), default=np.inf)
-        # Only the last vehicle of a lane can be too close to the first one of the next lane. Ego always stays.
-        along_before_ego = network.lanes[ego[0]].length_m - ego[1] + along
-        gap_to_ego = along_before_ego if ego[0] in current.predecessors else np.inf
-        if (along < last[lane] or current.length_m - along + next_along > minimum) and gap_to_ego > minimum:
+        is_too_close = along >= last[lane] and current.length_m - along + next_along <= minimum
+        # Ego always stays: the vehicle ahead of it is dropped instead.
+        is_too_close |= ego_lane in current.predecessors and ego_to_end_m + along <= minimum
+        if not is_too_close:
             remaining.append((lane, along))
     return remaining
 
