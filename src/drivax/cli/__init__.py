@@ -207,11 +207,10 @@ class _SignalHandler:
             # Ever later, because on a busy machine a signal every 10 ms takes all of the time.
             self._send_later(number, max(_RESEND_S, waited_s / 2))
             return
-        # Another exception would interrupt the removal of partial output, or of this handler.
+        # Another exception would interrupt the removal of partial output, or of this handler. With SIG_IGN, Python
+        # reports signals that have come already.
         for other in {signal.SIGTERM, signal.SIGHUP}.intersection(self.signals):
-            signal.signal(
-                other, lambda *_: None
-            )  # SIG_IGN would be printed for a signal that has come already
+            signal.signal(other, lambda *_: None)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise Stopped(signal.Signals(number))
