@@ -2,10 +2,11 @@
 
     python -m experiments.robustness kills --moments 200 [--seed 0] [--only NAME ...] [--write]
     python -m experiments.robustness soak --minutes 60 [--seed 0] [--only NAME ...] [--write]
+    python -m experiments.robustness page
 
 ``kills`` stops one command at each moment; ``soak`` runs all commands in turn, again and again, most of them after one
 or two faults. Both begin with two undisturbed runs of all commands, whose output is the reference. ``--write`` stores
-the summary in ``experiments/results``.
+the summary in ``experiments/results``; ``page`` puts what is stored there into ``docs/results/robustness.md``.
 
 The work folder is a small tmpfs in a user namespace (``unshare``, no privileges), so that it can be filled; a system
 without user namespaces skips the fault ``full``. Half of the moments are uniform in the run, half after the first file
@@ -37,12 +38,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.repository import RESULTS, ROOT
+from experiments.repository import DOCS, RESULTS, ROOT
 
+PAGE = DOCS / "results" / "robustness.md"
+BEGIN, END = "<!-- robustness.py: begin -->", "<!-- robustness.py: end -->"
 PROGRAM = (sys.executable, "-m", "drivax")
 #: Exit statuses by fault; a negative one is a signal that the command does not handle, or not yet.
 STATUSES = {
     "kill": (-9,), "worker": (1,), "term": (143, -15), "int": (130, -2), "hup": (129, -1), "full": (1,),
+}  # fmt: skip
+#: The faults in tables.
+FAULTS = {
+    "kill": "SIGKILL", "worker": "SIGKILL of a worker process", "term": "SIGTERM", "int": "Ctrl-C",
+    "hup": "closed terminal (SIGHUP)", "full": "full disk",
 }  # fmt: skip
 #: Values that differ between equal runs, by file name: times, speeds, command lines, the state of the
 #: repository, random file names.
@@ -506,11 +514,40 @@ def _summary(bench: Bench, args: argparse.Namespace, counts: dict[str, Any]) -> 
     }
 
 
+def table(kills: dict[str, Any], soak: dict[str, Any]) -> str:
+    """Return the outcomes of each fault as a Markdown table, and two sentences about the soak."""
+    lines = [
+        "| fault | single commands: stopped | ended before | soak: stopped | ended before |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for fault, words in FAULTS.items():
+        cells = [
+            sum(outcomes.get(fault, {}).get(outcome, 0) for outcomes in result["runs"].values())
+            for result in (kills, soak)
+            for outcome in ("stopped", "finished")
+        ]
+        lines.append(f"| {words} | {' | '.join(map(str, cells))} |")
+    equal = "equals" if soak["digest"] == soak["undisturbed"] else "differs from"
+    return "\n".join([
+        *lines, "",
+        f"Problems: {len(kills['problems'])} in {kills['moments']} moments, {len(soak['problems'])} in the soak of "
+        f"{soak['minutes']:.0f} minutes ({soak['cycles']} cycles through all commands). The digest of its last cycle "
+        f"{equal} that of the undisturbed runs.",
+    ])  # fmt: skip
+
+
+def _write_page() -> None:
+    """Put the stored results into the page."""
+    results = (json.loads((RESULTS / f"{name}.json").read_text()) for name in ("kills", "soak"))
+    before, rest = PAGE.read_text().split(BEGIN)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{table(*results)}\n\n{END}{rest.split(END)[1]}")
+
+
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("mode", choices=("kills", "soak"))
+    parser.add_argument("mode", choices=("kills", "soak", "page"))
     parser.add_argument("--moments", type=int, default=200)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -538,6 +575,9 @@ def main() -> int:
     # A job in the background ignores Ctrl-C, one of nohup SIGHUP, and so would the commands.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    if args.mode == "page":
+        _write_page()
+        return 0
     if args.disk is None:
         return _call_on_disk()
     last = max(list(COMMANDS).index(name) for name in args.only)

@@ -286,3 +286,10 @@ def test_speed_page_shows_ratios_against_the_earlier_state(script, stored):
     for kernels, (begin, end) in ratios.MARKERS.items():
         table = ratios.table(stored("speed_ratios")["kernel_rows" if kernels else "rows"], kernels)
         assert f"{begin}\n\n{table}\n\n{end}" in ratios.PAGE.read_text()
+
+
+def test_robustness_page_shows_stored_outcomes(script, stored):
+    robustness = script("robustness")
+    table = robustness.table(stored("kills"), stored("soak"))
+    shown = f"{robustness.BEGIN}\n\n{table}\n\n{robustness.END}" in robustness.PAGE.read_text()
+    assert shown, "run python -m experiments.robustness page"
