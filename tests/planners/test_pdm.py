@@ -361,12 +361,12 @@ def test_emergency_brake_holds_the_curvature_in_the_space_route():
     """0.5 m left of the route, straight ahead is an offset of 0.5 m: no left turn into the car alongside."""
     simulator = Simulator(replace(TASK, actions=ROUTE))
     run = jax.jit(partial(first_action, EmergencyBrake(ConstantVelocity(ROUTE), ROUTE), simulator))
-    near, beside = (
+    blocked, free = (
         np.asarray(run(bank_of(straight_road([car(0, 0.5, 0, 4), other]))))
         for other in (car(10.8, 0.5, 0, 0), car(10.0, 3.0, 0, 0))
     )
-    np.testing.assert_allclose(near * [6.0, 3.5], [-4.05, 0.5], atol=1e-3)
-    np.testing.assert_allclose(beside * [6.0, 3.5], [0.0, 0.5], atol=1e-3)
+    np.testing.assert_allclose(blocked * [6.0, 3.5], [-4.05, 0.5], atol=1e-3)
+    np.testing.assert_allclose(free * [6.0, 3.5], [0.0, 0.5], atol=1e-3)
 
 
 def test_emergency_brake_forecasts_along_planned_poses():

@@ -99,9 +99,9 @@ def test_no_start_collides_or_is_off_the_road():
 
 
 def test_episode_starts_as_logged_when_every_draw_fails():
-    # Ego is 0.5 m behind a car and 0.1 m beside a column of cars.
-    beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
-    bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
+    # Ego is 0.5 m behind a car, and 0.1 m to the right of a column of cars.
+    column = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
+    bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *column]))
     strong = Simulator(Task(), start=NoisyStart(strong=1.0))
     logged = Simulator(Task()).context(bank, 0, 10)
     drawn = jax.jit(jax.vmap(lambda key: strong.context(bank, 0, 10, 0, key)))(keys(16))

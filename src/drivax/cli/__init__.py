@@ -158,11 +158,10 @@ def _stop_at_signals() -> Iterator[None]:
         stop.install()
         yield
     finally:
-        removed = False
-        while not removed:  # a further Ctrl-C may interrupt it
+        while True:  # a further Ctrl-C may interrupt it
             try:
                 stop.remove(previous)
-                removed = True
+                break
             except KeyboardInterrupt:
                 continue
 

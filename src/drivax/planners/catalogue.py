@@ -52,9 +52,10 @@ def _with_actions(planner: Any, actions: ActionSpace) -> Any:
 
 def default_task(planner: Planner) -> Task:
     """Return the default task, with the action space of the planner, or of a planner that it wraps."""
-    while not hasattr(planner, "actions") and isinstance(getattr(planner, "planner", None), Planner):
-        planner = planner.planner  # type: ignore[attr-defined]
-    return Task(actions=getattr(planner, "actions", Task().actions))
+    inner: Any = planner
+    while not hasattr(inner, "actions") and isinstance(getattr(inner, "planner", None), Planner):
+        inner = inner.planner
+    return Task(actions=getattr(inner, "actions", Task().actions))
 
 
 def as_planner(candidate: Any, name: str) -> Planner:
