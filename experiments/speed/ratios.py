@@ -4,7 +4,8 @@
     python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
     python -m experiments.speed.ratios --data SET --kernels [--only NAME ...] [--write]
 
-With ``--kernels``, this tree is timed without native kernels against itself with them.
+With ``--kernels``, this tree is timed without native kernels against itself with them; with ``--against``, both trees
+run without. Both sides train the presets of the first.
 
 SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
 tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first runs of each, which
@@ -59,7 +60,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.program import Program, Seeds
 from drivax.simulator.traffic.log import LogTraffic
 def trainer(preset, *overrides):
-    config = settings.load(TrainConfig, preset, list(overrides))
+    config = settings.load(TrainConfig, f"{PRESETS}/{preset}.yaml", list(overrides))
     bank = ScenarioBank.from_scenarios(first(1024))
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     program = Program(Seeds(learner, (0,)), bank, config.devices)
@@ -212,8 +213,9 @@ def environment(side: Side, cache: str) -> dict[str, str]:
 class Worker:
     """A process of one side that runs a program again and again."""
 
-    def __init__(self, side: Side, program: str, data: Path, cache: str) -> None:
-        command = [sys.executable, "-c", f"DATA = {str(data)!r}\n{program}\n{_LOOP}"]
+    def __init__(self, side: Side, program: str, data: Path, presets: Path, cache: str) -> None:
+        constants = f"DATA, PRESETS = {str(data)!r}, {str(presets)!r}"
+        command = [sys.executable, "-c", f"{constants}\n{program}\n{_LOOP}"]
         self._process = subprocess.Popen(
             command,
             env=environment(side, cache),
@@ -246,7 +248,10 @@ class Worker:
 def repeated(measurement: Repeated, sides: Sequence[Side], data: Path, repeats: int) -> dict[str, Any]:
     """Return work per second of both sides, by turns; medians."""
     with tempfile.TemporaryDirectory() as cache:
-        workers = [Worker(side, measurement.program, data, f"{cache}/{k}") for k, side in enumerate(sides)]
+        presets = sides[0].tree / "configs"
+        workers = [
+            Worker(side, measurement.program, data, presets, f"{cache}/{k}") for k, side in enumerate(sides)
+        ]
         for worker in workers:
             for _ in range(measurement.warm_up):
                 worker.run()
@@ -390,7 +395,7 @@ def main() -> None:
         if args.kernels:
             sides = Side(ROOT, {"DRIVAX_NATIVE": "0"}), Side(ROOT)
         else:
-            sides = Side(args.against.resolve()), Side(ROOT)
+            sides = Side(args.against.resolve()), Side(ROOT, {"DRIVAX_NATIVE": "0"})
         names = args.only or [name for name, row in MEASUREMENTS.items() if _has_goal(row, args.kernels)]
         rows = measure(names, sides, args.data.resolve(), args.repeats)
         if args.write:

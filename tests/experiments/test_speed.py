@@ -45,7 +45,8 @@ def test_ratio_of_two_trees_is_that_of_their_work(ratios, tmp_path):
 
 def test_failed_program_is_an_error(ratios, tmp_path):
     with pytest.raises(SystemExit, match="failed"):
-        ratios.Worker(ratios.Side(tmp_path), "def call(): raise ValueError", tmp_path, str(tmp_path)).run()
+        side = ratios.Side(tmp_path)
+        ratios.Worker(side, "def call(): raise ValueError", tmp_path, tmp_path, str(tmp_path)).run()
 
 
 def test_rows_show_their_conditions(ratios):
