@@ -300,6 +300,11 @@ def test_yaml_aliases_are_values():
     assert parse_yaml("a: &x [1, 2]\nb: [*x, *x]") == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
 
 
+def test_records_and_cures_of_messages_are_cut():
+    error = DataError("damaged", file="a", record="r" * 10**6, cure="c" * 10**6)
+    assert len(str(error)) < 2000 and len(error.args[0]) < 1000
+
+
 def test_messages_keep_the_ends_of_long_values():
     line = str(DataError(f"{'x' * 10**6} is not a number", file="a", cure="again"))
     assert len(line) < 1000 and line.startswith("a: xxx") and line.endswith("xxx is not a number; again")

@@ -48,8 +48,8 @@ FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash
 _RERUN = "run drivax evaluate again"
 #: Largest table: bytes per row (most rows have 300), and in all.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
-#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one have 80 million. Each
-#: distinct text counts as so many more.
+#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one have 80 million. A
+#: distinct text counts as the second number of cells.
 _MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
 #: Largest trajectories: bytes in addition to the episodes, and bytes per episode (more than any capacity takes).
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
