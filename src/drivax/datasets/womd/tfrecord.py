@@ -150,8 +150,8 @@ def _read_record(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> b
         problem = f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {remaining} left"
         raise _FramingError(problem)
     if length > _LONGEST_BYTES:
-        size, most = map(format_bytes, (length, _LONGEST_BYTES))
-        raise _FramingError(f"the record has {size}, more than the {most} that are read")
+        problem = f"{format_bytes(length)}, more than the {format_bytes(_LONGEST_BYTES)} that are read"
+        raise _FramingError(f"the record has {problem}")
     payload = file.read(length)
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:
