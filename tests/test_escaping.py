@@ -20,6 +20,10 @@ from drivax.tracking.progress import Progress
 HOSTILE = '=HYPERLINK("http://x")\x1b]0;owned\x07\x1b[2J\u202e<script>alert(1)</script>'
 
 
+def rows_of(text: str) -> list[list[str]]:
+    return list(csv_rows(io.StringIO(text, newline="")))
+
+
 @pytest.mark.parametrize(
     "text", ["=1+1", "+cmd|' /C calc'!A0", "-1+1", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "'=1", "''@x"]
 )
@@ -27,7 +31,7 @@ def test_formulas_become_text_and_are_read_back(text):
     written = csv_text([[text, "0.5"]])
     (cells,) = csv.reader(io.StringIO(written, newline=""))
     assert cells == [f"'{text}", "0.5"]
-    assert csv_rows(written) == [[text, "0.5"]]
+    assert rows_of(written) == [[text, "0.5"]]
 
 
 @pytest.mark.parametrize(
@@ -37,7 +41,7 @@ def test_numbers_and_other_text_are_written_as_before(text):
     expected = io.StringIO()
     csv.writer(expected, lineterminator="\n").writerow(["x", text])
     assert csv_text([["x", text]]) == expected.getvalue()
-    assert csv_rows(csv_text([["x", text]])) == [["x", text]]
+    assert rows_of(csv_text([["x", text]])) == [["x", text]]
 
 
 def test_any_cells_are_read_back_and_none_begins_a_formula():
@@ -47,7 +51,7 @@ def test_any_cells_are_read_back_and_none_begins_a_formula():
         for _ in range(2000)
     ]
     rows = [["key", *row] for row in rows]
-    assert csv_rows(csv_text(rows)) == rows
+    assert rows_of(csv_text(rows)) == rows
     for row in csv.reader(io.StringIO(csv_text(rows), newline="")):
         for cell in row:
             if cell[:1] in tuple("=+-@\t\r\n"):
@@ -89,4 +93,4 @@ def test_pages_and_tables_escape_names():
     )  # fmt: skip
     for html in (table.html(), data_element({"name": HOSTILE}), facts_html([HOSTILE], [(HOSTILE, [])])):
         assert "<script>alert" not in html and 'title="" onload' not in html
-    assert csv_rows(table.csv())[1][0] == HOSTILE and "\n\"'=HYPERLINK" in table.csv()
+    assert rows_of(table.csv())[1][0] == HOSTILE and "\n\"'=HYPERLINK" in table.csv()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -10,7 +11,9 @@ import tokenize
 import tracemalloc
 import zipfile
 import zlib
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -18,8 +21,18 @@ import pytest
 from drivax import reading
 from drivax.datasets.nuscenes.map import city
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.episode_table import _read_columns
-from drivax.reading import explain_damage, parse_array, read_arrays, read_bytes, read_json, read_text
+from drivax.evaluation import episode_table
+from drivax.evaluation.episode_table import KEYS, _read_columns
+from drivax.reading import (
+    explain_damage,
+    parse_array,
+    read_arrays,
+    read_bytes,
+    read_csv,
+    read_json,
+    read_lines,
+    read_text,
+)
 from drivax.settings import parse_yaml
 from drivax.tracking.sinks import read_rows
 
@@ -185,6 +198,80 @@ def test_threads_parse_headers_in_turn(monkeypatch):
     assert inside == [True] * 20 and all(array.tolist() == [0, 1, 2] for array in arrays)
 
 
+@contextlib.contextmanager
+def memory_below(most: int) -> Iterator[None]:
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a" * (4 << 20), "a row of more than 1,048,576 characters"),
+        ("ab," * (2 << 20), "a row of more than 1,048,576 characters"),
+        ('"a\n",' * (1 << 20), "a row of more than 1,048,576 characters"),
+        ("a" * 200_000, "field larger than field limit"),
+        ("a\n" * 200_000, None),
+    ],
+)
+def test_table_takes_the_memory_of_one_row(tmp_path, text, words):
+    """As lists of texts these have 12 to 100 MB."""
+    file = tmp_path / "a.csv"
+    file.write_text(text)
+    refused = nullcontext() if words is None else pytest.raises(DataError, match=words)
+    with memory_below(12 << 20), refused:
+        assert sum(1 for _ in read_csv(file, "again")) == 200_000
+
+
+def test_log_takes_the_memory_of_one_line(tmp_path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"step":0}\n' * 30_000 + '{"st')
+    with memory_below(1 << 20):
+        assert sum(1 for _ in read_rows(file)) == 30_000
+    file.write_text("a" * (2 << 20))
+    with memory_below(8 << 20), pytest.raises(DataError, match="more than 1,048,576 characters"):
+        list(read_lines(file, "again"))
+
+
+@pytest.mark.parametrize("value", ["[0],", '{"a":0},', "0,"])
+def test_json_of_too_many_values_is_refused_before_it_is_parsed(tmp_path, value):
+    """Lists of one value take 30 times the memory of their text."""
+    file = tmp_path / "a.json"
+    file.write_text(f"[{value * (5 << 20)}0]")
+    with (
+        memory_below(file.stat().st_size + (1 << 20)),
+        pytest.raises(
+            DataError, match=r"is not valid JSON \([\d,]+ values, more than the 4,194,304"
+        ) as caught,
+    ):
+        read_json(file, "again")
+    assert caught.value.file == file and caught.value.cure == "again"
+
+
+def test_table_of_episodes_is_read_in_the_memory_of_its_numbers(tmp_path):
+    file = tmp_path / "episodes.csv"
+    header, row = ",".join((*KEYS, *"abcdefgh")), "p,d,scenario-{},s,0,log,1,,0.5,1,1,1,1,1"
+    file.write_text("\n".join([header, *(row.format(number) for number in range(10_000))]))
+    with memory_below(4 << 20):  # as rows of text: 12 MB
+        keys, metrics = _read_columns(file, 10_000)
+    assert keys["scenario_id"][9_999] == "scenario-9999" and len(keys["planner"]) == 10_000
+    assert metrics["c"].tolist() == [0.5] * 10_000 and np.isnan(metrics["b"]).all()
+
+
+def test_table_of_too_many_cells_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(episode_table, "_MOST_CELLS", 1000)
+    file = tmp_path / "episodes.csv"
+    file.write_text(
+        "\n".join([",".join((*KEYS, "a")), *(f"p,d,{number},s,0,log,1" for number in range(100))])
+    )
+    with pytest.raises(DataError, match="record 42: the table has too many cells"):
+        _read_columns(file, 100)
+
+
 LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n"
     for before, name in zip("abcdefgh", "bcdefghi", strict=True)
@@ -211,6 +298,11 @@ def test_yaml_is_bounded(text, words):
 
 def test_yaml_aliases_are_values():
     assert parse_yaml("a: &x [1, 2]\nb: [*x, *x]") == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
+
+
+def test_records_and_cures_of_messages_are_cut():
+    error = DataError("damaged", file="a", record="r" * 10**6, cure="c" * 10**6)
+    assert len(str(error)) < 2000 and len(error.args[0]) < 1000
 
 
 def test_messages_keep_the_ends_of_long_values():

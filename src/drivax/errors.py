@@ -18,7 +18,8 @@ _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
 }  # fmt: skip
-#: Characters of the longest problem that is kept in full; of others, which quote a value, only the ends.
+#: Characters of the longest problem, record and cure that are kept in full; of others, which quote a value, only the
+#: ends.
 _LONGEST = 1000
 #: Cure of a full disk.
 MAKE_ROOM = "make room, or choose another disk"
@@ -67,11 +68,11 @@ class DrivaxError(Exception):
         record: int | str | None = None,
         cure: str | None = None,
     ) -> None:
-        self.problem = problem if len(problem) <= _LONGEST else f"{problem[:700]} ... {problem[-200:]}"
+        self.problem = _shorten(problem)
         self.file = None if file is None else Path(file)
-        self.record = record
-        self.cure = cure
-        super().__init__(problem)
+        self.record = _shorten(record) if isinstance(record, str) else record
+        self.cure = None if cure is None else _shorten(cure)
+        super().__init__(self.problem)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Worker processes send errors back; the default would call __init__ with positional arguments.
@@ -83,6 +84,10 @@ class DrivaxError(Exception):
             location += f"record {escape_controls(self.record)}: "
         cure = "" if self.cure is None else f"; {self.cure}"
         return escape_controls(" ".join(f"{location}{self.problem}{cure}".split()))
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:700]} ... {text[-200:]}"
 
 
 class DataError(DrivaxError):

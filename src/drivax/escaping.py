@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 #: Begins a formula in spreadsheets, or hides the character that does; numbers are safe.
@@ -31,12 +30,10 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
     return "".join(",".join(_csv_cell(str(cell)) for cell in row) + "\n" for row in rows)
 
 
-def csv_rows(text: str) -> list[list[str]]:
-    """Return the rows of :func:`csv_text`, with the cells as they were."""
-    rows = list(csv.reader(io.StringIO(text, newline="")))
-    if "'" not in text:
-        return rows
-    return [[cell[1:] if _NEUTRAL.match(cell) else cell for cell in row] for row in rows]
+def csv_rows(lines: Iterable[str]) -> Iterator[list[str]]:
+    """Yield the rows of :func:`csv_text` from its lines, with the cells as they were."""
+    for row in csv.reader(lines):
+        yield [cell[1:] if cell[:1] == "'" and _NEUTRAL.match(cell) else cell for cell in row]
 
 
 def _csv_cell(cell: str) -> str:

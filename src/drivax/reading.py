@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import DataError, explain_system
+from drivax.escaping import csv_rows
 from drivax.files import format_bytes
 
 Array = np.ndarray[Any, Any]
@@ -31,8 +32,14 @@ DAMAGE = (
     SystemError, MemoryError, BufferError, csv.Error, struct.error, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
     tokenize.TokenError,
 )  # fmt: skip
-#: Largest text file, in bytes; values of JSON and CSV take up to 27 times as much memory (1.8 GB) as their text.
+#: Largest text file, in bytes: recordings and maps in JSON have 0.1 to 40 MB.
 MOST_TEXT = 64 << 20
+#: Most values of a JSON file: each takes up to 200 bytes of memory. In recordings, maps and manifests each has 10 to
+#: 30 bytes of text; the second number, bytes of text, is for manifests that are larger than ``MOST_TEXT``.
+MOST_VALUES, _LEAST_VALUE_BYTES = 4 << 20, 12
+#: Longest line of a text, and longest row of a table, in characters: those of drivax have up to 5,000. Cells of a table
+#: end at ``csv.field_size_limit`` (131,072).
+MOST_LINE = 1 << 20
 _HEADER_LIMIT = 100_000
 #: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
 _HEADER_LOCK = threading.Lock()
@@ -72,6 +79,12 @@ def check_regular(file: Path, cure: str) -> None:
             raise ValueError("not a regular file")
 
 
+def _check_size(file: Path, cure: str, most: int) -> None:
+    if (size := file.stat().st_size) > most:
+        problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
+        raise DataError(problem, file=file, cure=cure)
+
+
 def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """Return the content of a file.
 
@@ -80,10 +93,7 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """
     check_regular(file, cure)
     with explain_damage(file, cure):
-        size = file.stat().st_size
-        if size > most:
-            problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
-            raise DataError(problem, file=file, cure=cure)
+        _check_size(file, cure, most)
         return file.read_bytes()
 
 
@@ -98,15 +108,70 @@ def read_text(file: Path, cure: str, most: int = MOST_TEXT) -> str:
         return data.decode()
 
 
-def read_json(file: Path, cure: str) -> Any:
+def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        DataError: It is missing, larger than :data:`MOST_TEXT`, nested too deeply, or not JSON.
+        DataError: It is missing, larger than ``most`` bytes, nested too deeply, not JSON, or has too many values.
     """
-    data = read_bytes(file, cure)
+    data = read_bytes(file, cure, most)
     with explain_damage(file, cure, "is not valid JSON"):
-        return json.loads(data)
+        return parse_json(data)
+
+
+def parse_json(data: bytes) -> Any:
+    """Return the content of JSON text, whose values are counted first: ``[0],`` takes 30 times its bytes in memory.
+
+    Raises:
+        Exception: Of :data:`DAMAGE`.
+    """
+    # An upper bound: texts may contain these characters, too.
+    count, most = sum(map(data.count, (b",", b"[", b"{"))), max(MOST_VALUES, len(data) // _LEAST_VALUE_BYTES)
+    if count > most:
+        raise ValueError(f"{count:,} values, more than the {most:,} that are read")
+    return json.loads(data)
+
+
+def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
+    """Yield the lines of a UTF-8 file with their ends, of which one at a time is in memory.
+
+    Raises:
+        DataError: The file is missing, larger than ``most`` bytes, or not text, or has a line of more than
+            :data:`MOST_LINE` characters.
+    """
+    check_regular(file, cure)
+    with explain_damage(file, cure, "cannot be read"):
+        _check_size(file, cure, most)
+        with file.open(encoding="utf-8", newline="") as stream:
+            while line := stream.readline(MOST_LINE + 1):
+                _check_length(len(line))
+                yield line
+
+
+def read_csv(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[list[str]]:
+    """Yield the rows of a CSV file, of which one at a time is in memory.
+
+    Raises:
+        DataError: As of :func:`read_lines`, which holds for rows of several lines, too, or a cell is too long.
+    """
+    length = 0
+
+    def lines() -> Iterator[str]:
+        nonlocal length
+        for line in read_lines(file, cure, most):
+            length += len(line)
+            _check_length(length)
+            yield line
+
+    with explain_damage(file, cure, "cannot be read"):
+        for row in csv_rows(lines()):
+            length = 0
+            yield row
+
+
+def _check_length(length: int) -> None:
+    if length > MOST_LINE:
+        raise ValueError(f"a row of more than {MOST_LINE:,} characters")
 
 
 def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:

@@ -7,7 +7,6 @@ as the metrics of an unfinished training, and folders without a seal, are not ch
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -122,11 +121,11 @@ def _digest(file: Path) -> str | None:
 
 def _read(file: Path) -> dict[str, Any]:
     """Return the entries of a seal; none without one."""
-    from drivax.reading import read_bytes
+    from drivax.reading import parse_json, read_bytes
 
     data = read_bytes(file, _RESTORE, _MOST_BYTES) if file.exists() else b"{}"
     with contextlib.suppress(ValueError, RecursionError):
-        entries = json.loads(data)
+        entries = parse_json(data)
         if isinstance(entries, dict):
             return entries
     refuse_edited(file, "is damaged")

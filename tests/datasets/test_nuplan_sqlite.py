@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+import tracemalloc
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import shapely
 
 from datasets.samples import nuplan as sample
+from drivax.datasets.nuplan import sqlite
 from drivax.datasets.nuplan.sqlite import geometries, open_database, read_layer
 from drivax.errors import DataError
 
@@ -174,6 +176,47 @@ def test_views_are_no_tables(tmp_path):
         assert database.columns("endless") == frozenset()
         with pytest.raises(DataError, match="interrupted"):
             database.rows("SELECT count(*) FROM endless")
+
+
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [
+        (f"text TEXT DEFAULT '{'x' * 16_000}'", "rows of more than 35 MB"),
+        ("text AS (hex(zeroblob(1000000)))", "has no table many"),
+        ("rowid AS (hex(zeroblob(1000000)))", "has no table many"),
+    ],
+)
+def test_rows_that_become_more_than_the_file_are_refused(tmp_path, column, words):
+    """A column with a long default, which rows before it do not store, or a computed one makes 80 MB of 50 kB."""
+    path = package(tmp_path / "map.gpkg")
+    rows = ", ".join(f"({number})" for number in range(5000))
+    execute(path, "CREATE TABLE many (fid INTEGER)", f"INSERT INTO many VALUES {rows}")
+    execute(path, f"ALTER TABLE many ADD COLUMN {column}")
+    tracemalloc.start()
+    try:
+        with open_database(path) as database, pytest.raises(DataError, match=words):
+            database.require("many", "fid")
+            database.rows("SELECT text FROM many")
+        assert tracemalloc.get_traced_memory()[1] < 40e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_long_statements_of_the_schema_are_refused(tmp_path):
+    path = package(tmp_path / "map.gpkg")
+    execute(path, f"CREATE TABLE many (fid INTEGER, text TEXT DEFAULT '{'x' * 30_000}')")
+    with open_database(path) as database, pytest.raises(DataError, match="too big"):
+        database.columns("things")
+
+
+def test_rows_of_several_queries_count_together(tmp_path, monkeypatch):
+    path = package(tmp_path / "map.gpkg")
+    monkeypatch.setattr(sqlite, "_MOST_RESULT", 20_000)
+    with open_database(path) as database:
+        query = "SELECT fid, zeroblob(10000) FROM things WHERE fid IN"
+        assert len(database.rows_in(query, [10])) == len(database.rows_in(query, [20])) == 1
+        with pytest.raises(DataError, match="rows of more than 20 kB"):
+            database.rows_in(query, [10, *range(1000, 1500), 20])
 
 
 def test_huge_cells_are_refused_before_they_are_read(tmp_path):

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from datasets.samples import nuscenes as sample
 from drivax.datasets.nuscenes import map as nuscenes_map
+from drivax.datasets.nuscenes import reader as nuscenes_reader
 from drivax.datasets.nuscenes.map import Box
 from drivax.datasets.nuscenes.reader import (
     CENTRE_AHEAD_M,
@@ -19,6 +20,7 @@ from drivax.datasets.nuscenes.reader import (
     interpolate,
     kind_of,
     rows,
+    scene_rows,
     yaw,
 )
 from drivax.datasets.reader import BadRecord, Reader
@@ -302,6 +304,20 @@ def test_damaged_tables_are_refused(tmp_path, content, problem):
     path = tmp_path / "table.json"
     path.write_text(content)
     with pytest.raises(DataError, match=problem):
+        list(rows(path))
+
+
+def test_tables_of_too_many_or_too_long_rows_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps([{"token": "b" * 300}]))
+    with pytest.raises(DataError, match="a row whose token is too long"):
+        scene_rows(tmp_path)
+    path.write_text(json.dumps([{"a": "b" * (3 << 20)}]))
+    with pytest.raises(DataError, match="damaged after 0 rows"):
+        list(rows(path))
+    path.write_text("[" + '{"a": 0},' * 101)
+    monkeypatch.setattr(nuscenes_reader, "_MOST_ROWS", 100)
+    with pytest.raises(DataError, match="more than 100 rows"):
         list(rows(path))
 
 

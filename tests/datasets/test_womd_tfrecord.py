@@ -8,7 +8,7 @@ import zlib
 
 import pytest
 
-from drivax.datasets.womd.tfrecord import count_records, looks_framed, mask_crc, read_records
+from drivax.datasets.womd.tfrecord import count_records, looks_framed, mask_crc, read_records, write_record
 from drivax.errors import DataError, UsageError
 
 PAYLOADS = (b"first", b"", b"third record", b"x" * 300)
@@ -145,3 +145,16 @@ def test_missing_package_names_the_extra(good, read, hide_packages):
     hide_packages("google_crc32c")
     with pytest.raises(UsageError, match=r"drivax\[womd\]"):
         read(good)
+
+
+def test_records_longer_than_any_real_one_are_refused(tmp_path):
+    """Parsed, a record of empty messages takes 50 times its length."""
+    path = tmp_path / "some.tfrecord"
+    with path.open("wb") as file:
+        for payload in (b"ok", bytes((32 << 20) + 1)):
+            write_record(file, payload)
+    records = list(read_records(path))
+    assert records[0] == (0, b"ok")
+    number, error = one_error(records)
+    assert number == 1 and error.file == path
+    assert error.problem == "the record has 34 MB, more than the 34 MB that are read"

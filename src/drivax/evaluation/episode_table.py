@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, Int64
 
 from drivax.errors import DataError
-from drivax.escaping import csv_rows, csv_text
+from drivax.escaping import csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
-from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, read_arrays, read_json, read_text
+from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, read_arrays, read_csv, read_json
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, seal
 from drivax.stats.clusters import recordings
@@ -47,6 +48,9 @@ FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash
 _RERUN = "run drivax evaluate again"
 #: Largest table: bytes per row (most rows have 300), and in all.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
+#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one have 80 million. A
+#: distinct text counts as the second number of cells.
+_MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
 #: Largest trajectories: bytes in addition to the episodes, and bytes per episode (more than any capacity takes).
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
@@ -310,39 +314,44 @@ def _count_scenarios(info: Mapping[str, Any]) -> int:
 def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
     most = min(max(MOST_TEXT, scenarios * _MOST_ROW_BYTES), _MOST_TABLE_BYTES)
-    text = read_text(require_file(path, _RERUN), _RERUN, most)
-    with explain_damage(path, _RERUN, "cannot be read"):
-        rows = csv_rows(text)
-    header = rows[0] if rows else []
+    rows = read_csv(require_file(path, _RERUN), _RERUN, most)
+    header = next(rows, [])
     missing = [key for key in KEYS if key not in header]
     if missing or len(set(header)) < len(header):
         problem = f"lacks the column {missing[0]!r}" if missing else "names a column twice"
         raise DataError(problem, file=path, record="header", cure=_RERUN)
-    if len(rows) < 2:
-        raise DataError("contains no episodes", file=path, cure=_RERUN)
-    for number, row in enumerate(rows[1:], start=1):
+    keys: dict[str, list[str]] = {name: [] for name in KEYS}
+    metrics = {name: array("d") for name in header if name not in KEYS}
+    texts: dict[str, str] = {}
+    for number, row in enumerate(rows, start=1):
         if len(row) != len(header):
             raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_RERUN)
-    columns = dict(zip(header, zip(*rows[1:], strict=True), strict=True))
-    keys = {name: columns[name] for name in KEYS}
-    return keys, {name: _read_metric(path, name, columns[name]) for name in header if name not in KEYS}
+        if number * len(header) + _TEXT_CELLS * len(texts) > _MOST_CELLS:
+            raise DataError("the table has too many cells", file=path, record=number, cure=_RERUN)
+        for name, cell in zip(header, row, strict=True):
+            if name in keys:
+                keys[name].append(texts.setdefault(cell, cell))
+            else:
+                metrics[name].append(_parse_metric(path, number, name, cell))
+    if not keys[KEYS[0]]:
+        raise DataError("contains no episodes", file=path, cure=_RERUN)
+    columns = {name: np.frombuffer(values, np.float64) for name, values in metrics.items()}
+    return {name: tuple(cells) for name, cells in keys.items()}, columns
 
 
-def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
-    """Parse the cells of a metric as float64; empty cells are undefined (NaN), all others must be finite."""
-    values = np.full(len(cells), np.nan)
-    for row, cell in enumerate(cells):
-        if not cell.strip():
-            continue
-        try:
-            values[row] = float(cell)
-        except ValueError:
-            problem = f"{name} is {cell!r}, not a number or empty"
-            raise DataError(problem, file=path, record=row + 1, cure=_RERUN) from None
-        if not math.isfinite(values[row]):
-            problem = f"{name} is {'infinite' if math.isinf(values[row]) else 'NaN'}"
-            raise DataError(problem, file=path, record=row + 1, cure=_RERUN)
-    return values
+def _parse_metric(path: Path, row: int, name: str, cell: str) -> float:
+    """Parse the cell of a metric; an empty cell is undefined (NaN), all others must be finite."""
+    if not cell.strip():
+        return math.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        problem = f"{name} is {cell!r}, not a number or empty"
+        raise DataError(problem, file=path, record=row, cure=_RERUN) from None
+    if not math.isfinite(value):
+        problem = f"{name} is {'infinite' if math.isinf(value) else 'NaN'}"
+        raise DataError(problem, file=path, record=row, cure=_RERUN)
+    return value
 
 
 def _read_crashes(path: Path) -> tuple[Crash, ...]:

@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import json
 import math
 import shutil
 import threading
@@ -47,7 +46,7 @@ from drivax.files import (
     sync_and_close,
     write_json,
 )
-from drivax.reading import MOST_TEXT, explain_damage, read_array_header, read_bytes
+from drivax.reading import MOST_TEXT, explain_damage, parse_json, read_array_header, read_bytes
 from drivax.scenario.schema import (
     NAMES,
     SCHEMA_VERSION,
@@ -513,11 +512,11 @@ def read_manifest(path: Path) -> dict[str, Any]:
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     check_seal(file)
-    # A manifest is shorter than the records that it lists.
-    most = sum(shard.stat().st_size for shard in path.glob("shard-*.npy") if shard.is_file())
+    # A manifest is shorter than the records that it lists, of which those of a sparse file take no space.
+    most = sum(shard.stat().st_blocks * 512 for shard in path.glob("shard-*.npy") if shard.is_file())
     text = read_bytes(file, AGAIN, min(max(MOST_TEXT, most), _MOST_MANIFEST))
     with explain_damage(file, AGAIN, "manifest is damaged"):
-        manifest = json.loads(text)
+        manifest = parse_json(text)
         version = manifest["schema_version"]
     if version != SCHEMA_VERSION:
         newer = isinstance(version, int) and version > SCHEMA_VERSION

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from drivax.errors import DataError
 from drivax.files import refuse_link, sync_and_close, write_text
-from drivax.reading import DAMAGE, read_text
+from drivax.reading import DAMAGE, read_lines
 
 #: Least time between two flushes (s).
 _FLUSH_S = 10.0
@@ -136,14 +136,13 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
         DataError: A row is damaged.
     """
     file = Path(file)
-    lines = read_text(file, "train again").splitlines(keepends=True)
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_lines(file, "train again"), start=1):
         try:
             row = json.loads(line)
             if not isinstance(row["step"], int):
                 raise ValueError("a step that is no integer")
         except DAMAGE as error:
-            if number == len(lines) and not line.endswith("\n"):
+            if not line.endswith("\n"):  # the last one
                 return
             cure = "delete the row"
             raise DataError("not a metrics row", file=file, record=number, cure=cure) from error

@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
+from drivax.datasets.argoverse import unpacked
 from drivax.datasets.reader import read_head
 from drivax.errors import DataError, explain_system, import_extra
-from drivax.reading import check_regular
+from drivax.reading import DAMAGE, check_regular
 
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
@@ -25,8 +26,6 @@ AXLE_HEIGHT_M = 0.33
 #: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
 PARQUET_MAGIC = b"PAR1"
-#: The longest logs have some ten thousand rows; damaged files can claim any number.
-MOST_ROWS = 1_000_000
 _AGAIN = "download it again"
 Array = np.ndarray[Any, Any]
 Kind = Literal["number", "whole", "text"]
@@ -70,7 +69,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
     pa = import_extra("pyarrow")
     check_regular(path, _AGAIN)
     try:
-        table, unread = _load(path, list(columns), optional)
+        table, unread = _load(path, columns, optional)
         if table.num_rows == 0:
             raise DataError("contains no rows", file=path, cure=_AGAIN)
         kinds = [(name, columns[name], table.column(name)) for name in table.column_names]
@@ -82,14 +81,14 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
         raise DataError("is missing", file=path, cure=_AGAIN) from error
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure) from error
-    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+    except (pa.ArrowException, OSError, *DAMAGE) as error:
         if isinstance(error, OSError) and (failure := explain_system(error, path)):
             raise failure from error
         raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
     return Table(table.num_rows, numbers, texts, unread)
 
 
-def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:
+def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:
     """Return the columns as a validated Arrow table, and the names of the others.
 
     String offsets of damaged files may point anywhere.
@@ -99,38 +98,59 @@ def _load(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[
 
     with pa.OSFile(str(path)) as source:
         if read_head(path, 4) == PARQUET_MAGIC:
+            unpacked.check_footer(source)
             file = pq.ParquetFile(source)
-            names = file.schema_arrow.names
-            columns = [name for name in columns if name in names or name not in optional]
-            _check(names, columns, file.metadata.num_rows)
-            table = file.read(columns=list(columns), use_threads=False)
+            schema, metadata = file.schema_arrow, file.metadata
+            names = _check(schema, columns, optional)
+            groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+            unpacked.check_pages(source, groups, names)
+            # Text stays in dictionaries: a text of a megabyte may be that of all rows.
+            texts = [name for name in names if columns[name] == "text"]
+            file = pq.ParquetFile(source, metadata=metadata, read_dictionary=texts)
+            table = file.read(columns=names, use_threads=False)
         else:
-            names = pa.ipc.open_file(source).schema.names
-            _check(names, columns, 0)
-            indices = [names.index(name) for name in columns]
+            # The file is read as the stream in it: its footer may point elsewhere.
+            unpacked.check_messages(source)
+            schema = pa.ipc.open_stream(source).schema
+            names = _check(schema, columns)
+            unpacked.check_messages(source)
+            indices = [schema.names.index(name) for name in names]
             options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=indices)
-            table = pa.ipc.open_file(source, options=options).read_all()
-    _check(table.schema.names, columns, table.num_rows)
+            table = pa.ipc.open_stream(source, options=options).read_all()
     table.validate(full=True)
-    return table, frozenset(names) - {*columns}
+    return table, frozenset(schema.names) - {*names}
 
 
-def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
-    """Refuse a table that lacks a column, has it twice, or has an implausible number of rows."""
-    for name in columns:
-        if names.count(name) != 1:
-            problem = f"has {'several columns' if name in names else 'no column'} {name}"
+def _check(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> list[str]:
+    """Return the columns that a table has; refuse it if it lacks one, or has one twice or of another type.
+
+    Columns of other types could repeat a value, and those with dots in their names be read with others.
+    """
+    names = [name for name in columns if name in schema.names or name not in optional]
+    for name in names:
+        if schema.names.count(name) != 1:
+            problem = f"has {'several columns' if name in schema.names else 'no column'} {name}"
             raise DataError(problem, cure="name a table of Argoverse 2, or download it again")
-    if not 0 <= rows <= MOST_ROWS:
-        raise DataError(f"invalid row count {rows}", cure=_AGAIN)
+        if not _is_plain(column := schema.field(name).type, columns[name]):
+            raise DataError(f"column {name} contains {str(column)[:80]}", cure=_AGAIN)
+    if any("." in name for name in schema.names):
+        raise DataError("has a column with a dot in its name", cure=_AGAIN)
+    return names
+
+
+def _is_plain(column: Any, kind: Kind) -> bool:
+    """Return whether an Arrow type is one of a kind of column."""
+    import pyarrow as pa
+
+    if kind == "text":
+        column = column.value_type if pa.types.is_dictionary(column) else column
+        return pa.types.is_string(column) or pa.types.is_large_string(column)
+    return pa.types.is_integer(column) or (kind == "number" and pa.types.is_floating(column))
 
 
 def _numbers(column: Any, is_integer: bool, name: str) -> Array:
     """Return a column of integers or, unless ``is_integer``, of any numbers."""
-    import pyarrow as pa
-
-    fits = pa.types.is_integer(column.type) or (not is_integer and pa.types.is_floating(column.type))
-    if not fits or column.null_count:
+    if column.null_count:
         raise DataError(
             f"column {name} contains {column.type} with {column.null_count} null values", cure=_AGAIN
         )
@@ -138,7 +158,16 @@ def _numbers(column: Any, is_integer: bool, name: str) -> Array:
 
 
 def _words(column: Any) -> Words:
+    """Return a column of text, whose dictionary may have words of no row or the same word twice."""
     import pyarrow as pa
 
-    codes = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
-    return Words(tuple(codes.dictionary.to_pylist()), codes.indices.to_numpy().astype(np.int64))
+    is_dictionary = pa.types.is_dictionary(column.type)
+    codes = (column.unify_dictionaries() if is_dictionary else column.dictionary_encode()).combine_chunks()
+    rows = codes.indices.cast(pa.int64()).fill_null(-1).to_numpy()
+    used, first, of_row = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    texts = codes.dictionary.take(pa.array(used[order], mask=used[order] < 0)).to_pylist()
+    words: dict[str, int] = {}
+    numbers = np.empty(len(used), np.int64)
+    numbers[order] = [words.setdefault(text or "", len(words)) for text in texts]
+    return Words(tuple(words), numbers[of_row])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -193,12 +194,12 @@ def _unknown_fields(database: Database) -> int:
 
 def time_line(database: Database) -> TimeLine:
     """Return all lidar sweeps in order of time."""
-    rows = database.rows("SELECT token, timestamp, scene_token FROM lidar_pc ORDER BY timestamp")
+    rows = database.rows("SELECT token, timestamp, scene_token FROM lidar_pc")
     if not rows:
         raise DataError("has no lidar sweep", file=database.path, cure="download the file again")
     if not all(isinstance(time, int) for _, time, _ in rows):
         raise DataError("a lidar sweep has no timestamp", file=database.path, cure="download the file again")
-    tokens, times, scenes = zip(*rows, strict=True)
+    tokens, times, scenes = zip(*sorted(rows, key=itemgetter(1)), strict=True)
     return TimeLine(tokens, np.array(times, np.int64), scenes)
 
 
@@ -266,10 +267,9 @@ def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> Non
 
 def agents(database: Database) -> _Agents:
     """Return numbers (from 1 in order of the table) and kinds of a log's tracks by token."""
-    rows = database.rows(
-        "SELECT t.token, c.name FROM track AS t LEFT JOIN category AS c ON c.token = t.category_token ORDER BY t.rowid"
-    )
-    kinds = {token: _KINDS.get(name, AgentKind.OTHER) for token, name in rows}
+    names = dict(database.rows("SELECT token, name FROM category"))
+    rows = database.rows("SELECT token, category_token FROM track ORDER BY rowid")
+    kinds = {token: _KINDS.get(names.get(category, ""), AgentKind.OTHER) for token, category in rows}
     return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
 
 
@@ -308,11 +308,10 @@ def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
     v_centre = R(yaw) (vx, vy + yaw rate x 1.461 m).
     """
     tokens = [log.line.tokens[sweep] for sweep in piece.sweeps]
-    query = (
-        "SELECT p.token, e.x, e.y, e.qw, e.qx, e.qy, e.qz, e.vx, e.vy, e.angular_rate_z "
-        "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token IN"
-    )
-    pose_of = {token: pose for token, *pose in log.database.rows_in(query, tokens)}
+    sweeps = dict(log.database.rows_in("SELECT token, ego_pose_token FROM lidar_pc WHERE token IN", tokens))
+    query = "SELECT token, x, y, qw, qx, qy, qz, vx, vy, angular_rate_z FROM ego_pose WHERE token IN"
+    poses = {token: pose for token, *pose in log.database.rows_in(query, list(sweeps.values()))}
+    pose_of = {token: poses[pose] for token, pose in sweeps.items() if pose in poses}
     if missing := [token for token in tokens if token not in pose_of]:
         raise DataError(f"{len(missing)} sweeps have no ego pose", cure=_CURE)
     pose = _numbers([pose_of[token] for token in tokens], 9, "ego_pose")
@@ -367,7 +366,7 @@ def _boxes(
 def _scenario_types(log: Log, piece: Piece) -> list[str]:
     """Read the types of the scenario tags on any of the ``scene_sweeps``, sorted."""
     tokens = log.line.tokens[slice(*piece.scene_sweeps)]
-    rows = log.database.rows_in("SELECT DISTINCT type FROM scenario_tag WHERE lidar_pc_token IN", tokens)
+    rows = log.database.rows_in("SELECT type FROM scenario_tag WHERE lidar_pc_token IN", tokens)
     return sorted({kind for (kind,) in rows if isinstance(kind, str) and kind})
 
 

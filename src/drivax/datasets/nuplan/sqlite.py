@@ -10,21 +10,32 @@ import sqlite3
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from sys import getsizeof
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.errors import DataError, import_extra
+from drivax.files import format_bytes
 from drivax.reading import check_regular, explain_damage
 
 Array = np.ndarray[Any, Any]
 
 _MAGIC = b"SQLite format 3\0"
 _CURE = "download the file again"
-#: Longest accepted text or BLOB, bytes; a damaged length must not allocate more.
-_LONGEST_CELL = 1 << 26
+#: Longest accepted text or BLOB, bytes, a million corners of a polygon; a damaged length must not allocate more.
+_LONGEST_CELL = 1 << 24
+#: Longest statement of the schema, bytes; those of nuPlan and GeoPackages have up to 3,000. It bounds the default of a
+#: column, which rows without the column repeat.
+_LONGEST_STATEMENT = 20_000
+#: Memory of the rows of a result, bytes: half a million boxes have 250 MB. Damage and defaults can multiply the rows of
+#: small files, which may take the first number plus 16 times their size.
+_LEAST_RESULT, _MOST_RESULT, _RESULT_PER_BYTE = 32 << 20, 512 << 20, 16
+#: Rows that are fetched before their memory is counted.
+_ROWS_AT_ONCE = 8
 #: Limit of virtual machine instructions of a query: a million, plus 20 per byte of the file (a full scan takes about
 #: 0.1). It ends queries on damaged trees with cycles.
 _STEPS_PER_BYTE = 20
@@ -39,12 +50,15 @@ _HEAD_BYTES = 40
 
 
 class Database:
-    """One SQLite file, opened by :func:`open_database`."""
+    """One SQLite file, opened by :func:`open_database`.
+
+    Queries neither sort nor join: SQLite would store the rows in temporary files of any size.
+    """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self._connection = connection
-        self._remaining = 0
+        self._remaining = self._room = 0
         connection.set_progress_handler(self._tick, _STEPS_AT_ONCE)
 
     def _tick(self) -> int:
@@ -53,19 +67,40 @@ class Database:
         return int(self._remaining < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Return all rows of a query."""
-        self._remaining = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
-        try:
-            return self._connection.execute(query, values).fetchall()
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
-            raise DataError(f"SQLite cannot read it ({error})", file=self.path, cure=_CURE) from error
+        """Return all rows of a query.
+
+        Raises:
+            DataError: SQLite cannot read them, or they take too much memory or too long.
+        """
+        self._room = self._most_result()
+        return self._fetch(query, values)
 
     def rows_in(self, query: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
         """Return all rows of a query that ends in ``IN``, for any number of values."""
+        self._room = self._most_result()
         rows = []
         for start in range(0, len(values), _VALUES_AT_ONCE):
             batch = values[start : start + _VALUES_AT_ONCE]
-            rows += self.rows(f"{query} ({', '.join('?' * len(batch))})", batch)
+            rows += self._fetch(f"{query} ({', '.join('?' * len(batch))})", batch)
+        return rows
+
+    def _most_result(self) -> int:
+        return min(_LEAST_RESULT + _RESULT_PER_BYTE * self.path.stat().st_size, _MOST_RESULT)
+
+    def _fetch(self, query: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+        """Return the rows of a query, whose memory is taken from the room that is left."""
+        self._remaining = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
+        rows: list[tuple[Any, ...]] = []
+        try:
+            cursor = self._connection.execute(query, values)
+            while batch := cursor.fetchmany(_ROWS_AT_ONCE):
+                self._room -= sum(map(getsizeof, batch)) + sum(map(getsizeof, chain.from_iterable(batch)))
+                if self._room < 0:
+                    raise MemoryError(f"rows of more than {format_bytes(self._most_result())}")
+                rows += batch
+        except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
+            problem = f"SQLite cannot read it ({str(error) or 'out of memory'})"
+            raise DataError(problem, file=self.path, cure=_CURE) from error
         return rows
 
     def tables(self) -> frozenset[str]:
@@ -74,13 +109,14 @@ class Database:
         return frozenset(str(name) for (name,) in names)
 
     def columns(self, table: str) -> frozenset[str]:
-        """Return the names of a table's columns; none for a missing table, a view or a virtual table."""
+        """Return the names of a table's columns; none for a missing, a virtual or a computed one, or for a view."""
         # Virtual tables have the type 'table', too, but run the code of their module.
         query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
         if not self.rows(query, (table,)):
             return frozenset()
-        names = self.rows("SELECT name FROM pragma_table_info(?)", (table,))
-        return frozenset(str(name) for (name,) in names)
+        columns = self.rows("SELECT name, hidden FROM pragma_table_xinfo(?)", (table,))
+        is_computed = any(hidden for _, hidden in columns)  # a few bytes of the file could become any number
+        return frozenset() if is_computed else frozenset(str(name) for name, _ in columns)
 
     def require(self, table: str, *columns: str) -> None:
         """Raise a DataError unless a table has these columns."""
@@ -106,6 +142,7 @@ def open_database(path: Path) -> Iterator[Database]:
     with contextlib.closing(connection):
         connection.text_factory = lambda value: value.decode("utf-8", "replace")
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_CELL)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _LONGEST_STATEMENT)
         database = Database(path, connection)
         database.rows("PRAGMA trusted_schema = OFF")
         yield database

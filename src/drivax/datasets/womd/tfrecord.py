@@ -17,6 +17,7 @@ import numpy as np
 
 from drivax.datasets.reader import read_head
 from drivax.errors import DataError, import_extra
+from drivax.files import format_bytes
 from drivax.reading import explain_damage
 
 _Array = np.ndarray[Any, Any]
@@ -27,8 +28,9 @@ _LENGTH, _BYTES, _FLOATS, _INTEGERS = 2, 1, 2, 3
 _GROUPS = np.arange(10, dtype=np.uint64)
 _HEADER_BYTES, _FOOTER_BYTES = 12, 4
 _MASK = 0xA282EAD8
-#: Size of the largest protocol buffer; a longer record is damage, whatever its checksum says.
-_LONGEST_BYTES = 2**31 - 1
+#: Longest record, bytes: those of WOMD and ScenarioMax have 1 to 5 MB. Parsed protocol buffers of empty messages take
+#: 50 times as much memory (1.6 GB).
+_LONGEST_BYTES = 32 << 20
 _FETCH = "copy or download the file again"
 
 
@@ -148,7 +150,8 @@ def _read_record(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> b
         problem = f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {remaining} left"
         raise _FramingError(problem)
     if length > _LONGEST_BYTES:
-        raise _FramingError(f"the record has {length} bytes, a protocol buffer at most {_LONGEST_BYTES}")
+        problem = f"{format_bytes(length)}, more than the {format_bytes(_LONGEST_BYTES)} that are read"
+        raise _FramingError(f"the record has {problem}")
     payload = file.read(length)
     footer = file.read(_FOOTER_BYTES)
     if len(footer) < _FOOTER_BYTES:

@@ -1,0 +1,219 @@
+"""What parquet and feather files unpack to, from the headers of their parts, before pyarrow takes the memory.
+
+pyarrow believes these headers and no other sizes. Formats: Apache Parquet, ``parquet.thrift`` in Thrift's compact
+protocol; Apache Arrow, ``Message.fbs`` in FlatBuffers, of which a feather file (version 2) holds a stream.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from drivax.files import format_bytes
+
+#: The longest logs have some ten thousand rows, which take a few megabytes; damaged files can claim any number.
+MOST_ROWS, MOST_BYTES = 1_000_000, 128 << 20
+#: Longest description of a file and of a page or batch, bytes; those of Argoverse 2 have up to 5,000. Each value in one
+#: may take some thousand bytes of memory.
+_LONGEST_FOOTER, _LONGEST_HEADER = 1 << 18, 1 << 16
+#: Encodings of parquet pages: all but deltas of texts (7), which repeat the beginning of the text before.
+_ENCODINGS = (0, 2, 3, 4, 5, 6, 8, 9)
+#: Compact protocol: kinds of values, and the fields of a page header that hold the header of its content.
+_TRUE, _FALSE, _BYTE, _I32, _I64, _DOUBLE, _BINARY, _STRUCT = 1, 2, 3, 5, 6, 7, 8, 12
+_DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
+#: Arrow streams: where they begin in a file, what precedes a message, and kinds of messages.
+_STREAM, _CONTINUES = 8, 0xFFFFFFFF
+_SCHEMA, _DICTIONARY_BATCH, _RECORD_BATCH = 1, 2, 3
+
+
+def check_footer(source: Any) -> None:
+    """Refuse a parquet file whose footer has an implausible length.
+
+    Raises:
+        Exception: Of ``reading.DAMAGE``, as of all functions of this module.
+    """
+    source.seek(max(source.size() - 8, 0))
+    (length,) = struct.unpack("<I", source.read(8)[:4])
+    if length > _LONGEST_FOOTER:
+        raise ValueError(f"a footer of {format_bytes(length)}")
+    source.seek(0)
+
+
+def check_pages(source: Any, groups: Sequence[Any], names: Collection[str]) -> None:
+    """Refuse a parquet file if some columns have too many rows or unpack to too much; ``groups`` are its row groups."""
+    room, rows = _Room(), sum(group.num_rows for group in groups)
+    room.take(rows, 0)
+    groups = groups if rows else []  # the columns of empty files have no place
+    for column in (group.column(number) for group in groups for number in range(group.num_columns)):
+        if column.path_in_schema in names:
+            start = column.data_page_offset
+            start = min(start, column.dictionary_page_offset) if column.has_dictionary_page else start
+            end = start + column.total_compressed_size
+            if not 0 <= start <= end <= source.size():
+                raise ValueError("a column outside the file")
+            while start < end:
+                start += _check_page(source, start, room)
+    source.seek(0)
+
+
+def check_messages(source: Any) -> None:
+    """Refuse a feather file if it has too many rows or unpacks to too much; leave it at the beginning of its stream."""
+    room, position = _Room(), _STREAM
+    while position + 8 <= source.size():
+        source.seek(position)
+        mark, length = struct.unpack("<II", source.read(8))
+        if mark != _CONTINUES or length > _LONGEST_HEADER:
+            raise ValueError("a message of odd length")
+        if not length:
+            break
+        header, body = source.read(length), position + 8 + length
+        message = _root(header)
+        kind, content = _scalar(header, message, 1, "<B"), _table(header, message, 2)
+        if kind == _DICTIONARY_BATCH:
+            content = _table(header, content, 1)
+        if kind in (_DICTIONARY_BATCH, _RECORD_BATCH):
+            _check_batch(source, header, content, body, room, kind == _RECORD_BATCH)
+        elif kind != _SCHEMA:
+            raise ValueError(f"a message of kind {kind}")
+        if (size := _scalar(header, message, 3, "<q")) < 0:
+            raise ValueError("a message of negative length")
+        position = body + size
+    source.seek(_STREAM)
+
+
+class _Room:
+    """Rows and bytes that are left."""
+
+    def __init__(self) -> None:
+        self._rows, self._bytes = MOST_ROWS, MOST_BYTES
+
+    def take(self, rows: int, size: int) -> None:
+        if rows < 0 or size < 0:
+            raise ValueError("a negative length")
+        self._rows -= rows
+        self._bytes -= size
+        if self._rows < 0:
+            raise ValueError(f"more than {MOST_ROWS:,} rows")
+        if self._bytes < 0:
+            raise ValueError(f"unpacks to more than {format_bytes(MOST_BYTES)}")
+
+
+def _check_page(source: Any, start: int, room: _Room) -> int:
+    """Take the room of a page; return the length of the page in the file."""
+    source.seek(start)
+    fields, length = _read_struct(source.read(_LONGEST_HEADER), 0)
+    size = fields[3, _I32]
+    if size < 0:
+        raise ValueError("a page of negative length")
+    room.take(0, fields[2, _I32])
+    for field, encoding in ((_DATA, 2), (_DICTIONARY, 2), (_DATA_V2, 4)):
+        content = fields.get((field, _STRUCT), {})
+        if content and content[encoding, _I32] not in _ENCODINGS:
+            raise ValueError(f"a page of encoding {content[encoding, _I32]}")
+        if not 0 <= content.get((1, _I32), 0) <= MOST_ROWS:
+            raise ValueError(f"a page of {content[1, _I32]} values")
+    return length + size
+
+
+def _read_struct(data: bytes, position: int, depth: int = 4) -> tuple[dict[tuple[int, int], Any], int]:
+    """Read a structure of the compact protocol: its fields by number and kind, and the position after it.
+
+    As for pyarrow, a field of an unexpected kind is another field, and the last of several counts.
+    """
+    if not depth:
+        raise ValueError("nested too deeply")
+    fields: dict[tuple[int, int], Any] = {}
+    number = 0
+    while head := data[position]:
+        position += 1
+        kind = head & 15
+        if head >> 4:
+            number += head >> 4
+        else:
+            number, position = _read_signed(data, position)
+        fields[number, kind], position = _read_value(data, position, kind, depth)
+    return fields, position + 1
+
+
+def _read_value(data: bytes, position: int, kind: int, depth: int) -> tuple[Any, int]:
+    if kind in (_TRUE, _FALSE):
+        return kind == _TRUE, position
+    if kind == _BYTE:
+        return data[position], position + 1
+    if _BYTE < kind <= _I64:
+        return _read_signed(data, position)
+    if kind == _DOUBLE:
+        return None, position + 8
+    if kind == _BINARY:
+        length, position = _read_varint(data, position)
+        return None, position + length
+    if kind == _STRUCT:
+        return _read_struct(data, position, depth - 1)
+    raise ValueError(f"a page header with a value of kind {kind}")
+
+
+def _read_varint(data: bytes, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[position]
+        value, shift, position = value | (byte & 127) << shift, shift + 7, position + 1
+        if byte < 128:
+            return value, position
+        if shift > 63:
+            raise ValueError("an integer of more than ten bytes")
+
+
+def _read_signed(data: bytes, position: int) -> tuple[int, int]:
+    value, position = _read_varint(data, position)
+    return value >> 1 ^ -(value & 1), position
+
+
+def _check_batch(source: Any, header: bytes, batch: int, body: int, room: _Room, has_rows: bool) -> None:
+    """Take the room of a record batch or of the batch of a dictionary."""
+    rows = _scalar(header, batch, 0, "<q")
+    room.take(rows * has_rows, 0)
+    is_compressed = _field(header, batch, 3) is not None
+    start = _field(header, batch, 2)
+    if start is None:
+        return
+    start += _unpack("<I", header, start)
+    for number in range(_unpack("<I", header, start)):
+        offset, size = struct.unpack_from("<qq", header, start + 4 + 16 * number)
+        if is_compressed and size >= 8:
+            source.seek(body + offset)
+            unpacked = int.from_bytes(source.read(8), "little", signed=True)
+            size = size if unpacked == -1 else unpacked
+        room.take(0, size)
+
+
+def _root(data: bytes) -> int:
+    return _unpack("<I", data, 0)
+
+
+def _field(data: bytes, table: int, number: int) -> int | None:
+    """Return the position of a field of a FlatBuffers table; None without it."""
+    directory = table - _unpack("<i", data, table)
+    entry = 4 + 2 * number
+    if entry >= _unpack("<H", data, directory):
+        return None
+    offset = _unpack("<H", data, directory + entry)
+    return table + offset if offset else None
+
+
+def _scalar(data: bytes, table: int, number: int, form: str) -> int:
+    position = _field(data, table, number)
+    return 0 if position is None else _unpack(form, data, position)
+
+
+def _table(data: bytes, table: int, number: int) -> int:
+    position = _field(data, table, number)
+    if position is None:
+        raise ValueError("a message without content")
+    return position + _unpack("<I", data, position)
+
+
+def _unpack(form: str, data: bytes, position: int) -> int:
+    if position < 0:
+        raise ValueError("a position before the message")
+    return struct.unpack_from(form, data, position)[0]
