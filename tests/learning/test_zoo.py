@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from drivax import settings
 from drivax.api import find_planner
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.runner import planner_training_sets
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import (
     POLICY_FILE,
@@ -26,10 +28,12 @@ from drivax.learning.policies import (
     policy_traffic,
 )
 from drivax.planners.planner_traffic import TrafficDriver
+from drivax.scenario.build.assemble import assemble
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import Route
+from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
@@ -160,6 +164,26 @@ def test_traffic_is_found_by_name(run, tmp_path):
             find_traffic(name)
     with pytest.raises(DataError, match="not a run folder"):
         find_traffic(str(tmp_path))
+
+
+def test_no_folder_shadows_a_name(run, bank, tmp_path, monkeypatch):
+    names = ("idm", "zoo:ppo", "drivax.planners.simple:IdmPlanner")
+    traffic = "drivax.simulator.traffic.reactive:IdmTraffic"
+    for name in (*names, traffic):
+        shutil.copytree(run.path, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    local = find_planner(str(run.path), bank)[1]
+    for name in names:
+        assert find_planner(name, bank)[1] != local == find_planner(f"./{name}", bank)[1]
+        assert planner_training_sets(name) != planner_training_sets(f"./{name}") == run.info["data"]
+    assert find_traffic("idm") == find_traffic(traffic) == IdmTraffic()
+    assert find_traffic("zoo:ppo").run == str(policy_folder("zoo:ppo"))
+    for name in ("idm", "zoo:ppo", traffic):
+        assert find_traffic(f"./{name}").run == find_traffic(f"./{name}+idm").run == str(tmp_path / name)
+    with pytest.raises(UsageError, match=r"there is no traffic 'idm\+idm'"):
+        find_traffic("idm+idm")
+    with pytest.raises(UsageError, match=r"trained policy '/.*/idm' has its own task"):
+        drivax.evaluate(Path("idm"), drivax.load([assemble(straight_road([car()]))]), task=Task())
 
 
 def test_names_of_the_zoo():

@@ -157,9 +157,10 @@ def split_traffic(name: str) -> tuple[str | None, str]:
         UsageError: There is no such traffic.
     """
     run, plus, base = name.rpartition("+")
-    if plus and base in TRAFFIC and is_policy(run):
+    # No folder shadows a built-in name or `module:name`.
+    if plus and base in TRAFFIC and run not in TRAFFIC and is_policy(run):
         return run, base
-    if is_policy(name) and name not in TRAFFIC:
+    if name not in TRAFFIC and is_policy(name):
         return name, "log"
     if name not in TRAFFIC and not is_dotted(name):
         kinds = [*TRAFFIC, "package.module:name", "the folder of a training run", *zoo()]

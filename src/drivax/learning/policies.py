@@ -160,7 +160,9 @@ def policy_traffic(
     """
     folder, trust = open_policy(run), tuple(trust)
     task, base = folder.config(TrainConfig, _AS_LOGGED, trust).task, base or LogTraffic()
-    return PolicyTraffic(task, count, base, run=str(folder.path), samples=samples, trust=trust)
+    # The absolute path of a folder is no name of the zoo.
+    path = str(folder.path.absolute())
+    return PolicyTraffic(task, count, base, run=path, samples=samples, trust=trust)
 
 
 def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
