@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.checks import check_at_least, check_at_most
 from drivax.curation.logged import Progress, map_batches
 from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
-from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.config import check_learnable
 from drivax.learning.driving import Driving
 from drivax.learning.experience import (
@@ -51,6 +51,8 @@ _LOG_BATCH = 8
 _BLOCK_SIZE = 4096
 #: Actions sampled from every member to estimate the mutual information.
 _SAMPLES = 16
+#: Largest number of members.
+MOST_FOLDS = 1000
 #: Without past steps and the last action, which a policy could copy.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
@@ -91,6 +93,7 @@ class EnsembleConfig:
         if self.learn_from is not None and self.learn_from < 1:
             raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or null")
         check_at_least(self, 1, "total_steps")
+        check_at_most(self, MOST_FOLDS, "folds")
         check_at_least(self, 0, "seed")
         check_learnable(self.task.actions)
         if self.weighted == "rarity" and self.task.actions.size != 2:

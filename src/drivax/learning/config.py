@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from drivax.checks import check_at_least
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
-from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.algorithms.offline import OfflineConfig
@@ -38,6 +38,8 @@ Algorithm = (
 
 #: Name of the traffic in which the policy in training drives several vehicles.
 SELF = "self"
+#: Largest number of kinds of traffic in a training.
+MOST_SHARES = 16
 #: Largest difference of a sum of shares from 1.
 _ROUNDING = 1e-3
 
@@ -100,6 +102,8 @@ class TrainConfig:
             cure = "set algorithm.fitted_q.updates of cql, iql or td3_bc"
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
         shares = self.shares.values()
+        if len(shares) > MOST_SHARES:
+            raise UsageError(f"traffic has {len(shares)} shares", cure=f"use {MOST_SHARES} or less")
         if not (min(shares, default=0.0) > 0.0 and abs(sum(shares) - 1.0) <= _ROUNDING):
             texts = [f"{name} {share:g}" for name, share in self.shares.items()]
             problem = f"shares of traffic are {', '.join(texts) or 'missing'}"

@@ -12,8 +12,8 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.checks import check_above_zero, check_at_least
 from drivax.errors import UsageError
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment

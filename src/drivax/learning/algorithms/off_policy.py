@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
-from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
+from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic, graph_of
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import polyak, soft_policy_loss, td_target, temperature_loss
@@ -83,7 +83,7 @@ class OffPolicy(Generic[Config]):
         self.spec = environment.shapes(data)
         # Traced only: no random numbers are drawn.
         networks = nnx.eval_shape(lambda: self.networks(jax.random.key(0)))
-        self.graphs = {name: nnx.graphdef(network) for name, network in networks.items()}
+        self.graphs = {name: graph_of(network) for name, network in networks.items()}
 
     @property
     def network(self) -> NetworkConfig:

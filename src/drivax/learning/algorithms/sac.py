@@ -15,10 +15,17 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool
 
+from drivax.checks import (
+    MOST_SAMPLES,
+    MOST_STEPS_PER_ITERATION,
+    check_above_zero,
+    check_at_least,
+    check_at_most,
+    check_shares,
+)
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
 from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -46,6 +53,8 @@ from drivax.networks.distributions import REPARAMETRISED
 from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
+#: Largest number of steps of n-step returns.
+MOST_STEPS = 1000
 #: Steps of the replay buffer, and logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 
@@ -99,6 +108,9 @@ class SacConfig:
     def __post_init__(self) -> None:
         check_average(self.average)
         check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
+        check_at_most(self, MOST_SAMPLES, "environments", "unroll", "updates_per_step", "batch")
+        check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
+        check_at_most(self, MOST_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from drivax.learning.algorithms.checks import check_at_least
+from drivax.checks import check_at_least
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
