@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from drivax.checks import check_above_zero, check_at_least, check_at_most
 from drivax.errors import UsageError
-from drivax.learning.algorithms.off_policy import Trained, squared_error, target_entropy
+from drivax.learning.algorithms.off_policy import Trained, q_logs, squared_error, target_entropy
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
@@ -131,7 +131,7 @@ class Cql(Offline[CqlConfig]):
             "critic": error,
             "penalty": jnp.mean(penalty),
             "penalty_weight": weight,
-            "mean_q": jnp.mean(q),
+            **q_logs(q),
             "mean_q_uniform": jnp.mean(sampled_q[: self.config.actions]),
         }
 

@@ -12,6 +12,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.learning.environment import Environment
+from drivax.learning.program import is_largest
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic, graph_of
 from drivax.networks.distributions import Actions, Distribution
@@ -54,6 +55,16 @@ class SoftActor(NamedTuple):
     loss: Float[Array, " B"]
     temperature_loss: Float[Array, ""]
     logs: dict[str, Array]
+
+
+def q_logs(q: Array) -> dict[str, Array]:
+    """Return values to log of the Q values of the data's actions: their mean, and the largest absolute one."""
+    return {"mean_q": jnp.mean(q), "largest_q": jnp.max(jnp.abs(q))}
+
+
+def over_updates(logs: dict[str, Array]) -> dict[str, Array]:
+    """Return the logs ``loss/*`` of an iteration from those of its updates: means, and maxima of ``largest_*``."""
+    return {f"loss/{name}": (jnp.max if is_largest([name]) else jnp.mean)(x) for name, x in logs.items()}
 
 
 def squared_error(q: Array, target: Array) -> Float[Array, ""]:
