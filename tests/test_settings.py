@@ -415,6 +415,32 @@ def test_dump_is_readable():
     assert text.index("steps") < text.index("name") < text.index("network")
 
 
+def test_no_file_shadows_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A folder of a stranger may hold files of any name, and a configuration file is trusted."""
+    configs, folder = tmp_path / "configs", tmp_path / "stranger"
+    monkeypatch.setattr(settings, "_configs", lambda: configs)
+    for place, steps in ((configs, 3), (folder, 9)):
+        (place / "studies").mkdir(parents=True)
+        for name in ("fast.yaml", "studies/slow.yaml"):
+            (place / name).write_text(f"steps: {steps}")
+    for name in ("fast", "fsat", "studies/slow"):
+        (folder / name).write_text("steps: 9")
+    monkeypatch.chdir(folder)
+    for name in ("fast", "studies/slow"):
+        assert settings.load(Training, name).steps == 3
+        for path in (f"{name}.yaml", f"./{name}", str(folder / name), Path(name)):
+            assert settings.load(Training, path).steps == 9
+        for base, steps in ((name, 3), (f"./{name}", 9), (f"{name}.yaml", 9)):
+            (folder / "own.yaml").write_text(f"extends: {base}")
+            assert settings.load(Training, "own.yaml").steps == steps
+    # A misspelt preset reads no file either.
+    with pytest.raises(UsageError, match=r"no preset or file 'fsat'; did you mean 'fast'\?"):
+        settings.load(Training, "fsat")
+    (folder / "own.yaml").write_text("extends: fsat")
+    with pytest.raises(UsageError, match=r"extends 'fsat', which is not found; did you mean 'fast'\?"):
+        settings.load(Training, "own.yaml")
+
+
 def test_folder_may_share_the_name_of_a_preset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo").mkdir()

@@ -124,7 +124,9 @@ def evaluate(
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
-        planner, task = find_planner(str(planner), loaded.bank, sample, task, trust)
+        # A path is no name of a planner.
+        name = planner if isinstance(planner, str) else str(planner.absolute())
+        planner, task = find_planner(name, loaded.bank, sample, task, trust)
     elif sample:
         raise UsageError("only a trained policy by name can sample", cure="leave out sample=")
     planner = as_planner(planner, getattr(planner, "__name__", "planner"))
@@ -156,7 +158,7 @@ def find_planner(
             code that is not trusted.
         DataError: The folder is no run, or is damaged.
     """
-    if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
+    if name in PLANNERS or is_dotted(name):
         if sample:
             raise UsageError(f"{name!r} is no trained policy to sample", cure="leave out --sample (sample=)")
         planner = make_planner(name, task and task.actions)

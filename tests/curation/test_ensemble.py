@@ -1,6 +1,7 @@
 """Ensemble: folds, disagreement and information by hand, and disagreement on rare data."""
 
 import math
+import re
 from dataclasses import replace
 
 import jax
@@ -14,6 +15,7 @@ from drivax.curation import ensemble as ensemble_module
 from drivax.curation.ensemble import (
     EnsembleConfig,
     Predictions,
+    _check_finite,
     assign_folds,
     experience_of,
     fit,
@@ -25,7 +27,8 @@ from drivax.curation.methods import check_combination, ensemble_table
 from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
 from drivax.errors import UsageError
-from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.behaviour_cloning import BcConfig, BcState
+from drivax.learning.divergence import DivergenceError
 from drivax.learning.driving import Driving
 from drivax.learning.experience import sample_steps
 from drivax.networks.actor_critic import NetworkConfig
@@ -62,6 +65,30 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def ensemble(data):
     return train_ensemble(TINY, data)
+
+
+@pytest.mark.slow
+def test_divergence_is_one_line_and_writes_nothing(data, tmp_path, capsys):
+    call = ["curate", "ensemble", "--data", str(data.path), "--out", str(tmp_path / "scores.npz")]
+    call += ["--folds", "3", "--total_steps", "640", "--cloning.batch", "16", "--cloning.updates", "4"]
+    call += ["--cloning.network.encoder.width", "8", "--cloning.network.head", "[8]"]
+    assert main([*call, "--cloning.learning_rate", "1e30"]) == 1
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("drivax: ")]
+    assert re.search(
+        r"ensemble diverged at step 64: .* is (NaN|infinite) in member 0; lower cloning.learning_rate$", line
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_divergence_of_a_member_is_named():
+    numbers = jnp.arange(3)
+    state = BcState({"w": jnp.zeros((3, 2))}, (), jax.random.split(jax.random.key(0), 3), numbers)
+    logs = {"loss/imitation": jnp.ones(3)}
+    _check_finite(64, state, logs)
+    with pytest.raises(DivergenceError, match="step 64: loss/imitation is infinite in member 1; lower"):
+        _check_finite(64, state, {"loss/imitation": jnp.array([1.0, jnp.inf, 1.0])})
+    with pytest.raises(DivergenceError, match=r"\.parameters\['w'\] is NaN in member 2; lower"):
+        _check_finite(64, replace(state, parameters={"w": jnp.zeros((3, 2)).at[2, 1].set(jnp.nan)}), logs)
 
 
 def test_folds_never_share_a_recording():

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import signal
 from dataclasses import replace
 
@@ -11,6 +12,8 @@ import pytest
 
 from drivax import settings
 from drivax.errors import UsageError
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import mean_logs, train
 from drivax.learning.training_log import Preempted
@@ -127,6 +130,58 @@ def test_impossible_settings_are_refused():
     ):
         with pytest.raises(UsageError, match=words):
             settings.load(TrainConfig, values)
+
+
+#: Settings that decide how much memory and time a run takes, with a value that a stranger may write: the last one.
+HUGE_SIZES = [
+    *(f"task: {{observation: {{{name}: 10000000}}}}" for name in ("agents", "road", "lights", "route")),
+    "task: {hold: 10000000}",
+    "task: {actions: {kind: discrete, accelerations: 1001}}",
+    "task: {actions: {kind: discrete, curvatures: 1001}}",
+    "start: {kind: noisy_start, tries: 10000000}",
+    "algorithm: {kind: bc, network: {head: [10000000]}}",
+    "algorithm: {kind: bc, network: {head: [4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, "
+    "4, 4, 4, 4, 4, 4, 4, 4]}}",
+    *(f"algorithm: {{kind: bc, network: {{encoder: {{{setting}: 10000000}}}}}}" for setting in (
+        "kind: lq, latents", "kind: lqh, local_layers", "kind: mtr, layers", "kind: wayformer, layers",
+        "kind: lq, heads: 1, width", "kind: mtr, width: 64, heads", "kind: entity, heads: 1, width",
+    )),
+    *(f"algorithm: {{kind: bc, network: {{encoder: {{{setting}: [10000000]}}}}}}" for setting in (
+        "hidden", "rows", "kind: lq, embedding",
+    )),
+    *(f"algorithm: {{kind: {setting}: 10000000}}" for setting in (
+        "ppo, environments", "ppo, unroll", "ppo, epochs", "ppo, minibatches", "sac, environments", "sac, unroll",
+        "sac, updates_per_step", "sac, batch", "sac, steps", "bc, batch", "bc, updates", "cql, batch", "iql, updates",
+        "td3_bc, batch", "cql, actions", "cql, backup_actions",
+    )),
+    "algorithm: {kind: sac, replay: {capacity: 1000000000}}",
+    "algorithm: {kind: bc_sac, sac: {replay: {capacity: 1000000000}}}",
+    "algorithm: {kind: bc_ppo, warm_start: {cloning: {batch: 10000000}}}",
+    "algorithm: {kind: iql, fitted_q: {batch: 10000000}}",
+    "algorithm: {kind: iql, fitted_q: {updates: 10000000}}",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HUGE_SIZES)
+def test_sizes_have_upper_bounds(text):
+    name = "levels" if "discrete" in text else re.findall(r"(\w+): \[?\d", text)[-1]
+    with pytest.raises(
+        UsageError, match=rf"\b{name}\b.*; .*(use [\d,]+ or less|1 to 1|at most 255)"
+    ) as raised:
+        settings.load(TrainConfig, settings.parse_yaml(text))
+    assert "\n" not in str(raised.value)
+
+
+def test_steps_of_an_iteration_have_an_upper_bound():
+    for config in (PpoConfig, SacConfig):
+        with pytest.raises(UsageError, match="steps_per_iteration is 268435456; use 16,777,216 or less"):
+            config(environments=1 << 14, unroll=1 << 14)
+
+
+def test_kinds_of_traffic_have_an_upper_bound():
+    shares = {f"runs/{number}": 0.05 for number in range(20)}
+    with pytest.raises(UsageError, match="traffic has 20 shares; use 16 or less"):
+        settings.load(TrainConfig, {"traffic": shares})
 
 
 @pytest.mark.slow

@@ -131,6 +131,7 @@ def test_cql_against_numpy(batch, policy_batch):
         "penalty": penalty,
         "penalty_weight": 2.0,
         "mean_q": result["q"].mean(),
+        "largest_q": np.abs(result["q"]).max(),
         "mean_q_uniform": result["q_uniform"].mean(),
         "policy": policy,
         "mean_q_policy": result["judged"].mean(),
@@ -201,6 +202,7 @@ def test_iql_against_numpy(batch, policy_batch):
     ):
         assert logs[name] == pytest.approx(number, rel=1e-4), name
     assert total == pytest.approx(value + critic + policy, rel=1e-4)
+    assert logs["largest_q"] == pytest.approx(np.abs(result["q"]).max(), rel=1e-4)
 
 
 def test_td3_bc_against_numpy(batch, policy_batch):
@@ -230,6 +232,7 @@ def test_td3_bc_against_numpy(batch, policy_batch):
     assert logs["critic"] == pytest.approx(critic, rel=1e-4)
     assert logs["policy"] == pytest.approx(policy, rel=1e-4)
     assert total == pytest.approx(critic + policy, rel=1e-4)
+    assert logs["largest_q"] == pytest.approx(np.abs(result["q"]).max(), rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,7 @@ def test_losses_against_numpy(sac):
         "critic": 0.5 * ((result["q"] - td_target) ** 2).mean(),
         "policy": (0.2 * result["now"] - np.minimum(*result["policy_q"])).mean(),
         "mean_q": result["q"].mean(),
+        "largest_q": np.abs(result["q"]).max(),
         "entropy": -result["now"].mean(),
         "temperature": 0.2,
     }

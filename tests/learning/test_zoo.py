@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+import yaml
 
 import drivax
 from drivax import settings
 from drivax.api import find_planner
 from drivax.cli import main
-from drivax.errors import DataError, UsageError
+from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.evaluation.runner import planner_training_sets
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import (
     POLICY_FILE,
@@ -26,10 +29,14 @@ from drivax.learning.policies import (
     policy_traffic,
 )
 from drivax.planners.planner_traffic import TrafficDriver
+from drivax.planners.simple import IdmPlanner
+from drivax.scenario.build.assemble import assemble
+from drivax.seal import allow_edited
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import Route
+from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
@@ -160,6 +167,47 @@ def test_traffic_is_found_by_name(run, tmp_path):
             find_traffic(name)
     with pytest.raises(DataError, match="not a run folder"):
         find_traffic(str(tmp_path))
+
+
+def test_no_folder_shadows_a_name(run, bank, tmp_path, monkeypatch):
+    names = ("idm", "zoo:ppo", "drivax.planners.simple:IdmPlanner")
+    traffic = "drivax.simulator.traffic.reactive:IdmTraffic"
+    for name in (*names, traffic):
+        shutil.copytree(run.path, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert find_planner("idm", bank)[0] == find_planner(names[2], bank)[0] == IdmPlanner()
+    for name in names:
+        with pytest.raises(UsageError, match=f"trained policy './{name}' has its own task"):
+            find_planner(f"./{name}", bank, task=Task())
+        assert planner_training_sets(name) != planner_training_sets(f"./{name}") == run.info["data"]
+    assert find_traffic("idm") == find_traffic(traffic) == IdmTraffic()
+    assert find_traffic("zoo:ppo").run == str(policy_folder("zoo:ppo"))
+    for name in ("idm", "zoo:ppo", traffic):
+        assert find_traffic(f"./{name}").run == find_traffic(f"./{name}+idm").run == str(tmp_path / name)
+    with pytest.raises(UsageError, match=r"there is no traffic 'idm\+idm'"):
+        find_traffic("idm+idm")
+    with pytest.raises(UsageError, match=r"trained policy '/.*/idm' has its own task"):
+        drivax.evaluate(Path("idm"), drivax.load([assemble(straight_road([car()]))]), task=Task())
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        (
+            {"hidden": [10**6]},
+            r"config\.yaml: algorithm\.network\.encoder: hidden has a layer of width 1000000",
+        ),
+        ({"hidden": [4096] * 20}, r"config\.yaml: a network has 320,060,837 parameters; use 268,435,456"),
+    ],
+)
+def test_policy_of_huge_sizes_is_refused_at_once(sizes, words, bank, tmp_path):
+    folder = shutil.copytree(policy_folder("zoo:ppo"), tmp_path / "huge")
+    values = settings.parse_yaml((folder / "config.yaml").read_text())
+    values["algorithm"]["network"]["encoder"] |= sizes
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    with allow_edited(), pytest.raises(DrivaxError, match=words) as raised:
+        find_planner(str(folder), bank)
+    assert "\n" not in str(raised.value)
 
 
 def test_names_of_the_zoo():

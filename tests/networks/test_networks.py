@@ -10,7 +10,7 @@ from flax import nnx
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.networks.actor_critic import ActorCritic, NetworkConfig, Policy, TwinCritic
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig, Policy, TwinCritic, graph_of
 from drivax.networks.distributions import Actions
 from drivax.networks.encoders import MlpConfig
 from drivax.networks.entity import EntityConfig
@@ -218,6 +218,18 @@ def test_encoders_in_yaml():
 def test_mistaken_networks_are_named(text, message):
     with pytest.raises(UsageError, match=message):
         load(text)
+
+
+@pytest.mark.parametrize("layers", [10, 20])
+def test_networks_of_many_parameters_are_refused(layers):
+    """Each layer has 16.8 million, and none takes memory."""
+    config = NetworkConfig(encoder=MlpConfig(hidden=(4096,) * layers))
+    network = nnx.eval_shape(lambda: Policy(config, {"ego": (3,)}, nnx.Rngs(0)))
+    if layers == 10:
+        assert graph_of(network) == nnx.graphdef(network)
+        return
+    with pytest.raises(UsageError, match=r"a network has 319,[\d,]+ parameters; use 268,435,456 or less"):
+        graph_of(network)
 
 
 def test_policy_explores_by_action_and_never_less_than_a_share():

@@ -254,6 +254,15 @@ def test_impossible_sizes_are_refused(make, words):
         make()
 
 
+def test_attention_of_many_tokens_is_refused():
+    attention = nnx.eval_shape(lambda: Attention(64, 8, nnx.Rngs(0)))
+    tokens = jax.ShapeDtypeStruct((2, 4096, 64), jnp.float32)
+    with pytest.raises(
+        UsageError, match="4,096 queries to 4,096 tokens has 134,217,728 weights; use 67,108,864"
+    ):
+        nnx.eval_shape(lambda module, x: module(x, x), attention, tokens)
+
+
 @pytest.mark.parametrize("asking", [None, 2])
 def test_products_of_bfloat16_in_large_batches(asking):
     """As float32 within the eight bits of the operands, gradients too: not every backend has such products itself."""

@@ -359,6 +359,20 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert "contains a study with other settings" in capsys.readouterr().err
 
 
+def test_no_file_shadows_a_study(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    for name in ("longtail", "studies/longtail", "studies/own"):
+        (tmp_path / name).write_text("title: 5")
+    monkeypatch.chdir(tmp_path)
+    load_study.cache_clear()
+    assert load_study("longtail") == LONGTAIL
+    with pytest.raises(UsageError, match="no preset or file 'studies/own'"):
+        load_study("own")
+    for path in ("./longtail", "studies/own"):
+        with pytest.raises(UsageError, match=rf"^{path.removeprefix('./')}: title: 5 is not text"):
+            load_study(path)
+
+
 def test_invalid_studies_are_refused(data, tmp_path):
     sets = StudySets(data.path, data.path, (data.path,))
     with pytest.raises(UsageError, match="baseline 'bc' is missing"):

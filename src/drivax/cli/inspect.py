@@ -51,7 +51,7 @@ class Inspect:
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
     """Run code of this module of yours that a trained policy names; repeat it to trust several."""
     task: str | None = None
-    """Training configuration (file or preset) of the observations; a trained policy has its own."""
+    """Training configuration (preset or file) of the observations; a trained policy has its own."""
     draw: Path | None = None
     """Also draw the observation of the first scenario at its current step into this PNG file."""
     overwrite: bool = False
@@ -112,6 +112,7 @@ def _check_flags(args: Inspect) -> None:
     """Refuse flags that exclude each other, and an existing picture."""
     from drivax.errors import UsageError
     from drivax.files import check_output
+    from drivax.planners.catalogue import PLANNERS
     from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
@@ -122,7 +123,8 @@ def _check_flags(args: Inspect) -> None:
         if getattr(args, name) and not args.observations:
             flag = f"--{name.replace('_', '-')}"
             raise UsageError(f"{flag} needs --observations", cure="add --observations")
-    if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
+    planner = args.planner or "expert"
+    if args.task is not None and planner not in PLANNERS and is_policy(planner.partition("@")[0]):
         raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None:
         check_output(args.draw, args.overwrite)

@@ -38,7 +38,7 @@ class Train:
 
     SIGTERM writes a checkpoint and ends the run; --resume continues it.
 
-    CONFIG is a YAML file or the name of a preset; override its settings with --section.key VALUE.
+    CONFIG is the name of a preset or a YAML file; override its settings with --section.key VALUE.
 
     Example: drivax train demo --data sets/train --out runs/ppo --algorithm.learning_rate 1e-3
 
@@ -50,7 +50,7 @@ class Train:
     """
 
     config: tyro.conf.Positional[str]
-    """YAML file, or name of a preset (demo)."""
+    """Name of a preset (demo), or a YAML file: FILE.yaml or ./FILE."""
     data: Path
     """Scenario set to train on."""
     out: Path

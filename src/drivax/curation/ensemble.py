@@ -18,13 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.checks import check_at_least, check_at_most
 from drivax.curation.logged import Progress, map_batches
 from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
-from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.config import check_learnable
+from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving
 from drivax.learning.experience import (
     Experience,
@@ -34,6 +35,7 @@ from drivax.learning.experience import (
     sample_steps,
     sampler,
 )
+from drivax.learning.program import all_finite, trained_leaves
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -51,6 +53,8 @@ _LOG_BATCH = 8
 _BLOCK_SIZE = 4096
 #: Actions sampled from every member to estimate the mutual information.
 _SAMPLES = 16
+#: Largest number of members.
+MOST_FOLDS = 1000
 #: Without past steps and the last action, which a policy could copy.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
@@ -91,6 +95,7 @@ class EnsembleConfig:
         if self.learn_from is not None and self.learn_from < 1:
             raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or null")
         check_at_least(self, 1, "total_steps")
+        check_at_most(self, MOST_FOLDS, "folds")
         check_at_least(self, 0, "seed")
         check_learnable(self.task.actions)
         if self.weighted == "rarity" and self.task.actions.size != 2:
@@ -228,6 +233,7 @@ def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | No
     Raises:
         UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
         DataError: No step is usable for training.
+        DivergenceError: A loss or a parameter is not finite.
     """
     environment = Driving(Simulator(config.task))
     clusters = np.array(recordings_of(data.entries))
@@ -269,6 +275,22 @@ def experience_of(
     return experience, np.maximum(action[usable].std(axis=0), 1e-6)
 
 
+_all_finite = jax.jit(jax.vmap(all_finite))
+
+
+def _check_finite(step: int, state: Any, logs: dict[str, Array]) -> None:
+    """Raise DivergenceError if a loss or a trained leaf of a member is not finite."""
+    # A program of its own, because fusions with it could round the parameters differently.
+    rows, finite = jax.device_get((logs, _all_finite(list(trained_leaves(state).values()))))
+    for number in range(len(finite)):
+        problem = nonfinite_log({name: float(values[number]) for name, values in rows.items()})
+        if problem is None and not finite[number]:
+            problem = nonfinite_leaf(jax.tree.map(lambda leaf, number=number: leaf[number], state))
+        if problem is not None:
+            text = f"training of the ensemble diverged at step {step:,}: {problem} in member {number}"
+            raise DivergenceError(text, cure="lower cloning.learning_rate")
+
+
 def fit(
     config: EnsembleConfig, learner: Bc, experience: Experience, fold: Int[Numbers, " N"],
     log: Progress | None = None, batched: bool | None = None,
@@ -278,17 +300,20 @@ def fit(
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
     results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
     are slower.
+
+    Raises:
+        DivergenceError: A loss or a parameter is not finite.
     """
     environment, cloning = require_log(learner.environment), config.cloning
     if batched is None:
         batched = jax.default_backend() != "cpu"
     steps_per_member = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
-    def update(experience: Experience, fold: Array, states: Any, key: Array) -> tuple[tuple[Any, Any], None]:
+    def update(experience: Experience, fold: Array, states: Any, key: Array) -> tuple[Any, dict[str, Array]]:
         indices = sample_steps(experience.critic, key, (cloning.batch,))
         observation, action, _ = expert_actions(environment, experience, indices)
 
-        def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
+        def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, dict[str, Array]]:
             own_fold, member_state = member
             is_other_fold = fold[indices[0]] != own_fold
             # Sort steps of the own fold last. Steps are independent draws, so the cut removes random other steps.
@@ -299,23 +324,25 @@ def fit(
                 distribution = learner.distribution(parameters, batch)
                 return cloning.imitation_loss(distribution, action[order], is_other_fold[order])
 
-            return imitation_update(member_state, learner.optimiser, loss)[0]
+            return imitation_update(member_state, learner.optimiser, loss)
 
         size = config.folds if batched else None
-        return jax.lax.map(update_member, (jnp.arange(config.folds), states), batch_size=size), None
+        return jax.lax.map(update_member, (jnp.arange(config.folds), states), batch_size=size)
 
     @partial(jax.jit, donate_argnums=2)
-    def iterate(experience: Experience, fold: Array, states: Any, key: Array) -> Any:
+    def iterate(experience: Experience, fold: Array, states: Any, key: Array) -> tuple[Any, dict[str, Array]]:
         keys = jax.random.split(key, cloning.updates)
-        return jax.lax.scan(partial(update, experience, fold), states, keys)[0]
+        states, logs = jax.lax.scan(partial(update, experience, fold), states, keys)
+        return states, {f"loss/{name}": values.mean(axis=0) for name, values in logs.items()}
 
     network_key, key = jax.random.split(jax.random.key(config.seed))
     keys = jax.random.split(network_key, config.folds)
     state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
     states = (state.parameters, state.optimiser)
     for iteration in range(config.iterations):
-        states = iterate(experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration))
-        jax.block_until_ready(states)
+        states, logs = iterate(experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration))
+        state = replace(state, parameters=states[0], optimiser=states[1])
+        _check_finite((iteration + 1) * cloning.steps_per_iteration, state, logs)
         if log is not None:
             log(iteration + 1, config.iterations)
     return states[0]

@@ -29,6 +29,7 @@ from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_ke
 from drivax.files import check_space, explain_full_disk, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs, select_metrics
+from drivax.planners.catalogue import PLANNERS
 from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner, hold
 from drivax.scenario.bank.columns import AgentColumn
@@ -134,12 +135,17 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", **table.info}
-    if training_sets := policy_training_sets(config.planner):
+    if training_sets := planner_training_sets(config.planner):
         info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
+
+
+def planner_training_sets(name: str) -> list[dict[str, Any]]:
+    """Return the training sets of a planner by name; only policies have any."""
+    return [] if name in PLANNERS else policy_training_sets(name)
 
 
 def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:

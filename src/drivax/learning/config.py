@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from drivax.checks import check_at_least
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
-from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.algorithms.offline import OfflineConfig
@@ -38,6 +38,8 @@ Algorithm = (
 
 #: Name of the traffic in which the policy in training drives several vehicles.
 SELF = "self"
+#: Largest number of kinds of traffic in a training.
+MOST_SHARES = 16
 #: Largest difference of a sum of shares from 1.
 _ROUNDING = 1e-3
 
@@ -100,6 +102,8 @@ class TrainConfig:
             cure = "set algorithm.fitted_q.updates of cql, iql or td3_bc"
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
         shares = self.shares.values()
+        if len(shares) > MOST_SHARES:
+            raise UsageError(f"traffic has {len(shares)} shares", cure=f"use {MOST_SHARES} or less")
         if not (min(shares, default=0.0) > 0.0 and abs(sum(shares) - 1.0) <= _ROUNDING):
             texts = [f"{name} {share:g}" for name, share in self.shares.items()]
             problem = f"shares of traffic are {', '.join(texts) or 'missing'}"
@@ -157,9 +161,10 @@ def split_traffic(name: str) -> tuple[str | None, str]:
         UsageError: There is no such traffic.
     """
     run, plus, base = name.rpartition("+")
-    if plus and base in TRAFFIC and is_policy(run):
+    # No folder shadows a built-in name or `module:name`.
+    if plus and base in TRAFFIC and run not in TRAFFIC and is_policy(run):
         return run, base
-    if is_policy(name) and name not in TRAFFIC:
+    if name not in TRAFFIC and is_policy(name):
         return name, "log"
     if name not in TRAFFIC and not is_dotted(name):
         kinds = [*TRAFFIC, "package.module:name", "the folder of a training run", *zoo()]

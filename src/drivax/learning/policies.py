@@ -65,9 +65,13 @@ def load_policy(
     """
     folder = open_policy(run)
     config = folder.config(TrainConfig, _AS_LOGGED, trust)
-    with explain_damage(folder.path / "config.yaml", "fix the settings", "makes no policy"):
-        learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
-        template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    file = folder.path / "config.yaml"
+    try:
+        with explain_damage(file, "fix the settings", "makes no policy"):
+            learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+            template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    except UsageError as error:
+        raise UsageError(error.problem, file=error.file or file, cure=error.cure) from error
 
     def planner(parameters: Any) -> Planner:
         run_name = _name(folder.path)
@@ -160,7 +164,9 @@ def policy_traffic(
     """
     folder, trust = open_policy(run), tuple(trust)
     task, base = folder.config(TrainConfig, _AS_LOGGED, trust).task, base or LogTraffic()
-    return PolicyTraffic(task, count, base, run=str(folder.path), samples=samples, trust=trust)
+    # The absolute path of a folder is no name of the zoo.
+    path = str(folder.path.absolute())
+    return PolicyTraffic(task, count, base, run=path, samples=samples, trust=trust)
 
 
 def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:

@@ -226,11 +226,16 @@ def device_count() -> int:
     return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
+def is_largest(path: Sequence[Any]) -> bool:
+    """Return whether a logged value is a maximum over samples and updates instead of a mean, by its name."""
+    return any(str(getattr(key, "key", key)).startswith("largest_") for key in path)
+
+
 def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:
     """Return a function's result summed over devices, each with its share of ``divided`` along an axis.
 
-    The sum is taken once, where the compiler would take it in every step of a loop. If shares would differ, nothing is
-    divided.
+    Of values ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
+    step of a loop. If shares would differ, nothing is divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):
@@ -239,7 +244,11 @@ def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: A
 
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def summed(whole: Any, share: Any) -> Any:
-        return jax.lax.psum(function(whole, share), _AXIS)
+        own = function(whole, share)
+        total = jax.lax.psum(own, _AXIS)
+        return jax.tree_util.tree_map_with_path(
+            lambda path, total, own: jax.lax.pmax(own, _AXIS) if is_largest(path[-1:]) else total, total, own
+        )
 
     return summed(whole, divided)
 

@@ -17,10 +17,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.checks import check_at_most
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment, Environments, Rollout, Store
 from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
+
+#: Largest number of steps of a buffer; the published one has a million.
+MOST_CAPACITY = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,9 @@ class ReplayConfig:
 
     capacity: int = 100_000
     store: Store = "state"
+
+    def __post_init__(self) -> None:
+        check_at_most(self, MOST_CAPACITY, "capacity")
 
     def rows(self, environments: int) -> int:
         """Return the number of rows.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -36,6 +39,9 @@ from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, Wayform
 #: Gains of orthogonal output weights. The small one of policies makes the first actions follow ``first_scale`` whatever
 #: the observation is.
 _POLICY_GAIN, _VALUE_GAIN = 0.01, 1.0
+
+#: Largest number of parameters of a network: 1 GiB. The largest preset has 0.7 million.
+MOST_PARAMETERS = 1 << 28
 
 #: Built-in encoders by ``kind``, or a configuration of your own.
 EncoderSettings = (
@@ -77,6 +83,19 @@ class NetworkConfig:
         if not 0.0 <= self.least_scale <= 1.0:
             raise UsageError(f"least_scale is {self.least_scale}", cure="use 0 to 1")
         check_widths("head", self.head)
+
+
+def graph_of(network: Any) -> Any:
+    """Return the structure of a network, which may be that of ``nnx.eval_shape``.
+
+    Raises:
+        UsageError: It has too many parameters.
+    """
+    count = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(network, nnx.Param)))
+    if count > MOST_PARAMETERS:
+        cure = f"use {MOST_PARAMETERS:,} or less: narrower layers, or a smaller observation"
+        raise UsageError(f"a network has {count:,} parameters", cure=cure)
+    return nnx.graphdef(network)
 
 
 class _Head(nnx.Module):

@@ -20,10 +20,12 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
-from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_names
+from drivax.networks.encoders import MOST_WIDTH, Groups, GroupSpec, dense_layers, group_names
 
 Dtype = Literal["float32", "bfloat16"]
 
+#: Largest number of attention weights of an observation; the published sizes have 0.3 million.
+MOST_WEIGHTS = 1 << 26
 #: Logit of masked tokens; finite, so that the softmax stays finite if all tokens are masked.
 _MASKED = -1e30
 
@@ -33,6 +35,8 @@ def check_heads(width: int, heads: int) -> None:
     for name, value in (("width", width), ("heads", heads)):
         if value < 1:
             raise UsageError(f"{name} is {value}", cure="use 1 or more")
+        if value > MOST_WIDTH:
+            raise UsageError(f"{name} is {value}", cure=f"use {MOST_WIDTH:,} or less")
     if width % heads:
         raise UsageError(f"width {width} is not a multiple of {heads} heads", cure="change width or heads")
 
@@ -58,6 +62,12 @@ class Attention(nnx.Module):
     ) -> Float[Array, "*batch q width"]:
         """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros without any."""
         width, heads, size = self.query.shape
+        count = heads * queries.shape[-2] * tokens.shape[-2]
+        if count > MOST_WEIGHTS:
+            problem = f"attention of {queries.shape[-2]:,} queries to {tokens.shape[-2]:,} tokens"
+            raise UsageError(
+                f"{problem} has {count:,} weights", cure=f"use {MOST_WEIGHTS:,} or less: observe less"
+            )
         # To project a token takes width^2 products, to compare it with projected queries width x heads per query.
         if queries.shape[-2] * heads < width:
             return self._attend_few_queries(queries, tokens, mask)

@@ -31,6 +31,9 @@ ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu
 #: Non-decreasing activations: they commute with a maximum.
 _MONOTONE = ("relu", "tanh")
 
+#: Largest width of a layer, and largest number of layers.
+MOST_WIDTH, MOST_LAYERS = 4096, 32
+
 #: Lower bound of deviations: a nearly constant feature is not amplified.
 _MIN_DEVIATION = 1e-3
 #: Normalised features are clipped at this many deviations.
@@ -134,9 +137,13 @@ class MlpEncoder(nnx.Module):
 
 
 def check_widths(name: str, widths: tuple[int, ...]) -> None:
-    """Raise UsageError if a layer of the setting ``name`` has no outputs."""
+    """Raise UsageError if a layer of the setting ``name`` has no outputs or too many, or if there are too many."""
     if min(widths, default=1) < 1:
         raise UsageError(f"{name} has a layer of width {min(widths)}", cure="use 1 or more")
+    if max(widths, default=1) > MOST_WIDTH:
+        raise UsageError(f"{name} has a layer of width {max(widths)}", cure=f"use {MOST_WIDTH:,} or less")
+    if len(widths) > MOST_LAYERS:
+        raise UsageError(f"{name} has {len(widths)} layers", cure=f"use {MOST_LAYERS} or less")
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:

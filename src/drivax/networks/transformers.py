@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
-from drivax.errors import UsageError
+from drivax.checks import check_at_least, check_at_most
 from drivax.networks.attention import (
     Dtype,
     Embedding,
@@ -25,7 +25,7 @@ from drivax.networks.attention import (
     group_shapes,
     masked_mean,
 )
-from drivax.networks.encoders import Groups, GroupSpec, check_widths
+from drivax.networks.encoders import MOST_LAYERS, MOST_WIDTH, Groups, GroupSpec, check_widths
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class TransformerConfig:
     def __post_init__(self) -> None:
         sizes = self.sizes
         check_heads(sizes.width, sizes.heads)
-        for name in ("layers", "latents"):
-            if getattr(sizes, name) < 1:
-                raise UsageError(f"{name} is {getattr(sizes, name)}", cure="use 1 or more")
+        check_at_least(sizes, 1, "layers", "latents")
+        check_at_most(sizes, MOST_LAYERS, "layers")
+        check_at_most(sizes, MOST_WIDTH, "latents")
         check_widths("embedding", sizes.embedding)
 
     @property
@@ -114,8 +114,8 @@ class LqhConfig(LatentConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.local_layers < 1:
-            raise UsageError(f"local_layers is {self.local_layers}", cure="use 1 or more")
+        check_at_least(self, 1, "local_layers")
+        check_at_most(self, MOST_LAYERS, "local_layers")
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
         """Return the encoder with fresh parameters."""

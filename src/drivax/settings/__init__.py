@@ -4,7 +4,8 @@ A configuration record holds scalars, strings, literals, paths, tuples, mappings
 which carry a ``kind`` key in YAML (:func:`kind_of`), and objects of the user by ``package.module:name``. Missing keys
 keep the defaults of the enclosing record. In a record with presets (a class method ``preset(name)``), the key
 ``preset`` names the preset to start from. A file may extend a preset (``extends: ppo``) or a file relative to it
-(``extends: base.yaml``): its settings are merged over those of the other. An unknown key or a value of the wrong type
+(``extends: base.yaml``): its settings are merged over those of the other. No file shadows a preset: a file without a
+suffix is ``./NAME``. An unknown key or a value of the wrong type
 is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable ``renamed``
 maps former keys to present ones.
 """
@@ -20,7 +21,9 @@ from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
 from drivax.settings.structure import Flag, NameAlone, kind_of, parse_yaml, plain, structure, write_yaml
 
-__all__ = ["check_names", "dump", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets"]
+__all__ = [
+    "check_names", "dump", "is_path", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets",
+]  # fmt: skip
 
 Record = TypeVar("Record")
 
@@ -33,7 +36,7 @@ def load(
 
     Args:
         cls: The dataclass to build; its defaults apply to keys that ``source`` lacks.
-        source: A YAML file, the name of a preset, or a mapping.
+        source: The name of a preset, a YAML file (text is one if :func:`is_path`), or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
             count as underscores. A ``kind`` other than that in ``source`` discards the settings of its section.
         trust: None for a source that the user wrote. Otherwise it is data, as of a run: its names lead only to drivax
@@ -76,6 +79,11 @@ def presets() -> list[str]:
     return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.yaml"))
 
 
+def is_path(name: str) -> bool:
+    """Return whether a name that is no preset is a path: it has a folder (``./NAME``) or a suffix (``NAME.yaml``)."""
+    return Path(name).name != name or Path(name).suffix != ""
+
+
 def _configs() -> Path:
     """Folder of the packaged configuration files."""
     package = Path(__file__).resolve().parent.parent
@@ -85,12 +93,13 @@ def _configs() -> Path:
 
 
 def _find_file(source: str | Path) -> Path:
-    """Return the file at a path, or else that of the preset of this name."""
+    """Return the file of the preset of this name, or else that at a path."""
+    if isinstance(source, str) and (source in presets() or not is_path(source)):
+        return preset(source)
     path = Path(source)
     if path.is_file():
         return path
-    # A folder may have the name of a preset: `drivax demo` writes one called demo.
-    if path.is_dir() and source not in presets():
+    if path.is_dir():
         problem = "not a configuration file but a folder"
         raise UsageError(problem, file=path, cure="name a .yaml file or a preset")
     if isinstance(source, Path) or path.suffix in (".yaml", ".yml"):
@@ -126,12 +135,11 @@ def _read_settings(
 def _find_base(file: Path, name: Any) -> Path:
     """Return the preset, or the file relative to ``file``, that ``file`` extends."""
     name, names = str(name), presets()
-    is_file = Path(name).suffix in (".yaml", ".yml")
-    if is_file and (file.parent / name).is_file():
-        return file.parent / name
-    if not is_file and name in names:
+    if name in names:
         return preset(name)
-    cure = "name a file relative to this one" if is_file else did_you_mean(name, names)
+    if is_path(name) and (file.parent / name).is_file():
+        return file.parent / name
+    cure = "name a file relative to this one" if Path(name).suffix else did_you_mean(name, names)
     raise UsageError(f"extends {name!r}, which is not found", file=file, cure=cure)
 
 

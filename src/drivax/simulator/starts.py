@@ -27,6 +27,8 @@ from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, History
 #: Rows of all moving agents at one step, as in ``bank.agents``.
 Rows = Float[Array, "A 8"]
 
+#: Largest number of draws per start.
+MOST_TRIES = 1000
 #: Acceleration (m/s2) and curvature (1/m) of an action of 1 in the published description.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
 #: Range of a strong acceleration, relative to an action of 1; a mild one is between 0 and the upper end.
@@ -87,8 +89,9 @@ class NoisyStart:
     def __post_init__(self) -> None:
         if not 1 <= self.steps < HISTORY:
             raise UsageError(f"a noisy start of {self.steps} steps", cure=f"use 1 to {HISTORY - 1}")
-        if not (0.0 <= self.strong <= 1.0 and 0.0 <= self.scale < math.inf and self.tries >= 1):
-            raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
+        if not (0.0 <= self.strong <= 1.0 and 0.0 <= self.scale < math.inf and 1 <= self.tries <= MOST_TRIES):
+            cure = f"strong in [0, 1], scale >= 0, tries 1 to {MOST_TRIES}"
+            raise UsageError(f"{self} cannot be drawn", cure=cure)
 
     def begin(
         self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer, agents: Rows, key: Any

@@ -166,13 +166,13 @@ class StudyDefinition:
 
 @cache
 def load_study(source: str | Path) -> StudyDefinition:
-    """Return the definition of a study from a YAML file, or by the name of one in ``configs/studies``.
+    """Return the definition of a study by the name of one in ``configs/studies``, or from a YAML file.
 
     Raises:
         UsageError: The definition does not exist, or is invalid.
     """
-    name = str(source)
-    return settings.load(StudyDefinition, source if name.endswith(".yaml") else f"studies/{name}")
+    is_file = isinstance(source, Path) or settings.is_path(source)
+    return settings.load(StudyDefinition, source if is_file else settings.preset(f"studies/{source}"))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.checks import check_at_most
 from drivax.errors import UsageError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
@@ -28,6 +29,8 @@ from drivax.simulator.types import Action, AgentContext, History, Motion
 
 #: Wheelbase as a share of the length, for steering angles of ``published``.
 _WHEELBASE = 0.6
+#: Largest number of levels of each component of :class:`Discrete`, and of steps of :class:`Trajectory`.
+MOST_LEVELS, MOST_STEPS = 255, 1000
 #: Tolerance of the bounds [-1, 1].
 _ROUNDING = 1e-4
 #: Lower bound of lengths in divisors, m: empty slots have length 0.
@@ -169,9 +172,9 @@ class Discrete(Physical):
     def __post_init__(self) -> None:
         super().__post_init__()
         counts = (self.accelerations, self.curvatures)
-        if min(counts) < 3 or any(count % 2 == 0 for count in counts):
+        if not 3 <= min(counts) <= max(counts) <= MOST_LEVELS or any(count % 2 == 0 for count in counts):
             problem = f"{self.accelerations} x {self.curvatures} levels"
-            raise UsageError(problem, cure="use odd numbers, at least 3")
+            raise UsageError(problem, cure=f"use odd numbers, at least 3 and at most {MOST_LEVELS}")
         if not self.density >= 1.0:
             raise UsageError(f"density is {self.density:g}", cure="use 1 (even) or more (denser near zero)")
 
@@ -360,6 +363,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         if self.steps < 3:
             raise UsageError(f"a plan of {self.steps} steps is too short", cure="use steps: 3 or more")
+        check_at_most(self, MOST_STEPS, "steps")
 
     @property
     def size(self) -> int:

@@ -39,6 +39,8 @@ from drivax.tasks.perception import (
     position_errors,
 )
 
+#: Largest number of rows of the group road, and of another group; scenarios have at most 8,192 pieces and 512 agents.
+MOST_ROAD_ROWS, MOST_ROWS = 8192, 512
 #: Block size of :func:`running_count`.
 _BLOCK = 8
 #: Stop lines that ego is past by more than this, in the direction of their lane, are omitted, m. Added to the distance
@@ -120,6 +122,9 @@ class ObservationConfig:
         for name, count in counts.items():
             if count < 0:
                 raise ValueError(f"observation.{name} is {count}; use 0 or more")
+            most = MOST_ROAD_ROWS if name == "road" else MOST_ROWS
+            if count > most:
+                raise ValueError(f"observation.{name} is {count}; use {most:,} or less")
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
         for name in ("road_ahead_m", "road_behind_m", "road_side_m"):

@@ -35,6 +35,8 @@ from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.own import check_unique
 from drivax.tasks.rewards import RewardConfig
 
+#: Largest number of steps of a decision.
+MOST_HOLD = 100
 Failure = Literal["collision", "offroad", "red_light"]
 
 
@@ -66,8 +68,8 @@ class Task:
 
     def __post_init__(self) -> None:
         select_metrics(self.metrics)
-        if self.hold < 1:
-            raise UsageError(f"task.hold is {self.hold}", cure="use 1 step or more")
+        if not 1 <= self.hold <= MOST_HOLD:
+            raise UsageError(f"task.hold is {self.hold}", cure=f"use 1 to {MOST_HOLD} steps")
         check_conditions(self.conditions, self.rewards)
         if self.conditions:
             check_unique("observation.own", [group.name for group in self.observation.own], ("conditions",))

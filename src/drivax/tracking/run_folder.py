@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 from drivax import kernels, settings
 from drivax.errors import DataError, UsageError
 from drivax.files import check_output, refuse_link, replace_folder, restore_folder, write_text
+from drivax.plugins import is_dotted
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
@@ -287,8 +288,8 @@ def policy_folder(name: str | Path) -> Path:
 
 
 def is_policy(name: str | Path) -> bool:
-    """Return whether a name is that of a trained policy: ``zoo:NAME``, or a folder."""
-    return str(name).startswith(ZOO) or Path(name).is_dir()
+    """Return whether a name is that of a trained policy: ``zoo:NAME``, or a folder other than ``module:name``."""
+    return str(name).startswith(ZOO) or (Path(name).is_dir() and not is_dotted(str(name)))
 
 
 def policy_training_sets(planner: str) -> list[dict[str, Any]]:
@@ -296,8 +297,9 @@ def policy_training_sets(planner: str) -> list[dict[str, Any]]:
 
     Other planners have none.
     """
-    path = policy_folder(run_and_step(planner)[0])
-    info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
+    run = run_and_step(planner)[0]
+    path = policy_folder(run)
+    info = RunFolder.open(path).info if is_policy(run) and (path / RUN_FILE).is_file() else {}
     return training_sets(info) if info.get("kind") in ("training", "policy") else []
 
 

@@ -13,9 +13,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_at_most
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
@@ -27,7 +27,7 @@ from drivax.learning.experience import (
     sample_steps,
 )  # fmt: skip
 from drivax.learning.program import shard_axis
-from drivax.networks.actor_critic import NetworkConfig, Policy
+from drivax.networks.actor_critic import NetworkConfig, Policy, graph_of
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.scenario.record import record
@@ -73,6 +73,7 @@ class Cloning:
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "batch", "updates")
+        check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_least(self, 0, "learning_rate", "last_rate")
         check_above_zero(self, "gradient_norm")
         check_decay_share(self.falling)
@@ -164,7 +165,7 @@ class Bc:
         self.spec = environment.shapes(data)
         self.optimiser = config.optimiser(iterations * config.updates)
         # Traced only: no random numbers are drawn.
-        self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
+        self.graph = graph_of(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> Policy:
         actions = Actions(self.environment.action_size, self.environment.levels)

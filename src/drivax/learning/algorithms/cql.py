@@ -12,15 +12,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
+from drivax.checks import check_above_zero, check_at_least, check_at_most
 from drivax.errors import UsageError
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least
-from drivax.learning.algorithms.off_policy import Trained, squared_error, target_entropy
+from drivax.learning.algorithms.off_policy import Trained, q_logs, squared_error, target_entropy
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.distributions import Distribution
 from drivax.rl.equations import conservative_penalty, penalty_weight_loss, scaled_policy_loss, td_target
 
+#: Largest number of sampled actions.
+MOST_ACTIONS = 1000
 #: Largest logarithm of the Lagrange multiplier.
 _MAX_LOG_WEIGHT = math.log(1e6)
 
@@ -64,6 +66,7 @@ class CqlConfig(OfflineConfig):
         super().__post_init__()
         self.check_gradient()
         check_at_least(self, 1, "actions", "backup_actions")
+        check_at_most(self, MOST_ACTIONS, "actions", "backup_actions")
         check_above_zero(self, "temperature", "penalty_temperature")
         check_at_least(self, 0, "penalty", "imitation", "penalty_rate", "temperature_rate")
         if self.gap is not None and self.penalty == 0.0:
@@ -128,7 +131,7 @@ class Cql(Offline[CqlConfig]):
             "critic": error,
             "penalty": jnp.mean(penalty),
             "penalty_weight": weight,
-            "mean_q": jnp.mean(q),
+            **q_logs(q),
             "mean_q_uniform": jnp.mean(sampled_q[: self.config.actions]),
         }
 

@@ -12,9 +12,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.checks import check_above_zero, check_at_least
 from drivax.errors import UsageError
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least
-from drivax.learning.algorithms.off_policy import Trained
+from drivax.learning.algorithms.off_policy import Trained, q_logs
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
@@ -91,7 +91,7 @@ class Iql(Offline[IqlConfig]):
             "value": value_loss,
             "critic": critic_loss,
             "policy": imitation,
-            "mean_q": jnp.mean(q),
+            **q_logs(q),
             "mean_value": jnp.mean(value),
             "advantage": jnp.mean(advantage),
             "weight": jnp.mean(weights),

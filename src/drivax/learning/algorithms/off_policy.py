@@ -12,8 +12,9 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.learning.environment import Environment
+from drivax.learning.program import is_largest
 from drivax.learning.replay import Transitions
-from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
+from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic, graph_of
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import polyak, soft_policy_loss, td_target, temperature_loss
@@ -56,6 +57,16 @@ class SoftActor(NamedTuple):
     logs: dict[str, Array]
 
 
+def q_logs(q: Array) -> dict[str, Array]:
+    """Return values to log of the Q values of the data's actions: their mean, and the largest absolute one."""
+    return {"mean_q": jnp.mean(q), "largest_q": jnp.max(jnp.abs(q))}
+
+
+def over_updates(logs: dict[str, Array]) -> dict[str, Array]:
+    """Return the logs ``loss/*`` of an iteration from those of its updates: means, and maxima of ``largest_*``."""
+    return {f"loss/{name}": (jnp.max if is_largest([name]) else jnp.mean)(x) for name, x in logs.items()}
+
+
 def squared_error(q: Array, target: Array) -> Float[Array, ""]:
     """Return half the mean squared error of Q values from targets, over the batch and all critics."""
     return 0.5 * jnp.mean((q - target) ** 2)
@@ -83,7 +94,7 @@ class OffPolicy(Generic[Config]):
         self.spec = environment.shapes(data)
         # Traced only: no random numbers are drawn.
         networks = nnx.eval_shape(lambda: self.networks(jax.random.key(0)))
-        self.graphs = {name: nnx.graphdef(network) for name, network in networks.items()}
+        self.graphs = {name: graph_of(network) for name, network in networks.items()}
 
     @property
     def network(self) -> NetworkConfig:

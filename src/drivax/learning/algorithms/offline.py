@@ -15,9 +15,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_at_most, check_shares
 from drivax.errors import UsageError
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
-from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, squared_error
+from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, over_updates, squared_error
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
@@ -61,6 +61,7 @@ class FittedQConfig:
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "batch")
+        check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_least(self, 0, "updates", "rate")
         check_shares(self, "tau")
         check_above_zero(self, "gradient_norm")
@@ -158,6 +159,7 @@ class OfflineConfig:
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "batch", "updates")
+        check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
         check_shares(self, "gamma", "tau")
         check_above_zero(self, "gradient_norm")
@@ -271,7 +273,7 @@ class Offline(OffPolicy[Config]):
         after = OfflineState(
             trained["policy"], _without_policy(trained), target, optimiser, key, state.iteration + 1
         )
-        return after, {f"loss/{name}": value.mean() for name, value in logs.items()} | data.sizes()
+        return after, over_updates(logs) | data.sizes()
 
     def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
         """Draw the steps for policy evaluation and those for policy improvement."""

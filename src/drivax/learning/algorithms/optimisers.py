@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.program import device_count, sum_over_devices
+from drivax.learning.program import device_count, is_largest, sum_over_devices
 
 #: Most samples per chunk and CPU device, so that intermediate results fit the second-level cache.
 _CHUNK = 64
@@ -34,13 +34,14 @@ def sum_gradients(
 ) -> tuple[dict[str, Array], Any]:
     """Return the sums of logs and gradients of a loss over ``samples`` (leaves ``[chunk, sample, ...]``).
 
-    The loss of a batch must be the sum of that of its chunks. Devices divide the samples of each chunk.
+    The loss of a batch must be the sum of that of its chunks; logs ``largest_*`` are maxima. Devices divide the samples
+    of each chunk.
     """
     gradient = jax.grad(loss, has_aux=True)
 
     def sum_chunks(parameters: Any, samples: Any) -> tuple[dict[str, Array], Any]:
         def add(sums: Any, chunk: Any) -> tuple[Any, None]:
-            return jax.tree.map(jnp.add, sums, gradient(parameters, chunk)[::-1]), None
+            return _combine(sums, gradient(parameters, chunk)[::-1]), None
 
         first = jax.tree.map(lambda leaf: leaf[0], samples)
         if jax.tree.leaves(samples)[0].shape[0] == 1:
@@ -52,6 +53,13 @@ def sum_gradients(
     # Without barriers the compiler fuses these sums with the program around them, and each program rounds differently.
     inputs = jax.lax.optimization_barrier((parameters, samples))
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
+
+
+def _combine(sums: Any, values: Any) -> Any:
+    """Return the sums of trees, and of logs ``largest_*`` the maxima."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, *pair: (jnp.maximum if is_largest(path[-1:]) else jnp.add)(*pair), sums, values
+    )
 
 
 def add_auxiliary(

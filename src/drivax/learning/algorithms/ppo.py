@@ -12,10 +12,17 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool
 
+from drivax.checks import (
+    MOST_SAMPLES,
+    MOST_STEPS_PER_ITERATION,
+    check_above_zero,
+    check_at_least,
+    check_at_most,
+    check_shares,
+)
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters, unless_first
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
 from drivax.learning.algorithms.constraints import Constraints
 from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
@@ -29,7 +36,7 @@ from drivax.learning.environment import (
     transition,
 )
 from drivax.learning.program import shard_axis
-from drivax.networks.actor_critic import ActorCritic, NetworkConfig
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig, graph_of
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.rl.equations import clipped_surrogate_loss, generalised_advantages
@@ -88,6 +95,8 @@ class PpoConfig:
                 raise UsageError(f"the limit of constraint {name!r} is {limit}", cure="use 0 or more")
         check_average(self.average)
         check_at_least(self, 1, "environments", "unroll", "epochs", "minibatches")
+        check_at_most(self, MOST_SAMPLES, "environments", "unroll", "epochs", "minibatches")
+        check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
         check_at_least(self, 0, "learning_rate", "last_rate", "clip", "value_coefficient", "multiplier_rate")
         check_shares(self, "gamma", "lambda_")
         check_above_zero(self, "target_kl", "gradient_norm")
@@ -143,7 +152,7 @@ class Ppo:
             per_network=not config.network.shared_encoder,
         )
         # Structure only: no number is drawn.
-        self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
+        self.graph = graph_of(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> ActorCritic:
         actions = Actions(self.environment.action_size, self.environment.levels)

@@ -15,11 +15,18 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool
 
+from drivax.checks import (
+    MOST_SAMPLES,
+    MOST_STEPS_PER_ITERATION,
+    check_above_zero,
+    check_at_least,
+    check_at_most,
+    check_shares,
+)
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
-from drivax.learning.algorithms.checks import check_above_zero, check_at_least, check_shares
-from drivax.learning.algorithms.off_policy import Carry, OffPolicy, sample_each, target_entropy
+from drivax.learning.algorithms.off_policy import Carry, OffPolicy, q_logs, sample_each, target_entropy
 from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
 from drivax.learning.environment import (
     Environment,
@@ -40,12 +47,15 @@ from drivax.learning.experience import (
     sample_steps,
     transitions,
 )
+from drivax.learning.program import is_largest
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED
 from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
+#: Largest number of steps of n-step returns.
+MOST_STEPS = 1000
 #: Steps of the replay buffer, and logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 
@@ -99,6 +109,9 @@ class SacConfig:
     def __post_init__(self) -> None:
         check_average(self.average)
         check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
+        check_at_most(self, MOST_SAMPLES, "environments", "unroll", "updates_per_step", "batch")
+        check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
+        check_at_most(self, MOST_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")
@@ -320,7 +333,8 @@ class Sac(OffPolicy[SacConfig]):
 
         def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             share = len(samples[0].reward) / count
-            return jax.tree.map(lambda mean: share * mean, self.loss(trained, target, *samples))
+            loss, logs = self.loss(trained, target, *samples)
+            return share * loss, {n: x if is_largest([n]) else share * x for n, x in logs.items()}
 
         samples = (transitions, jax.random.split(key, (count, 2)))
         samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
@@ -340,7 +354,7 @@ class Sac(OffPolicy[SacConfig]):
         critic_loss, q = self.critic_loss(trained, batch, next_value)
         actor = self.soft_actor(trained, batch.observation, self.target_entropy, keys[:, 1])
         policy_loss = jnp.mean(actor.loss)
-        logs = actor.logs | {"critic": critic_loss, "policy": policy_loss, "mean_q": jnp.mean(q)}
+        logs = actor.logs | {"critic": critic_loss, "policy": policy_loss} | q_logs(q)
         return critic_loss + policy_loss + actor.temperature_loss, logs
 
 
@@ -358,6 +372,10 @@ def _keep_policy(settling: Bool[Array, ""], before: Carry, after: Carry) -> Carr
 
 
 def _sums(logs: dict[str, Array]) -> dict[str, Array]:
-    """Return sums over updates, with counts."""
-    sums = {f"loss/{name}": values.sum() for name, values in logs.items()}
-    return sums | {f"loss/{name}/n": jnp.asarray(float(len(values))) for name, values in logs.items()}
+    """Return the logs of an iteration with counts: sums over updates, and maxima of ``largest_*``."""
+    sums: dict[str, Array] = {}
+    for name, values in logs.items():
+        largest = is_largest([name])
+        sums[f"loss/{name}"] = values.max() if largest else values.sum()
+        sums[f"loss/{name}/n"] = jnp.asarray(1.0 if largest else float(len(values)))
+    return sums

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from drivax.learning.algorithms.checks import check_at_least
-from drivax.learning.algorithms.off_policy import Trained
+from drivax.checks import check_at_least
+from drivax.learning.algorithms.off_policy import Trained, q_logs
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
@@ -82,7 +82,7 @@ class Td3Bc(Offline[Td3BcConfig]):
         return critic_loss + policy, {
             "critic": critic_loss,
             "policy": policy,
-            "mean_q": jnp.mean(q),
+            **q_logs(q),
             "mean_q_policy": jnp.mean(policy_q),
             "imitation": imitation,
             "imitation_error": jnp.mean(jnp.abs(error)),

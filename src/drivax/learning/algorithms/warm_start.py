@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from drivax.checks import check_at_least
 from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import Cloning, check_loss, require_expert
-from drivax.learning.algorithms.checks import check_at_least
 from drivax.learning.algorithms.ppo import Ppo, PpoConfig
 from drivax.learning.algorithms.sac import Sac, SacConfig
 from drivax.learning.environment import Environment, any_across_learners

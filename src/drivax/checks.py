@@ -1,4 +1,7 @@
-"""Checks of numeric settings; NaN fails all of them, and None (a setting that is off) passes."""
+"""Checks of numeric settings; NaN fails all of them, and None (a setting that is off) passes.
+
+A run of a stranger states its own sizes. Upper bounds, far beyond use, keep it from taking all memory or time.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,20 @@ from typing import Any
 
 from drivax.errors import UsageError
 
+#: Largest number of environments, of steps or updates per iteration, and of samples per batch.
+MOST_SAMPLES = 1 << 20
+#: Largest number of steps that an iteration collects in all environments; the published ones have 8,192.
+MOST_STEPS_PER_ITERATION = 1 << 24
+
 
 def check_at_least(config: Any, least: int, *names: str) -> None:
     """Raise UsageError for the first of these settings that is below ``least``."""
     _check(config, names, lambda value: value >= least, f"use {least} or more")
+
+
+def check_at_most(config: Any, most: int, *names: str) -> None:
+    """Raise UsageError for the first of these settings that is above ``most``."""
+    _check(config, names, lambda value: value <= most, f"use {most:,} or less")
 
 
 def check_above_zero(config: Any, *names: str) -> None:
