@@ -1,6 +1,7 @@
-"""Shared by the tests of native kernels: they skip without the library, and run once for each instruction set."""
+"""Shared by the tests of native kernels: what they need, and how they run once for each instruction set."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -10,6 +11,8 @@ import pytest
 from drivax import kernels
 
 needs_kernels = pytest.mark.skipif(not kernels.in_use(), reason=f"no native kernels: {kernels.state()}")
+COMPILER = os.environ.get("CXX", "c++")
+needs_compiler = pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"no C++ compiler {COMPILER}")
 TARGETS = ("sse4.2", "avx2")
 
 
