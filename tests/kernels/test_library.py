@@ -198,27 +198,36 @@ def test_one_function_is_compiled_with_and_without_kernels():
 DIVIDE = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from drivax.kernels import set_encoder
+from drivax.networks.encoders import max_pool
 
 rng = np.random.default_rng(0)
 layer = lambda inputs: (jnp.asarray(rng.normal(size=(inputs, 32)), jnp.float32), jnp.zeros(32))
 layers = layer(5), layer(32)
 rows, valid = jnp.asarray(rng.normal(size=(8, 6, 5)), jnp.float32), jnp.asarray(rng.random((8, 6)) < 0.5)
-encode = jax.jit(jax.vmap(lambda rows, valid: set_encoder.encode(layers, rows, valid)[0]))
-expected = encode(rows, valid)
+encode = lambda layers, rows, valid: max_pool("relu", layers, rows, valid)
+loss = lambda *arguments: (encode(*arguments) ** 2).sum()
+seeds = jax.vmap(jax.grad(loss), (0, None, None))
 mesh = Mesh(np.array(jax.devices()), ("devices",))
-arguments = jax.device_put((rows, valid), NamedSharding(mesh, PartitionSpec("devices")))
-with jax.set_mesh(mesh):
-    program = encode.lower(*arguments).compile()
-np.testing.assert_array_equal(program(*arguments), expected)
-text = program.as_text()
-print("f32[4,32]" in text, "all-gather" in text)
+batch = jax.device_put((rows, valid), NamedSharding(mesh, PartitionSpec("devices")))
+several = jax.tree.map(lambda weight: jnp.stack([weight, 2 * weight, weight]), layers)
+for function, weights in ((encode, layers), (jax.grad(loss), layers), (seeds, several)):
+    function = jax.jit(function)
+    expected = function(weights, rows, valid)
+    with jax.set_mesh(mesh):
+        program = function.lower(jax.device_put(weights, NamedSharding(mesh, PartitionSpec())), *batch).compile()
+    scale = max(abs(leaf).max() for leaf in jax.tree.leaves(expected))
+    difference = jax.tree.map(lambda a, b: abs(a - b).max() / scale, program(weights, *batch), expected)
+    text = program.as_text()
+    calls = [line for line in text.splitlines() if "custom-call" in line and "drivax_" in line]
+    print(max(jax.tree.leaves(difference)) < 1e-6, all("f32[4,6,5]" in line for line in calls), len(calls),
+          "all-gather" in text, "all-reduce" in text)
 """
 
 
 @needs_kernels
-def test_devices_divide_a_batch():
-    assert run(DIVIDE, XLA_FLAGS="--xla_force_host_platform_device_count=2") == "True False"
+def test_devices_divide_a_batch_and_its_gradient():
+    lines = run(DIVIDE, XLA_FLAGS="--xla_force_host_platform_device_count=2").splitlines()
+    assert lines == ["True True 1 False False", "True True 2 False True", "True True 2 False True"]
 
 
 @needs_kernels

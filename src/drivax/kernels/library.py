@@ -122,7 +122,7 @@ def constants(values: Mapping[str, float]) -> dict[str, Any]:
 
 def call(
     kernel: str, results: Sequence[jax.ShapeDtypeStruct], common: Sequence[Any], batched: Sequence[Any] = (),
-    axes: int = 0, attributes: Mapping[str, Any] | None = None,
+    axes: int = 0, attributes: Mapping[str, Any] | None = None, sums: bool = False,
 ) -> list[Any]:  # fmt: skip
     """Call a kernel on a batch, or on one sample that ``jax.vmap`` makes a batch.
 
@@ -133,9 +133,11 @@ def call(
         batched: The other arguments; each has the batch's axes first.
         axes: Number of the batch's axes.
         attributes: Constants.
+        sums: Whether the results are sums over the batch. A ``vmap`` is a loop of calls then, too.
 
     Returns:
-        The results, with the batch's axes first. A batch is divided among the devices of the current mesh.
+        The results, with the batch's axes first unless they are sums. A batch is divided among the devices of the
+        current mesh.
     """
     library = _load()
     assert not isinstance(library, str), "callers ask in_use() first"
@@ -143,10 +145,11 @@ def call(
 
     @custom_vmap
     def run(common: Any, batched: Any) -> list[Any]:
-        return _divide(run_share, lead(batched))(common, batched)
+        return _divide(run_share, lead(batched), sums)(common, batched)
 
     def run_share(common: Any, batched: Any) -> list[Any]:
-        shapes = [jax.ShapeDtypeStruct((*lead(batched), *result.shape), result.dtype) for result in results]
+        first = () if sums else lead(batched)
+        shapes = [jax.ShapeDtypeStruct((*first, *result.shape), result.dtype) for result in results]
         return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **(attributes or {})))
 
     def lead(batched: Any) -> tuple[int, ...]:
@@ -155,7 +158,7 @@ def call(
     @run.def_vmap
     def run_batch(size: int, is_batched: Any, common: Any, batched: Any) -> tuple[list[Any], list[bool]]:
         outputs = [True] * len(results)
-        if any(is_batched[0]):
+        if sums or any(is_batched[0]):
             in_axes = tuple([0 if flag else None for flag in flags] for flags in is_batched)
             return jax.vmap(sequential_vmap(run), in_axes)(common, batched), outputs
         batched = [
@@ -167,7 +170,7 @@ def call(
     return run(list(common), list(batched))
 
 
-def _divide(function: Any, lead: tuple[int, ...]) -> Any:
+def _divide(function: Any, lead: tuple[int, ...], sums: bool) -> Any:
     """Divide a batch among the devices of the current mesh by its first axis that they divide."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1 or AxisType.Manual in mesh.axis_types:
@@ -175,5 +178,10 @@ def _divide(function: Any, lead: tuple[int, ...]) -> Any:
     axis = next((number for number, size in enumerate(lead) if size % mesh.size == 0), None)
     if axis is None:
         return function
+
+    def add(*arguments: Any) -> Any:
+        return jax.lax.psum(function(*arguments), mesh.axis_names)
+
     spec = PartitionSpec(*[None] * axis, mesh.axis_names)
-    return jax.shard_map(function, in_specs=(PartitionSpec(), spec), out_specs=spec, check_vma=False)
+    share, out_specs = (add, PartitionSpec()) if sums else (function, spec)
+    return jax.shard_map(share, in_specs=(PartitionSpec(), spec), out_specs=out_specs, check_vma=False)
