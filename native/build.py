@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,8 @@ import jax.ffi
 
 SOURCES = Path(__file__).resolve().parent
 LIBRARY = SOURCES.parent / "src" / "drivax" / "kernels" / "libdrivax.so"
+#: drivax itself may not be installed yet.
+_stamp = runpy.run_path(str(LIBRARY.with_name("stamp.py")))
 #: Flags of each target, and floats per vector.
 TARGETS = {
     "sse42": (("-msse4.2",), 4),
@@ -98,6 +101,7 @@ def build(output: Path = LIBRARY, sanitize: bool = False) -> None:
             str(library),
         ]
         subprocess.run(link, check=True)
+        library.write_bytes(_stamp["append_stamp"](library.read_bytes(), _stamp["stamp"](SOURCES)))
         library.replace(output)
     print(f"wrote {output}")
 

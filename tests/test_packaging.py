@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from kernels.compare import needs_compiler
+
 
 def build(tree: Path, folder: Path, *options: str) -> Path:
     """Build a tree into a folder, and return the wheel."""
@@ -108,7 +110,7 @@ def test_wheel_and_sdist_are_reproducible_byte_for_byte(wheel: Path, repository:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "c++")) is None, reason="no C++ compiler")
+@needs_compiler
 def test_a_wheel_for_one_platform_contains_the_native_kernels(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -210,6 +210,23 @@ def environment(side: Side, cache: str) -> dict[str, str]:
     return {**os.environ, **variables, **side.variables}
 
 
+def check_kernels(sides: Sequence[Side]) -> None:
+    """Check that native kernels are in use on the second side only.
+
+    Raises:
+        SystemExit: They are not.
+    """
+    program = "from drivax import kernels; print(kernels.in_use(), kernels.state())"
+    for side, expected in zip(sides, ("False", "True"), strict=True):
+        command = [sys.executable, "-c", program]
+        output = subprocess.check_output(command, env=environment(side, ""), text=True)
+        in_use, _, state = output.strip().partition(" ")
+        if in_use != expected:
+            raise SystemExit(
+                f"nothing to compare {'with' if expected == 'True' else 'without'} kernels: {state}"
+            )
+
+
 class Worker:
     """A process of one side that runs a program again and again."""
 
@@ -394,6 +411,7 @@ def main() -> None:
             parser.error("needs --data, and one of --against and --kernels")
         if args.kernels:
             sides = Side(ROOT, {"DRIVAX_NATIVE": "0"}), Side(ROOT)
+            check_kernels(sides)
         else:
             sides = Side(args.against.resolve()), Side(ROOT, {"DRIVAX_NATIVE": "0"})
         names = args.only or [name for name, row in MEASUREMENTS.items() if _has_goal(row, args.kernels)]

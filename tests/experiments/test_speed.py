@@ -49,6 +49,14 @@ def test_failed_program_is_an_error(ratios, tmp_path):
         ratios.Worker(side, "def call(): raise ValueError", tmp_path, tmp_path, str(tmp_path)).run()
 
 
+def test_without_kernels_there_is_nothing_to_compare(ratios, tmp_path, monkeypatch):
+    monkeypatch.setattr(ratios, "measure", lambda *_: pytest.fail("measured XLA against XLA"))
+    monkeypatch.setattr("sys.argv", ["ratios", "--data", str(tmp_path), "--kernels"])
+    monkeypatch.setenv("DRIVAX_NATIVE", "0")
+    with pytest.raises(SystemExit, match="nothing to compare with kernels: none, since DRIVAX_NATIVE=0"):
+        ratios.main()
+
+
 def test_rows_show_their_conditions(ratios):
     name = "PPO training"
     row = {

@@ -1,7 +1,9 @@
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -10,8 +12,9 @@ import pytest
 
 from drivax import kernels
 from drivax.kernels import library
+from drivax.kernels.stamp import append_stamp, stamp
 from drivax.networks.encoders import max_pool
-from kernels.compare import needs_kernels, run_tests
+from kernels.compare import COMPILER, needs_compiler, needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -31,20 +34,110 @@ def test_zero_switches_the_kernels_off():
     assert run(PRINT_STATE, DRIVAX_NATIVE="0") == f"False {expected}"
 
 
-def test_a_missing_or_damaged_library_is_not_used(tmp_path):
-    program = f"from pathlib import Path; from drivax.kernels import library; library.PATH = Path({{}}); {PRINT_STATE}"
-    assert (
-        run(program.format(repr(str(tmp_path / "libdrivax.so"))))
-        == "False none: make native (on Linux x86-64)"
-    )
-    damaged = tmp_path / "libdrivax.so"
-    damaged.write_bytes(b"\x7fELF" + b"no library" * 50)
-    assert run(program.format(repr(str(damaged)))) == "False none: libdrivax.so does not load here"
+class Installed:
+    """A file in place of the library, which is never loaded."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def install(self, content):
+        self.path.write_bytes(content)
+        self.path.chmod(0o755)
+        return self.state()
+
+    def state(self):
+        state, maps = library._load.__wrapped__(), Path("/proc/self/maps")
+        assert not maps.exists() or str(self.path) not in maps.read_text()
+        return state
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    folder = tmp_path / "kernels"
+    folder.mkdir(mode=0o755)
+    monkeypatch.setattr(library, "PATH", folder / "libdrivax.so")
+    return Installed(library.PATH)
+
+
+#: Dynamic loaders read at least its header.
+CODE = b"\x7fELF" + b"no library" * 50
+
+
+def test_without_a_library_the_build_is_named(installed):
+    assert installed.state() == "none: make native (on Linux x86-64)"
+
+
+def test_a_damaged_library_is_not_loaded(installed):
+    complete = append_stamp(CODE, stamp(library.SOURCES))
+    assert "does not load here" in installed.install(complete)  # the loader's word: only the code is missing
+    flipped = complete.replace(b"library", b"librarY", 1)
+    problem = f"none: {installed.path} is incomplete, damaged or not of drivax: make native"
+    for content in (b"", CODE, complete[:200], complete[:-1], complete[:-80], complete + b"x", flipped):
+        assert installed.install(content) == problem
+    stampless = CODE + b"\nnot JSON"
+    stampless += b"\n" + hashlib.sha256(stampless).hexdigest().encode()
+    assert "does not load here" in installed.install(stampless)
+
+
+@pytest.mark.parametrize(
+    ("name", "other"), [("platform", "linux-aarch64"), ("XLA FFI", "0.1"), ("sources", "0123")]
+)
+def test_a_library_for_another_machine_or_version_is_not_loaded(installed, name, other):
+    values = stamp(library.SOURCES)
+    problem = f"was built for {name} {other}, this is {values[name]}: make native"
+    assert installed.install(append_stamp(CODE, values | {name: other})).endswith(problem)
+    del values[name]
+    assert f"was built for {name} None" in installed.install(append_stamp(CODE, values))
+
+
+def test_any_change_of_a_source_makes_a_library_stale(repository, tmp_path):
+    sources = shutil.copytree(repository / "native", tmp_path / "native")
+    before = stamp(sources)["sources"]
+    assert before == stamp(repository / "native")["sources"]
+    for name in ("lanes.cc", "simd.h", "build.py"):
+        with (sources / name).open("a") as file:
+            file.write("\n")
+        before, after = stamp(sources)["sources"], before
+        assert before != after
+    shutil.rmtree(sources)
+    assert "sources" not in stamp(sources)  # a wheel
+
+
+def test_a_library_that_others_can_replace_is_not_loaded(installed, tmp_path):
+    problem = "can be written by other users: make native"
+    installed.install(append_stamp(CODE, stamp(library.SOURCES)))
+    for path, mode in ((installed.path, 0o757), (installed.path.parent, 0o777)):
+        before = path.stat().st_mode
+        path.chmod(mode)
+        assert installed.state().endswith(problem)
+        path.chmod(before)
+    assert not installed.state().endswith(problem)
+    other = installed.path.rename(tmp_path / "libdrivax.so")
+    installed.path.symlink_to(other)
+    assert installed.state().endswith("is not a regular file: make native")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file away")
+def test_a_library_of_another_user_is_not_loaded(installed):
+    installed.install(append_stamp(CODE, stamp(library.SOURCES)))
+    os.chown(installed.path, 12345, 12345)
+    assert installed.state().endswith("can be written by other users: make native")
+
+
+def test_no_variable_and_no_current_folder_moves_the_library(tmp_path, monkeypatch):
+    expected = run(PRINT_STATE)
+    (tmp_path / "libdrivax.so").write_bytes(CODE)
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "libdrivax.so").write_bytes(CODE)
+    monkeypatch.chdir(tmp_path)
+    variables = {"DRIVAX_NATIVE_LIBRARY": "./libdrivax.so", "LD_LIBRARY_PATH": "."}
+    assert run(PRINT_STATE, **variables) == expected
+    assert Path(kernels.__file__).absolute().with_name("libdrivax.so") == library.PATH
 
 
 def test_a_library_that_programs_do_not_call_is_not_in_use(monkeypatch):
     functions = {"drivax_target": lambda: b"AVX2", "drivax_hash": lambda: b"0123"}
-    monkeypatch.setattr(library, "_library", lambda: SimpleNamespace(**functions))
+    monkeypatch.setattr(library, "_load", lambda: SimpleNamespace(**functions))
     assert kernels.state() == "AVX2, build 0123"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert kernels.state() == "none: AVX2, build 0123 is for float32 on CPUs"
@@ -56,43 +149,85 @@ def test_the_target_can_be_lowered():
 
 
 @needs_kernels
-def test_kernels_are_not_traced_where_they_are_excluded():
+def test_a_copy_of_the_library_is_used(tmp_path):
+    copy = shutil.copy2(library.PATH, tmp_path)
+    program = (
+        f"from pathlib import Path; from drivax.kernels import library; library.PATH = Path({str(copy)!r}); "
+    )
+    assert run(program + PRINT_STATE) == f"True {kernels.state()}"
+
+
+def test_kernels_are_part_of_the_key_of_compiled_programs(monkeypatch):
+    monkeypatch.setattr(library, "_load", lambda: object())
+
+    def answer(_):
+        return jnp.float32(kernels.in_use())
+
+    @jax.jit
+    def program(x):
+        scanned = jax.lax.scan(lambda carry, _: (carry, answer(carry)), x, length=2)[1]
+        branch = jax.lax.cond(x > 0, answer, answer, x)
+        return jnp.stack([answer(x), scanned[0], jax.checkpoint(answer)(x), branch])
+
+    for _ in range(2):
+        assert program(1.0).tolist() == [1.0] * 4
+        with kernels.without_kernels():
+            assert program(1.0).tolist() == [0.0] * 4
+
+
+@needs_kernels
+def test_one_function_is_compiled_with_and_without_kernels():
     layers = [(jnp.ones((3, 32)), jnp.zeros(32)), (jnp.ones((32, 32)), jnp.zeros(32))]
-    rows, valid = jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)
+    arguments = layers, jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)
+    program = jax.jit(lambda *arguments: max_pool("relu", *arguments))
+    derivative = jax.jit(jax.grad(lambda *arguments: program(*arguments).sum()))
 
-    def program():
-        return jax.jit(lambda: max_pool("relu", layers, rows, valid)).lower().as_text()
+    def texts():
+        for function in (program, derivative):
+            function(*arguments)
+        return [function.lower(*arguments).as_text() for function in (program, derivative)]
 
-    assert "drivax_encode_sets" in program()
+    native = texts()
+    assert "drivax_encode_sets" in native[0] and "drivax_differentiate_sets" in native[1]
     with kernels.without_kernels():
-        assert "drivax_encode_sets" not in program()
-    assert "drivax_encode_sets" in program()
+        by_xla = texts()
+        assert not any("drivax_" in text for text in by_xla)
+    assert texts() == native
 
 
 DIVIDE = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from drivax.kernels import set_encoder
+from drivax.networks.encoders import max_pool
 
 rng = np.random.default_rng(0)
 layer = lambda inputs: (jnp.asarray(rng.normal(size=(inputs, 32)), jnp.float32), jnp.zeros(32))
 layers = layer(5), layer(32)
 rows, valid = jnp.asarray(rng.normal(size=(8, 6, 5)), jnp.float32), jnp.asarray(rng.random((8, 6)) < 0.5)
-encode = jax.jit(jax.vmap(lambda rows, valid: set_encoder.encode(layers, rows, valid)[0]))
-expected = encode(rows, valid)
+encode = lambda layers, rows, valid: max_pool("relu", layers, rows, valid)
+loss = lambda *arguments: (encode(*arguments) ** 2).sum()
+seeds = jax.vmap(jax.grad(loss), (0, None, None))
 mesh = Mesh(np.array(jax.devices()), ("devices",))
-arguments = jax.device_put((rows, valid), NamedSharding(mesh, PartitionSpec("devices")))
-with jax.set_mesh(mesh):
-    program = encode.lower(*arguments).compile()
-np.testing.assert_array_equal(program(*arguments), expected)
-text = program.as_text()
-print("f32[4,32]" in text, "all-gather" in text)
+batch = jax.device_put((rows, valid), NamedSharding(mesh, PartitionSpec("devices")))
+several = jax.tree.map(lambda weight: jnp.stack([weight, 2 * weight, weight]), layers)
+for function, weights in ((encode, layers), (jax.grad(loss), layers), (seeds, several)):
+    function = jax.jit(function)
+    expected = function(weights, rows, valid)
+    with jax.set_mesh(mesh):
+        program = function.lower(jax.device_put(weights, NamedSharding(mesh, PartitionSpec())), *batch).compile()
+    scale = max(abs(leaf).max() for leaf in jax.tree.leaves(expected))
+    difference = jax.tree.map(lambda a, b: abs(a - b).max() / scale, program(weights, *batch), expected)
+    text = program.as_text()
+    calls = [line for line in text.splitlines() if "custom-call" in line and "drivax_" in line]
+    print(max(jax.tree.leaves(difference)) < 1e-6, all("f32[4,6,5]" in line for line in calls), len(calls),
+          "all-gather" in text, "all-reduce" in text)
 """
 
 
 @needs_kernels
-def test_devices_divide_a_batch():
-    assert run(DIVIDE, XLA_FLAGS="--xla_force_host_platform_device_count=2") == "True False"
+def test_devices_divide_a_batch_and_its_gradient():
+    lines = run(DIVIDE, XLA_FLAGS="--xla_force_host_platform_device_count=2").splitlines()
+    assert lines == ["True True 1 False False", "True True 2 False True", "True True 2 False True"]
 
 
 @needs_kernels
@@ -106,15 +241,13 @@ def test_compiled_programs_name_the_build():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "c++")) is None, reason="no C++ compiler")
+@needs_compiler
 def test_sanitizers_find_no_error_in_the_kernels(repository, tmp_path):
-    """AddressSanitizer and UndefinedBehaviorSanitizer, over the tests of all kernels."""
-    built = tmp_path / "libdrivax.so"
-    command = [sys.executable, str(repository / "native" / "build.py"), "--sanitize", "--out", str(built)]
-    subprocess.run(command, check=True)
+    """AddressSanitizer and UndefinedBehaviorSanitizer, over the tests of all kernels, with a copy of the package."""
+    for folder in ("src", "native", "configs"):
+        shutil.copytree(repository / folder, tmp_path / folder)
+    subprocess.run([sys.executable, str(tmp_path / "native" / "build.py"), "--sanitize"], check=True)
     paths = [f"-print-file-name={name}.so" for name in ("libasan", "libubsan", "libstdc++")]
-    runtimes = [
-        subprocess.check_output([os.environ.get("CXX", "c++"), path], text=True).strip() for path in paths
-    ]
+    runtimes = [subprocess.check_output([COMPILER, path], text=True).strip() for path in paths]
     variables = {"LD_PRELOAD": ":".join(runtimes), "ASAN_OPTIONS": "detect_leaks=0"}
-    run_tests(repository / "tests" / "kernels", DRIVAX_NATIVE_LIBRARY=str(built), **variables)
+    run_tests(repository / "tests" / "kernels", PYTHONPATH=str(tmp_path / "src"), **variables)

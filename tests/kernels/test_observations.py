@@ -4,6 +4,7 @@ Rounding decides whether a piece of road within a millimetre of the box's sides 
 near is nearer; fuzzed samples with such pieces or agents are left out.
 """
 
+import contextlib
 from dataclasses import replace
 from functools import cache, partial
 
@@ -100,15 +101,12 @@ def observe(config, bank, context, frame):
 
 
 def run(config, bank, context, frame, natively=True):
-    if natively:
-        return jax.device_get(program(config, natively)(bank, context, frame))
-    with kernels.without_kernels():
-        return jax.device_get(program(config, natively)(bank, context, frame))
+    with contextlib.nullcontext() if natively else kernels.without_kernels():
+        return jax.device_get(program(config)(bank, context, frame))
 
 
 @cache
-def program(config, natively):
-    """Return a program of its own for each side, since programs are cached by what they call."""
+def program(config):
     return jax.jit(jax.vmap(lambda *arrays: observe(config, *arrays), (None, 0, 0)))
 
 

@@ -74,9 +74,8 @@ def query(bank, pose):
 
 
 def look_up(bank, poses):
-    # A new function each time: programs that were traced with kernels must not be used without.
     axes = partial(jax.vmap, in_axes=(None, 0))
-    return jax.device_get(jax.jit(axes(axes(lambda bank, pose: query(bank, pose))))(bank, poses))
+    return jax.device_get(jax.jit(axes(axes(query)))(bank, poses))
 
 
 def native(bank, poses):

@@ -1,7 +1,7 @@
 """Kernels of the simulator's step against XLA: contacts, the look ahead along the route, frames and lights."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from drivax.simulator.situation import _measure_contacts
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
-from kernels.compare import TARGETS, needs_kernels, run_on_target
+from kernels.compare import TARGETS, assert_same, equal_samples, needs_kernels, run_on_target
 from scenes import GLIMPSE, RED, SMALL, car, straight_road
 
 pytestmark = needs_kernels
@@ -28,76 +28,6 @@ pytestmark = needs_kernels
 READS = frozenset({"ttc_s", "collision", "at_fault", "collision_type"})
 #: Samples of a fuzzed batch.
 BATCH = 192
-
-
-@cache
-def jitted(function, axes):
-    """The function of a batch, by kernels and by XLA."""
-    batch = jax.jit(jax.vmap(function, axes))
-
-    @jax.jit
-    def reference(*arguments):
-        with kernels.without_kernels():
-            return jax.vmap(function, axes)(*arguments)
-
-    return batch, reference
-
-
-def widen(leaf):
-    leaf = np.asarray(leaf)
-    return leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf
-
-
-def equal_samples(actual, expected):
-    """Mask of the samples of which all leaves are equal, floats up to 1e-5."""
-    same = True
-    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
-        a, b = (np.asarray(leaf).reshape(len(leaf), -1) for leaf in (a, b))
-        is_float = b.dtype.kind == "f"
-        near = np.isclose(a, b, rtol=1e-5, atol=1e-5, equal_nan=True) if is_float else a == b
-        same &= near.all(axis=1)
-    return same
-
-
-def assert_same(function, axes, arguments, rare=0.01):
-    """Kernels give what XLA gives, but for samples on a threshold, which rounding moves to either side.
-
-    These are found in float64: when their numbers change by the rounding of float32, the result becomes that of the
-    kernel, too. At most the share ``rare`` of the samples may be such ones.
-    """
-    native, xla = jitted(function, axes)
-    actual, expected = jax.device_get((native(*arguments), xla(*arguments)))
-    differs = np.flatnonzero(~equal_samples(actual, expected))
-    assert len(differs) <= rare * len(jax.tree.leaves(actual)[0])
-    for sample in differs:
-        result = jax.tree.map(lambda leaf, i=sample: np.stack([leaf[i]] * 100), actual)
-        nearby = jax.tree.map(widen, results_nearby(function, axes, arguments, sample))
-        assert equal_samples(result, nearby).any(), sample
-    return expected
-
-
-@cache
-def jitted_in_float64(function, axes):
-    return jax.jit(jax.vmap(function, axes))
-
-
-def results_nearby(function, axes, arguments, sample, count=100):
-    """Results in float64 of a sample whose numbers change by the rounding of float32."""
-    rng = np.random.default_rng(0)
-
-    def spread(leaf):
-        values = np.broadcast_to(widen(leaf)[sample], (count, *np.shape(leaf)[1:]))
-        if values.dtype != np.float64:
-            return values
-        noise = rng.uniform(-1, 1, values.shape) * np.maximum(np.abs(values), 1.0)
-        return values + 2e-7 * noise * rng.choice([0.1, 1.0, 8.0], (count,) + (1,) * (values.ndim - 1))
-
-    with jax.enable_x64(True):
-        spreads = [
-            jax.tree.map(spread if axis == 0 else widen, argument)
-            for argument, axis in zip(arguments, axes, strict=True)
-        ]
-        return jax.device_get(jitted_in_float64(function, axes)(*spreads))
 
 
 def random_frames(rng, slots, batch=BATCH, share=0.7, spread_m=12.0, known=False):

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from drivax import settings
+from drivax import kernels, settings
 from drivax.api import evaluate, load
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
@@ -267,6 +267,33 @@ def test_run_without_validation_resumes_without(data, config, tmp_path):
     resumed = train(config, data, run.path, resume=True, log=lines.append)
     assert run.info["validation"] is None and len(lines) == 1 and lines[0].startswith("memory: ")
     assert not any("validation/" in name for row in resumed.read_metrics() for name in row)
+
+
+def test_resuming_with_other_kernels_warns(data, config, tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "state", lambda: "AVX2, build 0123")
+    run = train(config, data, tmp_path / "run", validation=None)
+
+    def warnings(state):
+        monkeypatch.setattr(kernels, "state", lambda: state)
+        lines = []
+        train(config, data, run.path, validation=None, resume=True, log=lines.append)
+        return [line for line in lines if line.startswith("warning: ")]
+
+    assert warnings("AVX2, build 0123") == []
+    for state, name in {
+        "none: make native": "none",
+        "none, since DRIVAX_NATIVE=0": "none",
+        "AVX-512, build 0123": "AVX-512, build 0123",
+    }.items():
+        (line,) = warnings(state)
+        assert (
+            f"the run used native kernels AVX2, build 0123, this process {name}: the result differs" in line
+        )
+    run = run.note(machine={"kernels": "none: make native"})
+    assert warnings("none, since DRIVAX_NATIVE=0") == []
+    assert len(warnings("AVX2, build 0123")) == 1
+    run.note(machine=None)  # before kernels
+    assert warnings("none: make native") == []
 
 
 def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):

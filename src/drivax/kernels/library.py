@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
+import stat
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,25 +17,56 @@ import numpy as np
 from jax.custom_batching import custom_vmap, sequential_vmap
 from jax.sharding import AxisType, PartitionSpec
 
-#: ``make native`` and the wheels for Linux on x86-64 put it here; tests build others.
-PATH = Path(os.environ.get("DRIVAX_NATIVE_LIBRARY", Path(__file__).parent / "libdrivax.so"))
+from drivax.kernels.stamp import read_stamp, stamp
+
+#: ``make native`` and the wheels for Linux on x86-64 put it here. Loading it runs its code: no variable moves it.
+PATH = Path(__file__).parent / "libdrivax.so"
+#: Its sources, in a checkout.
+SOURCES = Path(__file__).parents[3] / "native"
 #: ``0``: no kernels; ``sse4.2`` or ``avx2``: at most this target; anything else, or not set: the best one.
 VARIABLE = "DRIVAX_NATIVE"
 
-_allowed: ContextVar[bool] = ContextVar("kernels are allowed", default=True)
+#: Whether programs may call kernels. JAX traces and compiles again when it changes.
+_allowed = jax.make_user_context(True)
 
 
 @cache
-def _library() -> ctypes.CDLL | None:
-    """Return the library with its kernels registered, or None: not there, switched off, or not loadable."""
-    if os.environ.get(VARIABLE) == "0" or not PATH.exists():
-        return None
+def _load() -> ctypes.CDLL | str:
+    """Return the library with its kernels registered, or why it is not used."""
+    if os.environ.get(VARIABLE) == "0":
+        return f"none, since {VARIABLE}=0"
+    if not PATH.exists():
+        return "none: make native (on Linux x86-64)"
     try:
-        library = ctypes.CDLL(str(PATH))
-    except OSError:  # another system's or processor's
-        return None
-    for function in ("drivax_kernels", "drivax_target", "drivax_hash"):
-        getattr(library, function).restype = ctypes.c_char_p
+        problem = _problem()
+        return f"none: {PATH} {problem}: make native" if problem else _register()
+    except (OSError, AttributeError, ValueError, RuntimeError) as error:
+        message = str(error).partition("\n")[0]
+        return f"none: {PATH} does not load here ({message}): make native"
+
+
+def _problem() -> str | None:
+    """Return what is wrong with the library, which has not been loaded yet, or None."""
+    own = Path(__file__).stat()
+    writable = stat.S_IWOTH | stat.S_IWGRP & ~own.st_mode
+    if PATH.is_symlink() or not PATH.is_file():
+        return "is not a regular file"
+    for status in (PATH.stat(), PATH.parent.stat()):
+        if status.st_mode & writable or status.st_uid not in {0, os.getuid(), own.st_uid}:
+            return "or its folder can be written by other users"
+    built = read_stamp(PATH.read_bytes())
+    if built is None:
+        return "is incomplete, damaged or not of drivax"
+    for name, value in stamp(SOURCES).items():
+        if built.get(name) != value:
+            return f"was built for {name} {built.get(name)}, this is {value}"
+    return None
+
+
+def _register() -> ctypes.CDLL:
+    library = ctypes.CDLL(str(PATH))
+    for name in ("drivax_kernels", "drivax_target", "drivax_hash"):
+        getattr(library, name).restype = ctypes.c_char_p
     for name in library.drivax_kernels().decode().split():
         function = jax.ffi.pycapsule(getattr(library, f"drivax_{name}"))
         jax.ffi.register_ffi_target(_target_name(library, name), function, platform="cpu")
@@ -48,30 +79,24 @@ def _target_name(library: ctypes.CDLL, kernel: str) -> str:
 
 
 def state() -> str:
-    """Return what is in use, as in ``drivax doctor``."""
-    library = _library()
-    if library is not None:
-        build = f"{library.drivax_target().decode()}, build {library.drivax_hash().decode()}"
-        return build if in_use() else f"none: {build} is for float32 on CPUs"
-    if os.environ.get(VARIABLE) == "0":
-        return f"none, since {VARIABLE}=0"
-    return f"none: {PATH.name} does not load here" if PATH.exists() else "none: make native (on Linux x86-64)"
+    """Return what is in use, or why none is, as in ``drivax doctor``."""
+    library = _load()
+    if isinstance(library, str):
+        return library
+    build = f"{library.drivax_target().decode()}, build {library.drivax_hash().decode()}"
+    return build if in_use() else f"none: {build} is for float32 on CPUs"
 
 
 def in_use() -> bool:
     """Whether programs that are traced now call native kernels: on CPUs, if the library is there, in float32."""
     is_float32 = jax.dtypes.canonicalize_dtype(float) == jnp.float32
-    return _allowed.get() and is_float32 and _library() is not None and jax.default_backend() == "cpu"
+    is_loaded = not isinstance(_load(), str)
+    return _allowed.value and is_float32 and is_loaded and jax.default_backend() == "cpu"
 
 
-@contextlib.contextmanager
-def without_kernels() -> Iterator[None]:
+def without_kernels() -> contextlib.AbstractContextManager[None]:
     """Trace programs without native kernels, for export and for comparisons."""
-    token = _allowed.set(False)
-    try:
-        yield
-    finally:
-        _allowed.reset(token)
+    return _allowed(False)
 
 
 def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) -> Callable[..., Any]:
@@ -97,7 +122,7 @@ def constants(values: Mapping[str, float]) -> dict[str, Any]:
 
 def call(
     kernel: str, results: Sequence[jax.ShapeDtypeStruct], common: Sequence[Any], batched: Sequence[Any] = (),
-    axes: int = 0, attributes: Mapping[str, Any] | None = None,
+    axes: int = 0, attributes: Mapping[str, Any] | None = None, sums: bool = False,
 ) -> list[Any]:  # fmt: skip
     """Call a kernel on a batch, or on one sample that ``jax.vmap`` makes a batch.
 
@@ -108,20 +133,23 @@ def call(
         batched: The other arguments; each has the batch's axes first.
         axes: Number of the batch's axes.
         attributes: Constants.
+        sums: Whether the results are sums over the batch. A ``vmap`` is a loop of calls then, too.
 
     Returns:
-        The results, with the batch's axes first. A batch is divided among the devices of the current mesh.
+        The results, with the batch's axes first unless they are sums. A batch is divided among the devices of the
+        current mesh.
     """
-    library = _library()
-    assert library is not None, "callers ask in_use() first"
+    library = _load()
+    assert not isinstance(library, str), "callers ask in_use() first"
     name = _target_name(library, kernel)
 
     @custom_vmap
     def run(common: Any, batched: Any) -> list[Any]:
-        return _divide(run_share, lead(batched))(common, batched)
+        return _divide(run_share, lead(batched), sums)(common, batched)
 
     def run_share(common: Any, batched: Any) -> list[Any]:
-        shapes = [jax.ShapeDtypeStruct((*lead(batched), *result.shape), result.dtype) for result in results]
+        first = () if sums else lead(batched)
+        shapes = [jax.ShapeDtypeStruct((*first, *result.shape), result.dtype) for result in results]
         return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **(attributes or {})))
 
     def lead(batched: Any) -> tuple[int, ...]:
@@ -130,7 +158,7 @@ def call(
     @run.def_vmap
     def run_batch(size: int, is_batched: Any, common: Any, batched: Any) -> tuple[list[Any], list[bool]]:
         outputs = [True] * len(results)
-        if any(is_batched[0]):
+        if sums or any(is_batched[0]):
             in_axes = tuple([0 if flag else None for flag in flags] for flags in is_batched)
             return jax.vmap(sequential_vmap(run), in_axes)(common, batched), outputs
         batched = [
@@ -142,7 +170,7 @@ def call(
     return run(list(common), list(batched))
 
 
-def _divide(function: Any, lead: tuple[int, ...]) -> Any:
+def _divide(function: Any, lead: tuple[int, ...], sums: bool) -> Any:
     """Divide a batch among the devices of the current mesh by its first axis that they divide."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1 or AxisType.Manual in mesh.axis_types:
@@ -150,5 +178,10 @@ def _divide(function: Any, lead: tuple[int, ...]) -> Any:
     axis = next((number for number, size in enumerate(lead) if size % mesh.size == 0), None)
     if axis is None:
         return function
+
+    def add(*arguments: Any) -> Any:
+        return jax.lax.psum(function(*arguments), mesh.axis_names)
+
     spec = PartitionSpec(*[None] * axis, mesh.axis_names)
-    return jax.shard_map(function, in_specs=(PartitionSpec(), spec), out_specs=spec, check_vma=False)
+    share, out_specs = (add, PartitionSpec()) if sums else (function, spec)
+    return jax.shard_map(share, in_specs=(PartitionSpec(), spec), out_specs=out_specs, check_vma=False)

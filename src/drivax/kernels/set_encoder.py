@@ -41,7 +41,8 @@ def differentiate(
     """Return the gradient of the layers, summed over the batch; the first of equal rows takes all of it."""
     weights = _flat(layers)
     results = [jax.ShapeDtypeStruct(weight.shape, jnp.float32) for weight in weights]
-    kernel1, bias1, kernel2, bias2 = call("differentiate_sets", results, (*weights, rows, winner, gradient))
+    batched, axes = (rows, winner, gradient), winner.ndim - 1
+    kernel1, bias1, kernel2, bias2 = call("differentiate_sets", results, weights, batched, axes, sums=True)
     return (kernel1, bias1), (kernel2, bias2)
 
 

@@ -32,7 +32,7 @@ from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, training_sets
+from drivax.tracking.run_folder import RUN_FILE, RunFolder, kernels_difference, run_and_step, training_sets
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
@@ -117,6 +117,8 @@ def train(
     notes = hashes(validation_set, weights)
     if call.resume:
         config, folders = _resumed_folders(data, notes, out, call.seeds, trust)
+        if difference := kernels_difference(folders[0].info):
+            call.log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
     else:
         RunFolder.check(out, call.overwrite, "training")
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint

@@ -350,6 +350,16 @@ def machine() -> dict[str, Any]:
     }
 
 
+def kernels_difference(info: Mapping[str, Any]) -> str | None:
+    """Return which native kernels a run and this process use, given its ``run.json``; None if they are the same."""
+    machine = info.get("machine")
+    noted = machine.get("kernels", "none") if isinstance(machine, dict) else "none"
+    before, now = (
+        "none" if str(state).startswith("none") else str(state) for state in (noted, kernels.state())
+    )
+    return f"the run used native kernels {before}, this process {now}" if before != now else None
+
+
 def git_state(folder: Path) -> dict[str, Any] | None:
     """Return the commit of the checkout that contains a folder, and whether package or presets are modified.
 

@@ -1,0 +1,42 @@
+"""What a compiled library is for; the build appends it to the file, which is checked before it is loaded.
+
+``native/build.py`` runs this file by its path: it needs only JAX and the standard library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sysconfig
+from pathlib import Path
+
+import jax.ffi
+
+_VERSION = re.compile(r"#define XLA_FFI_API_(?:MAJOR|MINOR) (\d+)")
+
+
+def stamp(sources: Path) -> dict[str, str]:
+    """Return platform, version of XLA's foreign function interface, and hash of the sources, if they are here."""
+    header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h")
+    values = {"platform": sysconfig.get_platform(), "XLA FFI": ".".join(_VERSION.findall(header.read_text()))}
+    if (sources / "build.py").is_file():
+        digest = hashlib.sha256()
+        for path in sorted([*sources.glob("*.[ch]*"), sources / "build.py"]):
+            digest.update(path.read_bytes())
+        values["sources"] = digest.hexdigest()[:12]
+    return values
+
+
+def append_stamp(library: bytes, values: dict[str, str]) -> bytes:
+    """Return a library with its stamp and, as the last line, the SHA-256 of all before."""
+    stamped = library + b"\n" + json.dumps(values).encode()
+    return stamped + b"\n" + hashlib.sha256(stamped).hexdigest().encode()
+
+
+def read_stamp(library: bytes) -> dict[str, str] | None:
+    """Return the stamp of a library; None: it has none, or is not complete."""
+    stamped, _, digest = library.rpartition(b"\n")
+    if hashlib.sha256(stamped).hexdigest().encode() != digest:
+        return None
+    return json.loads(stamped.rpartition(b"\n")[2])
