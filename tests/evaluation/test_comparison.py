@@ -364,7 +364,7 @@ def test_runs_round_trip_and_damaged_files_are_named(tmp_path):
     with pytest.raises(Exception, match="of kind 'training', not evaluation"):
         EpisodeTable.read(written(tmp_path / "train", [], '{"kind": "training"}'))
     for seed in range(2):
-        written(tmp_path / "seeds" / f"seed-{seed}", [f"seed-{seed},d,s1,,0,log,1"])
+        written(tmp_path / "seeds" / f"seed-{seed}", ["p,d,s1,,0,log,1"])
     assert len(EpisodeTable.read_seeds(tmp_path / "seeds")) == 2 and len(EpisodeTable.read_seeds(run)) == 1
     with pytest.raises(Exception, match="run folder not found"):
         EpisodeTable.read_seeds(tmp_path / "nowhere")
