@@ -5,6 +5,7 @@ Each run tries 50 files of a format and 15 of a kind that drivax writes, the slo
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -37,9 +38,8 @@ def test_ten_thousand_damaged_files(repository, name):
 
 def test_damaged_own_files_are_detected_or_unchanged(repository):
     for line in _run(repository, "fuzz.own_files", *OWN, "--files", 15).splitlines():
-        assert '"detected"' in line or '"changed": 1' in line, (
-            "no damage was noticed: the damage is too gentle"
-        )
+        noticed = re.search(r'"detected"|"changed": [1-9]', line)
+        assert noticed, "no damage was noticed: the damage is too gentle"
 
 
 @pytest.mark.slow
