@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def evaluation(folder: Path, planner: str, seed: int = 0) -> Path:
     ids = tuple(f"s{number}" for number in range(EPISODES))
     recordings = tuple(f"r{number // 2}" for number in range(EPISODES))
     keys = {"planner": (planner,), "dataset": ("d",), "seed": ("0",), "traffic": ("log",)}
-    info = {"planner": planner, "traffic": "log"}
+    info: dict[str, Any] = {"planner": planner, "traffic": "log"}
     rollouts = Trajectories(
         rng.normal(size=(EPISODES, 3, 4)).astype(np.float32),
         rng.normal(size=(EPISODES, 2, 2)),
@@ -52,7 +53,8 @@ def evaluation(folder: Path, planner: str, seed: int = 0) -> Path:
         {"success": rng.integers(0, 2, EPISODES).astype(float), "progress_ratio": rng.random(EPISODES)},
         (Crash("d", "s3", 17, "ValueError: no lane"),), rollouts,
     )  # fmt: skip
-    RunFolder.create(folder, EvaluationConfig(planner), kind="evaluation", planner=planner, traffic="log")
+    counts: dict[str, Any] = {"episodes": EPISODES, "seed": 0}
+    RunFolder.create(folder, EvaluationConfig(planner), kind="evaluation", **info, **counts)
     table.write(folder)
     return folder
 
@@ -80,7 +82,7 @@ def folders(tmp_path_factory) -> dict[str, Path]:
     return evaluations | {"training": training(root / "training"), "study": study, "policy": policy}
 
 
-def results(kind: str, folder: Path, other: Path) -> object:
+def results(kind: str, folder: Path, other: Path) -> Any:
     """What drivax prints, draws or decides with the files of a folder."""
     if kind == "evaluation":
         tables, _ = read_runs([other, folder])
@@ -223,9 +225,89 @@ def test_edited_rollouts_and_added_or_deleted_crashes_are_seen(tmp_path):
         EpisodeTable.read(run)
 
 
-def test_folders_of_earlier_versions_and_unfinished_trainings_open(tmp_path):
+def as_earlier_version(run: Path) -> Path:
+    """A run folder without its seal, and without the entry that says that it has one."""
+    (run / SEAL).unlink()
+    info = json.loads((run / "run.json").read_text())
+    assert info.pop("sealed") is True
+    (run / "run.json").write_text(json.dumps(info))
+    return run
+
+
+@pytest.mark.parametrize("kind", ["evaluation", "training", "policy", "study"])
+@pytest.mark.parametrize("content", [None, "{}"])
+def test_lost_seals_are_refused_or_marked(folders, tmp_path, kind, content):
+    run = shutil.copytree(folders[kind], tmp_path / "run")
+    (run / SEAL).unlink()
+    problem = r"seal\.json: is missing; restore it, run the command again, or .* --edited"
+    if content is not None:
+        (run / SEAL).write_text(content)
+        problem = problem.replace("is missing", r"lacks config\.yaml")
+    with pytest.raises(DataError, match=problem):
+        results(kind, run, folders["other"])
+    with allow_edited():
+        found = results(kind, run, folders["other"])
+        assert edited_files() == [str(run / SEAL)]
+        if kind == "evaluation":
+            assert "ours (edited)" in found[0] and "ours (edited)" in found[1]
+        RunFolder.open(run).note(step=3)  # writes a seal, without what it does not know
+    with pytest.raises(DataError, match=r"seal\.json: lacks config\.yaml"):
+        RunFolder.open(run)
+
+
+def test_evaluations_need_the_entries_of_all_results(tmp_path):
+    run = evaluation(tmp_path / "run", "ours")
+    entries = json.loads((run / SEAL).read_text())
+    for name in ("episodes.csv", "summary.json", "crashes.json", "trajectories.npz"):
+        (run / SEAL).write_text(json.dumps({key: value for key, value in entries.items() if key != name}))
+        with pytest.raises(DataError, match=rf"seal\.json: lacks {name}; restore it"):
+            EpisodeTable.read(run)
+
+
+ROW = "ours,d,s3,r1,0,log,"
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda text: text.replace(ROW, "theirs,d,s3,r1,0,log,"), r"record 4: planner is 'theirs', not 'ours' as"),
+        (lambda text: text.replace(ROW, "ours,d,s3,r1,7,log,"), r"record 4: seed is '7', not '0' as in run\.json"),
+        (lambda text: text.replace(ROW, "ours,d,s3,r1,0,idm,"), r"record 4: traffic is 'idm', not 'log' as in run"),
+        (lambda text: text.replace("d,s3,", "d,s2,"), r"record 4: scenario 's2' occurs twice"),
+        (lambda text: text + "ours,d,s99,r9,0,log,1,0.5\n", r"record 13: has 13 rows, not 12 as in run\.json"),
+        (lambda text: text[: text.rindex("ours,")], r"record 11: has 11 rows, not 12 as in run\.json"),
+    ],
+)  # fmt: skip
+def test_rows_are_those_that_the_run_describes(tmp_path, change, problem):
+    """Also where the seal is that of the edited file."""
+    run = evaluation(tmp_path / "run", "ours")
+    file = run / "episodes.csv"
+    text = file.read_text()
+    assert change(text) != text
+    file.write_text(change(text))
+    seal(run, file.name)
+    with pytest.raises(DataError, match=rf"episodes\.csv: {problem}.*; restore it, .* --edited"):
+        EpisodeTable.read(run)
+    with allow_edited():
+        assert EpisodeTable.read(run).name == "ours (edited)"
+
+
+def test_rows_of_other_programs_are_compared_as_far_as_the_run_describes_them(tmp_path):
     run = evaluation(tmp_path / "run", "ours")
     (run / SEAL).unlink()
+    file = run / "run.json"
+    file.write_text('{"kind": "evaluation", "data": [{"hash": null, "scenarios": 10}]}')
+    with pytest.raises(
+        DataError, match=r"record 11: scenario 's10' is one more than the 10 of the set in run\.json"
+    ):
+        EpisodeTable.read(run)
+    file.write_text('{"kind": "evaluation"}')
+    edit(run / "episodes.csv", "ours,d,s3", "ours,d,s2")
+    assert len(EpisodeTable.read(run)) == EPISODES
+
+
+def test_folders_of_earlier_versions_and_unfinished_trainings_open(tmp_path):
+    run = as_earlier_version(evaluation(tmp_path / "run", "ours"))
     edit(run / "episodes.csv", "ours,d,s0", "ours,d,s00")
     assert EpisodeTable.read(run).name == "ours"
     folder = RunFolder.open(training(tmp_path / "training"))

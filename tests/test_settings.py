@@ -147,14 +147,15 @@ def test_scalars_by_the_core_rules(text: str, value: object):
 def test_mistakes_are_named_with_their_path(text: str, message: str):
     with pytest.raises(UsageError, match=message) as error:
         load(text)
-    assert error.value.status == 2
+    assert error.value.status == 2 and error.value.cure
 
 
 def test_missing_settings_and_failed_checks_are_named():
-    with pytest.raises(UsageError, match="'steps' is missing"):
+    with pytest.raises(UsageError, match="'steps' is missing; correct this setting"):
         settings.load(Needy, {})
-    with pytest.raises(UsageError, match="steps are negative; use 0 or more"):
+    with pytest.raises(UsageError, match=r"steps are negative; use 0 or more$") as error:
         settings.load(Needy, {"steps": -1})
+    assert error.value.cure == "use 0 or more"
 
 
 def test_whole_floats_count_as_steps():

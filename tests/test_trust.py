@@ -198,8 +198,9 @@ def test_hostile_names_are_never_imported(folder, untouched):
             file = folder / "config.yaml"
             with pytest.raises(UsageError) as error:
                 settings.load(TrainConfig, values(name), trust=())
-            message = str(error.value)
-            assert "\n" not in message and len(message) < 1000, (name, place, message)
+            message, is_own = str(error.value), name.split(":")[0].split(".")[0] == "drivax"
+            assert name in message and "\n" not in message and len(message) < 1000, (name, place, message)
+            assert error.value.cure and (is_own or "--trust-code" in error.value.cure), (name, place, message)
         file.write_text(text(values(name)))
         with pytest.raises(UsageError, match=r"config\.yaml: "):
             settings.load(TrainConfig, file, trust=())
@@ -330,7 +331,7 @@ def test_other_parts_of_drivax_are_refused(place, name, folder):
     """A name within drivax must lead to a component of the kind that its place takes."""
     with pytest.raises(UsageError) as error:
         settings.load(TrainConfig, PLACES[place](name), trust=())
-    assert name in str(error.value) and "\n" not in str(error.value)
+    assert name in str(error.value) and error.value.cure and "\n" not in str(error.value)
 
 
 def test_policies_of_useless_settings_are_one_line(folder, data):
@@ -378,7 +379,7 @@ def test_wrong_kinds_are_refused_before_a_call(place, thing, folder):
     sys.modules.pop("traps", None)
     with pytest.raises(UsageError) as error:
         settings.load(TrainConfig, PLACES[place](f"traps:{thing}"))
-    assert "\n" not in str(error.value)
+    assert f"traps:{thing}" in str(error.value) and error.value.cure and "\n" not in str(error.value)
     # Places without code of the user's do not even import it.
     traps = sys.modules.get("traps")
     assert traps.calls == [] if place not in ("actions", "start") else traps is None

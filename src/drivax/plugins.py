@@ -112,6 +112,8 @@ def _import(module_name: str, name: str) -> Any:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and f"{module_name}.".startswith(f"{missing}."):
             cure = "install it, add its folder to PYTHONPATH, or run from its folder"
+            if package == "drivax":  # A file may be of a newer version.
+                cure = "upgrade drivax, or do not use this file"
             raise UsageError(f"{name!r}: module {missing!r} not found", cure=cure) from error
         problem = f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}"
         raise UsageError(problem, cure="fix the module") from error

@@ -1,7 +1,7 @@
 """Seals: ``seal.json`` in a folder holds the SHA-256 of the files that decide results, and is written last.
 
 A seal detects accidents and edits, not forgery: a forger can write the seal, too. Files without an entry, such
-as the metrics of an unfinished training, and folders without a seal, are not checked.
+as the metrics of an unfinished training, are not checked; :func:`require_entries` finds the loss of a seal.
 """
 
 from __future__ import annotations
@@ -63,10 +63,22 @@ def check_seal(file: Path) -> None:
         refuse_edited(file, "is missing" if digest is None else problem)
 
 
-def refuse_edited(file: Path, problem: str) -> None:
+def require_entries(folder: Path, *names: str) -> None:
+    """Check that the seal of a folder that was sealed still exists and has entries for these files.
+
+    Raises:
+        DataError: The seal is missing or damaged, or lacks an entry; not in :func:`allow_edited`.
+    """
+    entries = _read(folder / SEAL)
+    if missing := [name for name in names if name not in entries]:
+        has_seal = (folder / SEAL).exists()
+        refuse_edited(folder / SEAL, f"lacks {missing[0]}" if has_seal else "is missing")
+
+
+def refuse_edited(file: Path, problem: str, record: int | str | None = None) -> None:
     """Raise a DataError about an edited file, or note the file where edited files are allowed."""
     if not is_edited_allowed():
-        raise DataError(problem, file=file, cure=_CURE)
+        raise DataError(problem, file=file, record=record, cure=_CURE)
     note_edited(str(file))
 
 

@@ -241,7 +241,9 @@ def test_truncated_and_empty_files_are_refused(sample, tmp_path):
         path = tmp_path / f"scenario_{number}.parquet"
         path.write_bytes(content)
         (bad,) = READER.read(path)
-        assert isinstance(bad, BadRecord) and "\n" not in str(bad.error())
+        assert isinstance(bad, BadRecord)
+        line = str(bad.error())
+        assert line.startswith(f"{path}: ") and bad.cure and "\n" not in line
 
 
 def test_recognise(sample, tmp_path):

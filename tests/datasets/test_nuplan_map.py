@@ -338,7 +338,7 @@ def test_invalid_maps_are_reported(tmp_path, statement, problem):
         db.execute(statement)
     with pytest.raises(DataError, match=problem) as caught:
         features_around(city_map(path), DRIVE)
-    assert caught.value.cure and "\n" not in str(caught.value)
+    assert str(path) in str(caught.value) and caught.value.cure and "\n" not in str(caught.value)
 
 
 def test_maps_are_found_above_the_log_then_by_the_environment(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import struct
 import tracemalloc
 from collections import OrderedDict, defaultdict
@@ -162,12 +163,14 @@ def test_18_damage_is_one_error_and_takes_little_memory(case):
     data = HUGE[case]()
     tracemalloc.start()
     try:
-        with pytest.raises(DataError) as error:
+        with pytest.raises(
+            DataError, match=r"^is a damaged pickle \(.+\); copy or generate the file again$"
+        ) as error:
             pickles.load(data)
         assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:
         tracemalloc.stop()
-    assert "\n" not in str(error.value) and error.value.cure
+    assert "\n" not in str(error.value)
 
 
 def test_18_deep_keys_do_not_end_the_process():
@@ -214,4 +217,5 @@ def test_damaged_bytes_raise_only_data_errors(data):
     try:
         pickles.load(bytes(good[: data.draw(st.integers(0, len(good)))]))
     except DataError as error:
-        assert "\n" not in str(error)
+        assert re.search("pickle|names |not data|more than", error.problem), error
+        assert error.cure and "\n" not in str(error)

@@ -332,7 +332,9 @@ def test_folders_of_several_planners_are_refused():
 def test_impossible_plans_are_refused(change):
     with pytest.raises(UsageError) as caught:
         settings.load(ComparisonPlan, settings.parse_yaml(change))
-    assert "\n" not in str(caught.value) and ";" in str(caught.value)
+    line, cure = str(caught.value), caught.value.cure or ""
+    name = {"secondary": "metric", "{split": "test"}.get(key := change.split(":")[0], key)
+    assert name in line and cure and cure != "correct this setting" and "\n" not in line
 
 
 def test_plans_round_trip():
@@ -364,7 +366,7 @@ def test_runs_round_trip_and_damaged_files_are_named(tmp_path):
     with pytest.raises(Exception, match="of kind 'training', not evaluation"):
         EpisodeTable.read(written(tmp_path / "train", [], '{"kind": "training"}'))
     for seed in range(2):
-        written(tmp_path / "seeds" / f"seed-{seed}", [f"seed-{seed},d,s1,,0,log,1"])
+        written(tmp_path / "seeds" / f"seed-{seed}", ["p,d,s1,,0,log,1"])
     assert len(EpisodeTable.read_seeds(tmp_path / "seeds")) == 2 and len(EpisodeTable.read_seeds(run)) == 1
     with pytest.raises(Exception, match="run folder not found"):
         EpisodeTable.read_seeds(tmp_path / "nowhere")

@@ -2,8 +2,27 @@
 
     python -m fuzz.own_files KIND ... --files 200 --seed 0       (from the folder tests)
 
-Exit status 1 when a file ended in anything else. Every second sample has no seals, so that damage reaches the parsers;
-valid text of another content is accepted there, and for the user's own files (:data:`OWN_TEXT`), and counted.
+Exit status 1 when a file ended in anything else. Every second sample is read with ``--edited``, so that damage reaches
+the parsers; valid text of another content is accepted there, and for the user's own files (:data:`OWN_TEXT`), and
+counted.
+
+What drivax writes, and the kind that has it here:
+
+==========================================  ==========================================================================
+scenario set                                ``set``: manifest (with tags and audit), shards, checksums, lists, seals
+score table                                 ``table``
+evaluation                                  ``run``: configuration, ``run.json``, episodes, summary, crashes,
+                                            trajectories, seal
+training                                    ``training``: configuration, ``run.json``, log, TensorBoard events,
+                                            checkpoints, seal
+exported policy, policy of the zoo          ``policy``: configuration, ``run.json``, parameters, seal
+study                                       ``study``: its file, and its run folder with the results
+export                                      ``export``: GPUDrive and tf.Example files with their notes
+partial folder of a killed process          ``partial``: identity, progress, lock
+pages, pictures, tables as files,           never read by drivax
+``bench`` and ``doctor`` output
+compiled programs                           JAX reads them, of the user only (``tests/test_compilation.py``)
+==========================================  ==========================================================================
 """
 
 from __future__ import annotations
@@ -13,38 +32,46 @@ import hashlib
 import json
 import random
 import shutil
-import signal
 import sys
 import tempfile
-import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from drivax import settings
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
-from drivax.errors import DrivaxError
-from drivax.evaluation.episode_table import EpisodeTable
+from drivax.datasets.conversion import Conversion, convert_file
+from drivax.datasets.export.writer import Export, export
+from drivax.datasets.reader import BadRecord
+from drivax.evaluation.episode_table import Crash, EpisodeTable, Trajectories
+from drivax.evaluation.runner import EvaluationConfig
+from drivax.files import PartialFolder
+from drivax.learning.config import TrainConfig
+from drivax.learning.policies import export_policy, load_policy
+from drivax.learning.training_log import TrainingLog
 from drivax.metrics.catalogue import EVENTS
+from drivax.report.runs import read_runs
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.select import splits
 from drivax.scenario.select.selection import read_names, select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.seal import SEAL, seal
+from drivax.seal import MARK, allow_edited, check_seal, seal
 from drivax.settings import load
-from drivax.studies.definition import StudyDefinition
-from drivax.tracking.checkpoints import pack, unpack
+from drivax.studies.definition import StudyConfig, StudyDefinition
+from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.sinks import JsonLines
 from fuzz import mutations
-from fuzz.run import SECONDS_PER_FILE, Hang, limit_memory
-from fuzz.run import _alarm as alarm
+from fuzz.limits import attempt, complaint, limit_memory
+from fuzz.run import MEMORY_PER_FILE, SECONDS_PER_FILE
 from scenes import car, straight_road
+from tiny_run import write_run as write_tiny_run
 
 SMALL_CAPACITY = replace(
     Capacity(),
@@ -66,17 +93,18 @@ SEALED_TEXT = (
     "episodes.csv",
     "crashes.json",
     "metrics.jsonl",
+    "results.json",
     ".txt",
 )
-OWN_TEXT = ("study.yaml",)
-TREE = {
-    "head": np.arange(12, dtype=np.float32).reshape(3, 4),
-    "body": [np.ones(5, np.float32), np.zeros(0, np.int32)],
-}
+OWN_TEXT = ("study.yaml", "export.json")
+#: Folders whose files may have another content: in a format without checksums, and those that are written again.
+EDITABLE = {"gpudrive", ".out.partial"}
+#: Identity and notes of a partial folder.
+IDENTITY, NOTES = {"seed": 3, "sources": ["a", "b"]}, [{"shard": 0, "ids": ["x"]}, {"shard": 1, "ids": []}]
 
 
 def content(value: Any) -> str:
-    """A digest of nested values and arrays."""
+    """A digest of nested values and arrays, without the mark of edited files."""
     digest = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -92,7 +120,7 @@ def content(value: Any) -> str:
             array = np.asarray(value)
             digest.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
         else:
-            digest.update(repr(value).encode())
+            digest.update(repr(value).replace(MARK, "").encode())
 
     add(value)
     return digest.hexdigest()
@@ -144,72 +172,149 @@ def read_table(folder: Path) -> Any:
 
 
 def write_run(folder: Path) -> None:
-    """An evaluation of two episodes, one of which crashed, with a log of metrics."""
-    (folder / "run.json").write_text(json.dumps({
-        "kind": "evaluation", "planner": "p", "traffic": "idm", "data": [{"path": "s", "hash": "ab", "scenarios": 2}],
-        "own_metrics": {"mine": {"unit": "m", "better": "low", "text": "t"}}, "versions": {"numpy": "2"},
-    }))  # fmt: skip
-    (folder / "config.yaml").write_text(
-        "planner: p\nnoisy_start: false\nseeds: [1, 2]\ntask: {a: 1.5, b: null}\n"
-    )
-    head = "planner,dataset,scenario_id,segment,seed,traffic,success,mine"
-    (folder / "episodes.csv").write_text(f"{head}\np,d,s1,,0,idm,1,0.25\np,d,s2,r,0,idm,0,\n")
-    crash = {"dataset": "d", "scenario_id": "s2", "step": 3, "error": "ValueError: x"}
-    (folder / "crashes.json").write_text(json.dumps([crash]))
-    rng, events = np.random.default_rng(0), {f"{name}_step": np.full(2, -1, np.int16) for name in EVENTS}
-    np.savez_compressed(
-        folder / "trajectories.npz", scenario_id=np.array(["s1", "s2"]), start=np.array([10, 10], np.int32),
-        ego=rng.random((2, 6, 4)).astype(np.float32), action=rng.random((2, 5, 2)).astype(np.float16),
-        others=rng.integers(-9, 9, (2, 6, 3, 3)).astype(np.int16), **events,
+    """An evaluation of two episodes, one of which crashed."""
+    rng, n = np.random.default_rng(0), 2
+    info = {
+        "planner": "p",
+        "traffic": "idm",
+        "own_metrics": {"mine": {"unit": "m", "better": "low", "text": "t"}},
+    }
+    keys = {"planner": ("p",) * n, "dataset": ("d",) * n, "scenario_id": ("s1", "s2"), "segment": ("", "r"),
+            "seed": ("0",) * n, "traffic": ("idm",) * n}  # fmt: skip
+    rollouts = Trajectories(
+        rng.random((n, 6, 4)).astype(np.float32), rng.random((n, 5, 2)), np.full(n, 10),
+        {name: np.full(n, -1) for name in EVENTS}, rng.integers(-9, 9, (n, 6, 3, 3)).astype(np.int16),
     )  # fmt: skip
-    log = JsonLines(folder / "metrics.jsonl")
-    for step in (0, 100):
-        log.write(step, {"loss": 0.5, "return": float("nan")})
-    log.close()
-    seal(folder, *(file.name for file in folder.iterdir()))
+    metrics = {"success": np.array([1.0, 0.0]), "mine": np.array([0.25, np.nan])}
+    table = EpisodeTable(None, "p", info, keys, metrics, (Crash("d", "s2", 3, "ValueError: x"),), rollouts)
+    RunFolder.create(folder / "run", EvaluationConfig("p"), kind="evaluation", episodes=n, seed=0, **info)
+    table.write(folder / "run")
 
 
 def read_run(folder: Path) -> Any:
     """All of an evaluation that reports show."""
-    table, run = EpisodeTable.read(folder), RunFolder.open(folder)
+    table, run = EpisodeTable.read(folder / "run"), RunFolder.open(folder / "run")
     trajectories = table.trajectories
     crashes = [[crash.dataset, crash.scenario_id, crash.step, crash.error] for crash in table.crashes]
-    return [run.info, run.settings, table.keys, dict(table.metrics), crashes, run.read_metrics(), trajectories.ego,
-            trajectories.action, trajectories.start, trajectories.events, trajectories.others, table.summary(),
+    return [run.info, run.settings, table.keys, dict(table.metrics), crashes, trajectories.ego, trajectories.action,
+            trajectories.start, trajectories.events, trajectories.others, table.summary(),
             list(table.own_metrics), dict(table.data)]  # fmt: skip
 
 
+def write_training(folder: Path) -> None:
+    """A finished training of two checkpoints."""
+    run = RunFolder.create(folder / "run", TrainConfig(), kind="training")
+    with TrainingLog(run, "score", keep=2, patience=0) as log:
+        log.start(None)
+        for step in (100, 200):
+            log.write(step, {"loss": 1 / step, "validation/vmax_score": step / 300})
+            log.checkpoints.save(step, {"w": np.arange(3.0), "n": np.zeros(0, np.int32)}, step / 300)
+
+
+def read_training(folder: Path) -> Any:
+    """Learning curves, configuration, and both checkpoints."""
+    (training,) = read_runs([folder / "run"])[1]
+    run, template = RunFolder.open(folder / "run"), {"w": np.zeros(3), "n": np.zeros(0, np.int32)}
+    checkpoints = Checkpoints(run.checkpoints)
+    states = [[checkpoints.about(step), checkpoints.restore(template, step)] for step in checkpoints.steps()]
+    return [
+        training.info,
+        dict(training.curves),
+        settings.dump(run.config(TrainConfig)),
+        checkpoints.best(),
+        states,
+    ]
+
+
+def _bank() -> ScenarioBank:
+    return ScenarioBank.from_scenarios([assemble(straight_road([car(x=40.0)]), SMALL_CAPACITY)])
+
+
 def write_policy(folder: Path) -> None:
-    """The parameters of an exported policy."""
-    pack(folder / "policy.npz", TREE)
+    """An exported policy."""
+    bank = _bank()
+    export_policy(write_tiny_run(folder / "training", bank).path, folder / "policy", bank)
+    shutil.rmtree(folder / "training")
 
 
 def read_policy(folder: Path) -> Any:
-    """The parameters as arrays."""
-    tree = unpack(folder / "policy.npz", TREE)
-    return [tree["head"], *tree["body"]]
+    """Its parameters as arrays, its task and its provenance."""
+    planner, task = load_policy(folder / "policy", _bank())
+    return [
+        *map(np.asarray, jax.tree.leaves(planner)),
+        settings.dump(task),
+        RunFolder.open(folder / "policy").info,
+    ]
 
 
 def write_study(folder: Path) -> None:
-    """The long-tail study as a file of the user."""
+    """The long-tail study as a file of the user, and a run folder with its results."""
     (folder / "study.yaml").write_text(settings.preset("studies/longtail").read_text("utf-8"))
+    run = RunFolder.create(folder / "run", StudyConfig(), kind="study", definition="c0de").path
+    (run / "results.json").write_text('{"claims": []}')
+    seal(run, "results.json")
 
 
 def read_study(folder: Path) -> Any:
-    """The settings of the study."""
-    return settings.dump(load(StudyDefinition, folder / "study.yaml"))
+    """The settings of the study, and the run folder."""
+    run = RunFolder.open(folder / "run")
+    check_seal(run.path / "results.json")
+    definition = settings.dump(load(StudyDefinition, folder / "study.yaml"))
+    return [definition, run.info, settings.dump(run.config(StudyConfig))]
+
+
+#: Formats of exports, and the readers that read them.
+EXPORTS: dict[Any, str] = {"gpudrive": "gpudrive", "tfexample": "womd-example"}
+
+
+def write_export(folder: Path) -> None:
+    """A scenario as GPUDrive JSON and as a tf.Example."""
+    data = write_set(folder)
+    for name in EXPORTS:
+        export(data, folder / name, Export(format=name, limit=1))
+    shutil.rmtree(data)
+
+
+def read_export(folder: Path) -> Any:
+    """The converted scenarios."""
+    found = []
+    for name, reader in EXPORTS.items():
+        for file in sorted(file for file in (folder / name).iterdir() if file.name != "export.json"):
+            for item in convert_file(file, Conversion(format=reader)):
+                if isinstance(item, BadRecord):
+                    if problem := complaint(item.error()):
+                        raise AssertionError(problem)
+                    raise item.error()
+                found.append(item.record.tobytes())
+    return found
+
+
+def write_partial(folder: Path) -> None:
+    """What a killed process leaves of a set of two finished shards."""
+    partial = PartialFolder(folder / "out", IDENTITY)
+    partial.open()
+    (partial.content / "shard").write_text("x")
+    for number, note in enumerate(NOTES):
+        partial.note(number, note)
+    partial.close()
+
+
+def read_partial(folder: Path) -> Any:
+    """The notes that a later process takes over; after damage, the first of those written, or none."""
+    partial = PartialFolder(folder / "out", IDENTITY)
+    notes = partial.open(restart=True)
+    partial.close()
+    if notes != NOTES[: len(notes)]:
+        raise AssertionError(notes)
+    return notes
 
 
 KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "set": (write_set, read_set), "table": (write_table, read_table), "run": (write_run, read_run),
-    "policy": (write_policy, read_policy), "study": (write_study, read_study),
+    "training": (write_training, read_training), "policy": (write_policy, read_policy),
+    "study": (write_study, read_study), "export": (write_export, read_export),
+    "partial": (write_partial, read_partial),
 }  # fmt: skip
-
-
-def remove_seals(folder: Path) -> None:
-    """Remove the seals of a sample, which would find damage before the parsers."""
-    for file in folder.rglob(SEAL):
-        file.unlink()
 
 
 def damage(folder: Path, rng: random.Random) -> tuple[Path, str]:
@@ -231,20 +336,18 @@ def damage(folder: Path, rng: random.Random) -> tuple[Path, str]:
 
 
 def outcome(
-    read: Callable[[Path], Any], folder: Path, expected: str, editable: bool
+    read: Callable[[Path], Any], folder: Path, expected: str, editable: bool, edited: bool = False
 ) -> tuple[str, str | None]:
     """How reading ends: its kind, and what is wrong with that; ``editable`` files may have another content."""
-    try:
-        result = content(read(folder))
-    except DrivaxError as error:
-        return "detected", str(error) if "\n" in str(error) or len(str(error)) > 2000 else None
-    except Hang:
-        return "hang", traceback.format_exc()
-    except BaseException:
-        return "traceback", traceback.format_exc()
-    if result == expected:
-        return "identical", None
-    return "changed", None if editable else "read with another content"
+
+    def compare() -> tuple[str, str | None]:
+        with allow_edited(edited):
+            result = content(read(folder))
+        if result == expected:
+            return "identical", None
+        return "changed", None if editable else "read with another content"
+
+    return attempt(compare, "detected", SECONDS_PER_FILE, MEMORY_PER_FILE)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -254,7 +357,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--files", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
-    signal.signal(signal.SIGALRM, alarm)
     return max(try_kind(kind, args.files, args.seed) for kind in args.kinds)
 
 
@@ -269,17 +371,16 @@ def try_kind(kind: str, files: int, seed: int) -> int:
         whole.mkdir()
         write(whole)
         expected = content(read(whole))
-        limit_memory()
+        limit_memory(MEMORY_PER_FILE)
         for number in range(files):
             rng = random.Random(f"{seed} {kind} {number}")
             shutil.copytree(whole, folder)
-            editable = OWN_TEXT + SEALED_TEXT * (number % 2)
-            if number % 2:
-                remove_seals(folder)
+            edited = number % 2 == 1
             path, how = damage(folder, rng)
-            signal.alarm(SECONDS_PER_FILE)
-            end, problem = outcome(read, folder, expected, path.name.endswith(editable))
-            signal.alarm(0)
+            editable = path.name.endswith(OWN_TEXT + SEALED_TEXT * edited) or not EDITABLE.isdisjoint(
+                path.parts
+            )
+            end, problem = outcome(read, folder, expected, editable, edited)
             ends[end] += 1
             changed[path.name] += end == "changed"
             if problem is not None:

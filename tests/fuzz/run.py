@@ -11,26 +11,22 @@ import argparse
 import importlib
 import json
 import random
-import resource
 import shutil
-import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.formats import find_reader
 from drivax.datasets.reader import BadRecord
-from drivax.errors import DrivaxError
 from drivax.scenario.schema import CAPACITIES, Scenario
 from fuzz import mutations
+from fuzz.limits import attempt, complaint, limit_memory
 
 #: How the files of a format can be damaged beyond their bytes, by the end of their names.
 BY_SUFFIX: dict[str, Callable[[Path, random.Random], None]] = {
@@ -41,16 +37,8 @@ BY_SUFFIX: dict[str, Callable[[Path, random.Random], None]] = {
     ".parquet": mutations.arrow_columns,
     ".feather": mutations.arrow_columns,
 }
-MEMORY = 1 << 30
-SECONDS_PER_FILE = 20
-
-
-class Hang(BaseException):
-    """One file took too long."""
-
-
-def _alarm(*_: object) -> None:
-    raise Hang
+#: Time and memory of a file: damaged samples are small.
+SECONDS_PER_FILE, MEMORY_PER_FILE = 20, 1 << 30
 
 
 def damage(folder: Path, rng: random.Random) -> str:
@@ -90,33 +78,23 @@ def unsound(scenario: Scenario) -> str | None:
 
 def outcome(path: Path, format_name: str) -> tuple[str, str | None]:
     """How reading and assembling one file ends: its kind, and what is wrong with that."""
-    kinds = []
-    try:
+
+    def read() -> tuple[str, str | None]:
+        kinds = []
         for item in convert_file(path, Conversion(format=format_name)):
             if isinstance(item, BadRecord):
-                line = str(item.error())
-                if "\n" in line or "assembling failed" in line:
-                    return "bad error", line
+                if problem := complaint(item.error()):
+                    return "bad error", problem
+                if "assembling failed" in str(item.error()):
+                    return "bad error", str(item.error())
                 kinds.append("bad record")
             elif (wrong := unsound(item)) is not None:
                 return "unsound scenario", wrong
             else:
                 kinds.append("scenario")
-    except DrivaxError as error:
-        return "error", None if "\n" not in str(error) else str(error)
-    except Hang:
-        return "hang", f"more than {SECONDS_PER_FILE} s\n{traceback.format_exc()}"
-    except BaseException:
-        return "traceback", traceback.format_exc()
-    return ("scenario" if "scenario" in kinds else kinds[0] if kinds else "nothing"), None
+        return ("scenario" if "scenario" in kinds else kinds[0] if kinds else "nothing"), None
 
-
-def limit_memory() -> None:
-    """Refuse this process more than 1 GB beyond what it has now."""
-    jax.devices()  # takes a stack for each thread of the backend, many on a large machine
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    return attempt(read, "error", SECONDS_PER_FILE, MEMORY_PER_FILE)
 
 
 def _sample(write: Callable[[Path], Path], scratch: Path) -> tuple[Path, Path]:
@@ -135,7 +113,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     find_reader(args.format)
     sample = importlib.import_module(f"datasets.samples.{args.format.replace('-', '_')}")
-    signal.signal(signal.SIGALRM, _alarm)
     ends: Counter[str] = Counter()
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -145,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if kind != "scenario" or problem:
                 print(f"the sample itself: {kind} {problem}")
                 return 1
-        limit_memory()
+        limit_memory(MEMORY_PER_FILE)
         for number in range(args.files) if args.only is None else (args.only,):
             rng = random.Random(f"{args.seed} {number}")
             folder = Path(scratch) / "damaged"
@@ -153,9 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             shutil.copytree(whole, folder)
             done = damage(folder, rng)
             begin = time.monotonic()
-            signal.alarm(SECONDS_PER_FILE)
             kind, problem = outcome(folder / path, args.format)
-            signal.alarm(0)
             ends[kind] += 1
             if problem is not None:
                 wrong.append(f"file {number} ({done}, {time.monotonic() - begin:.1f} s): {kind}: {problem}")

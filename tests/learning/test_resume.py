@@ -11,10 +11,12 @@ import pytest
 from drivax.errors import DataError
 from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
+from drivax.learning.config import TrainConfig
 from drivax.learning.loop import PretrainedRun, mean_logs, replace_networks
 from drivax.learning.replay import ReplayConfig
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.run_folder import RunFolder
 from pendulum import Demonstrations, Pendulum
 from tiny_algorithms import BC, PPO, SAC
 
@@ -107,10 +109,11 @@ def test_networks_transfer_to_another_run(tmp_path):
     """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
     hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)
     fresh = jax.jit(hot.init)(SHOWN, jax.random.key(5))
+    run = RunFolder.create(tmp_path / "run", TrainConfig(), kind="training")
     for number, (name, expected_paths) in enumerate(TAKEN.items()):
         former = jax.jit(ALGORITHMS[name].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(6))
-        Checkpoints(tmp_path / "checkpoints").save(number, former)
-        origin = PretrainedRun(tmp_path, number, [])
+        Checkpoints(run.checkpoints).save(number, former)
+        origin = PretrainedRun(run.path, number, [])
         if name == "ppo":
             with pytest.raises(DataError, match=r"no \.parameters.*; start from a run with the same network"):
                 origin.networks(fresh)
@@ -129,7 +132,7 @@ def test_networks_transfer_to_another_run(tmp_path):
         assert float(state.log_temperature) == pytest.approx(np.log(0.5))
     # And back into a warm start, where they lie one level deeper.
     both = jax.jit(ALGORITHMS["bc_sac"].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(7))
-    networks = PretrainedRun(tmp_path, list(TAKEN).index("sac"), []).networks(both)
+    networks = PretrainedRun(run.path, list(TAKEN).index("sac"), []).networks(both)
     assert list(networks) == [".parameters", ".learner.critic", ".learner.target"]
     jax.tree.map(
         np.testing.assert_array_equal,

@@ -31,7 +31,7 @@ from drivax.learning.policies import (
 from drivax.planners.planner_traffic import TrafficDriver
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.build.assemble import assemble
-from drivax.seal import allow_edited
+from drivax.seal import allow_edited, seal
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
@@ -129,10 +129,11 @@ def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))
     with pytest.raises(DataError, match=r"config\.yaml: changed since drivax wrote it"):
         load_policy(packed.path, bank)
-    (packed.path / "seal.json").unlink()
+    seal(packed.path, "config.yaml")
     with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
         load_policy(packed.path, bank)
     (packed.path / POLICY_FILE).write_bytes(b"PK")
+    seal(packed.path, POLICY_FILE)
     with pytest.raises(DataError, match=r"policy\.npz: not an \.npz file, or damaged"):
         load_policy(packed.path, bank)
 
@@ -141,7 +142,7 @@ def test_policies_load_without_their_training_traffic(run, bank, tmp_path):
     text = (run.path / "config.yaml").read_text()
     moved = RunFolder.create(tmp_path / "moved", settings.load(TrainConfig, TINY), kind="training")
     (moved.path / "config.yaml").write_text(text.replace("traffic: idm", "traffic: runs/gone"))
-    (moved.path / "seal.json").unlink()
+    seal(moved.path, "config.yaml")
     run.checkpoints.rename(moved.checkpoints)
     try:
         assert weights(load_policy(moved.path, bank)[0])

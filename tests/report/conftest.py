@@ -191,6 +191,19 @@ def write_evaluation(folder: Path, planner: str, scenarios: ScenarioSet, data: P
     return folder
 
 
+def redescribe(folder: Path, **changes: str) -> Path:
+    """Change keys of an evaluation, such as its planner, in ``run.json`` and in every row."""
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(about | changes))
+    with (folder / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with (folder / "episodes.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(row | changes for row in rows)
+    return folder
+
+
 def write_training(folder: Path) -> Path:
     folder.mkdir(parents=True)
     (folder / "run.json").write_text(json.dumps({"kind": "training", "command": "drivax train ppo.yaml"}))

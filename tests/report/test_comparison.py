@@ -14,6 +14,7 @@ from drivax import settings
 from drivax.cli import main
 from drivax.evaluation.plan import ComparisonPlan
 
+from .conftest import redescribe
 from .test_report import Page
 
 PLAN = "primary: progress_ratio\nsecondary: [collision, offroad, red_light]\nminimum_scenarios: 4\nresamples: 200\n"
@@ -166,9 +167,9 @@ def test_seeds_of_one_folder_are_averaged(runs, plan, tmp_path, capsys):
     for number, run in enumerate(runs[1:3]):
         folder = seeds / f"seed-{number}"
         folder.mkdir(parents=True)
-        about = json.loads((run / "run.json").read_text()) | {"planner": f"seed-{number}"}
-        (folder / "run.json").write_text(json.dumps(about))
-        (folder / "episodes.csv").write_text((run / "episodes.csv").read_text())
+        for name in ("run.json", "episodes.csv"):
+            shutil.copy(run / name, folder)
+        redescribe(folder, planner=f"seed-{number}")
     status, out, _ = called(capsys, seeds, runs[0], "--config", plan)
     assert status == 0 and "A  seeds" in out
     assert "A, seeds: 2 seeds: 0.725, 0.825; interquartile mean 0.775" in out

@@ -24,7 +24,7 @@ from drivax.report.runs import Training, read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
-from .conftest import SMALL, make_scenario, offset_path
+from .conftest import SMALL, make_scenario, offset_path, redescribe
 
 VOID = {"meta", "input", "br", "wbr", "link", "img"}
 
@@ -289,9 +289,7 @@ def react(run):
 
 def test_reactive_agents_are_those_of_the_last_run(runs, tmp_path):
     for run in runs[:3]:
-        about = json.loads((run / "run.json").read_text())
-        (run / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
-        react(run)
+        react(redescribe(run, traffic="idm"))
     page = Page(write_report(runs, tmp_path / "report.html").read_text())
     assert "Other agents are drawn as they moved around policy;" in page.text
     episode = json.loads(next(text for kind, text in page.scripts if kind.get("class") == "episode"))
@@ -304,8 +302,7 @@ def test_reactive_agents_are_those_of_the_last_run(runs, tmp_path):
 
 
 def test_runs_in_other_traffic_are_not_compared(runs, tmp_path):
-    about = json.loads((runs[0] / "run.json").read_text())
-    (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
+    redescribe(runs[0], traffic="idm")
     with pytest.raises(DataError, match=r"lacks 'others'"):
         read_runs(runs)
     react(runs[0])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import shutil
 
 import numpy as np
@@ -9,6 +8,8 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.report.episodes import EpisodeGroup, rollouts_of
 from drivax.report.runs import read_runs
+
+from .conftest import redescribe
 
 
 def test_evaluations_and_trainings_are_read(runs, scenarios):
@@ -29,9 +30,7 @@ def test_evaluations_and_trainings_are_read(runs, scenarios):
 
 
 def test_repeated_names_get_the_folder_as_suffix(runs):
-    folder = runs[1]
-    about = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(about | {"planner": "expert"}))
+    redescribe(runs[1], planner="expert")
     evaluations, _ = read_runs(runs)
     assert [run.name for run in evaluations] == ["expert", "expert (constant)", "policy"]
 

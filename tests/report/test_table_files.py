@@ -19,6 +19,8 @@ from drivax.report.pages.report import write_report
 from drivax.report.table_files import write_tables
 from drivax.table import Cell, Column, Table
 
+from .conftest import redescribe
+
 LATEX = next(filter(None, map(shutil.which, ("pdflatex", "xelatex", "tectonic"))), None)
 NASTY = r"50% of_a & b #1 {x} $y^2$ ~ \cmd <i>|é|😀"
 #: What a row may begin with, and what a renderer of Markdown could take for markup.
@@ -27,10 +29,8 @@ HARD = r"[0.5] <lambda> *a* `b` ~~c~~ \|"
 
 @pytest.fixture
 def written(runs, tmp_path):
-    about = json.loads((runs[0] / "run.json").read_text())
-    (runs[0] / "run.json").write_text(json.dumps(about | {"planner": NASTY}))
-    about = json.loads((runs[1] / "run.json").read_text())
-    (runs[1] / "run.json").write_text(json.dumps(about | {"planner": HARD}))
+    redescribe(runs[0], planner=NASTY)
+    redescribe(runs[1], planner=HARD)
     return {file.name: file for file in write_tables(runs, tmp_path / "tables")}
 
 

@@ -30,7 +30,7 @@ from drivax.scenario.schema import (
 )
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
-from drivax.seal import allow_edited, edited_files
+from drivax.seal import allow_edited, edited_files, seal
 
 SMALL = Capacity(
     name="small", agents=3, parked=2, steps=5, segments=8, features=4, lanes=4, lights=2, stops=1, routes=2,
@@ -72,10 +72,10 @@ def scenario_set(tmp_path: Path) -> Path:
 
 
 def edit_manifest(path: Path, **changes: object) -> None:
-    """Change the manifest, and remove the seal that would tell."""
+    """Change the manifest, and seal it again."""
     file = path / "manifest.json"
-    (path / "seal.json").unlink()
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    seal(path, file.name)
 
 
 def test_round_trip(scenario_set: Path):
@@ -575,7 +575,19 @@ def test_errors_are_one_line(scenario_set: Path):
     (scenario_set / "manifest.json").write_text('{\n"a":\n')
     with pytest.raises(DataError) as error:
         ScenarioSet.open(scenario_set)
-    assert "\n" not in str(error.value)
+    file, message = scenario_set / "manifest.json", str(error.value)
+    assert message.startswith(f"{file}: manifest is damaged (") and message.endswith(f"; {store.AGAIN}")
+    assert "\n" not in message
+
+
+def test_sets_without_their_seal_are_refused_or_marked(scenario_set: Path):
+    (scenario_set / "seal.json").unlink()
+    with pytest.raises(DataError, match=r"seal\.json: is missing; restore it, .* --edited"):
+        ScenarioSet.open(scenario_set)
+    with allow_edited():
+        assert len(ScenarioSet.open(scenario_set)) == 7
+        assert edited_files() == [str(scenario_set / "seal.json")]
+    assert len(ScenarioSet.open(as_earlier_version(scenario_set))) == 7
 
 
 def test_default_capacity_opens_with_plain_numpy(tmp_path: Path):

@@ -16,7 +16,7 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.seal import allow_edited
+from drivax.seal import allow_edited, seal
 from drivax.tracking import run_folder as runs
 from drivax.tracking.run_folder import RunFolder
 
@@ -114,7 +114,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
         RunFolder.open(tmp_path)
     run = RunFolder.create(tmp_path / "run", Config())
     (run.path / "run.json").write_text("{")
-    (run.path / "seal.json").unlink()
+    seal(run.path, "run.json")
     with pytest.raises(DataError, match=r"run\.json: is not valid JSON"):
         RunFolder.open(run.path)
 

@@ -22,7 +22,7 @@ from drivax.escaping import csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, read_arrays, read_csv, read_json
 from drivax.scenario.store import ScenarioSet
-from drivax.seal import check_seal, edited_files, mark_edited, seal
+from drivax.seal import check_seal, edited_files, mark_edited, refuse_edited, require_entries, seal
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
 from drivax.tracking.run_folder import CONFIG_FILE, RunFolder, require_file
@@ -46,6 +46,7 @@ NOT_SUMMARISED = tuple(name for name, column in COLUMNS.items() if not column.su
 #: Columns that are 0 if the planner crashed.
 FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
+_FILES = ("episodes.csv", "summary.json", "crashes.json", "trajectories.npz")
 #: Largest table: bytes per row (most rows have 300), and in all.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
 #: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one have 80 million. A
@@ -121,13 +122,18 @@ class EpisodeTable:
         """Read the episodes of a run folder of ``drivax evaluate``; trajectories are read on first access.
 
         Raises:
-            DataError: The folder or a file is missing, damaged or edited, or the run is not an evaluation.
+            DataError: The folder or a file is missing, damaged or edited, the run is not an evaluation, or its rows
+                are not those that ``run.json`` describes.
         """
         run = RunFolder.open(path)
         if run.kind != "evaluation":
             problem, file = f"run is of kind {run.kind!r}, not evaluation", run.path / "run.json"
             raise DataError(problem, file=file, cure="give a folder written by drivax evaluate")
+        if run.is_sealed:
+            require_entries(run.path, *_FILES)
         keys, metrics = _read_columns(run.path / "episodes.csv", _count_scenarios(run.info))
+        if difference := _difference(keys, run.info):
+            refuse_edited(run.path / "episodes.csv", *difference)
         crashes = _read_crashes(run.path / "crashes.json")
         for file in (CONFIG_FILE, "summary.json"):
             check_seal(run.path / file)
@@ -253,7 +259,7 @@ class EpisodeTable:
             start=trajectories.start.astype(np.int32),
             **arrays,
         )
-        seal(folder, "episodes.csv", "summary.json", "crashes.json", "trajectories.npz")
+        seal(folder, *_FILES)
 
     def open_set(self, data: Path | None = None) -> ScenarioSet:
         """Open the scenario set of this evaluation; ``data`` is its path if it has moved.
@@ -337,6 +343,27 @@ def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]
         raise DataError("contains no episodes", file=path, cure=_RERUN)
     columns = {name: np.frombuffer(values, np.float64) for name, values in metrics.items()}
     return {name: tuple(cells) for name, cells in keys.items()}, columns
+
+
+def _difference(keys: Mapping[str, Sequence[str]], info: Mapping[str, Any]) -> tuple[str, int] | None:
+    """Return the first row of ``episodes.csv`` that is not as ``run.json`` says, and what is wrong with it.
+
+    What ``run.json`` does not say, as with other programs, is not compared.
+    """
+    for name in ("planner", "traffic", "seed"):
+        expected = info.get(name)
+        for row, cell in enumerate(keys[name], start=1):
+            if expected is not None and cell != str(expected):
+                return f"{name} is {cell!r}, not {str(expected)!r} as in run.json", row
+    rows, episodes, most = len(keys["scenario_id"]), info.get("episodes"), _count_scenarios(info)
+    scenarios: set[ScenarioKey] = set()
+    for row, scenario in enumerate(zip(keys["dataset"], keys["scenario_id"], strict=True), start=1):
+        if episodes is not None and scenario in scenarios:  # Episodes of other programs may repeat scenarios.
+            return f"scenario {scenario[1]!r} occurs twice", row
+        scenarios.add(scenario)
+        if 0 < most < len(scenarios):
+            return f"scenario {scenario[1]!r} is one more than the {most} of the set in run.json", row
+    return None if episodes in (None, rows) else (f"has {rows} rows, not {episodes} as in run.json", rows)
 
 
 def _parse_metric(path: Path, row: int, name: str, cell: str) -> float:

@@ -134,7 +134,7 @@ def run_evaluation(
             sizes=sizes,
             progress=lambda done, total: bar.update(done),
         )
-    info: dict[str, Any] = {"kind": "evaluation", **table.info}
+    info: dict[str, Any] = {"kind": "evaluation", "episodes": len(table), "seed": config.seed, **table.info}
     if training_sets := planner_training_sets(config.planner):
         info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:

@@ -57,7 +57,7 @@ from drivax.scenario.schema import (
     stored_name,
 )
 from drivax.scenario.select.splits import Shares, write_splits
-from drivax.seal import check_seal, seal
+from drivax.seal import check_seal, require_entries, seal
 
 MANIFEST = "manifest.json"
 #: The cure for a set that cannot be repaired.
@@ -524,6 +524,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
     with explain_damage(file, AGAIN, "manifest is damaged"):
         _check_manifest(manifest, file)
+        is_sealed = any("crc_sha256" in shard for shard in manifest["shards"])
+    if is_sealed:  # Sets of earlier versions have neither these digests nor a seal.
+        require_entries(path, MANIFEST)
     return manifest
 
 

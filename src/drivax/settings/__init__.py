@@ -57,7 +57,11 @@ def load(
     try:
         return structure(values, cls)
     except ValueError as error:
-        raise UsageError(str(error), file=file) from error
+        # Messages end with a cure unless the problem says what is allowed.
+        problem, separator, cure = str(error).rpartition("; ")
+        if not separator:
+            problem, cure = cure, "correct this setting"
+        raise UsageError(problem, file=file, cure=cure) from error
 
 
 def dump(record: Any) -> str:

@@ -28,7 +28,7 @@ from drivax.files import check_output, refuse_link, replace_folder, restore_fold
 from drivax.plugins import is_dotted
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
-from drivax.seal import allow_edited, check_seal, edited_files, note_edited, seal, unseal
+from drivax.seal import allow_edited, check_seal, edited_files, note_edited, require_entries, seal, unseal
 from drivax.tracking.sinks import read_rows
 
 CONFIG_FILE = "config.yaml"
@@ -41,7 +41,8 @@ _RERUN = "run the command again"
 _ENTRIES: dict[str, Any] = {
     **dict.fromkeys(("kind", "planner", "traffic", "started", "command", "weights"), str),
     **dict.fromkeys(("own_metrics", "networks_from", "versions", "divergence"), dict), "data": list | dict,
-    **dict.fromkeys(("trained_on", "edited"), list), "seeds": int, "validation": str | dict,
+    **dict.fromkeys(("trained_on", "edited"), list), **dict.fromkeys(("seeds", "seed", "episodes"), int),
+    "validation": str | dict, "sealed": bool,
 }  # fmt: skip
 _TRAINING_KINDS = ("training", "seeds")
 #: Kinds of runs whose data sets have hashes; tables of other programs may lack them.
@@ -79,7 +80,7 @@ class RunFolder:
         """
         path = Path(path)
         cls.check(path, overwrite, info.get("kind"))
-        info = describe_run(data) | info
+        info = describe_run(data) | info | {"sealed": True}
         with replace_folder(path) as partial:
             write_text(partial / CONFIG_FILE, settings.dump(config))
             write_text(partial / RUN_FILE, _json(info))
@@ -111,7 +112,7 @@ class RunFolder:
         """Open a run folder.
 
         Raises:
-            DataError: The folder or its ``run.json`` is missing, damaged or edited.
+            DataError: The folder, its ``run.json`` or its seal is missing, damaged or edited.
         """
         path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
         file = path / RUN_FILE
@@ -125,12 +126,20 @@ class RunFolder:
         with explain_damage(file, _RERUN):
             _check_info(info)
             note_edited(*map(str, info.get("edited") or ()))
-        return cls(path, info)
+        run = cls(path, info)
+        if run.is_sealed:
+            require_entries(path, CONFIG_FILE)
+        return run
 
     @property
     def kind(self) -> str | None:
         """Kind of the run: ``training``, ``seeds``, ``evaluation``, ``policy``, ..."""
         return self.info.get("kind")
+
+    @property
+    def is_sealed(self) -> bool:
+        """Whether drivax sealed the folder; versions before seals, and other programs, do not say so."""
+        return self.info.get("sealed", False)
 
     def config(self, cls: type[Record], overrides: Sequence[str] = (), trust: Collection[str] = ()) -> Record:
         """Return the run's configuration as a record, with overrides as on a command line.

@@ -328,7 +328,7 @@ class _Around:
         layer = self.city.layers.get(name)
         if layer is None:
             return []
-        forward = _transformer(layer.epsg, self.city.epsg)
+        forward = _transformer(layer.epsg, self.city.epsg, self.city.path)
         return layer.touching(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
 
     def types(self, name: str) -> dict[int, int | None]:
@@ -352,7 +352,7 @@ class _Around:
         with np.errstate(invalid="ignore"):  # coordinates that are NaN
             shapes = shapely.force_2d(geometries(self._database, layer, np.array(rows, np.int64)))
             xy, owner = shapely.get_coordinates(shapes, return_index=True)
-        forward = _transformer(layer.epsg, self.city.epsg)
+        forward = _transformer(layer.epsg, self.city.epsg, self.city.path)
         xy = np.column_stack(forward.transform(xy[:, 0], xy[:, 1]))
         is_far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
         is_damaged = np.bincount(owner[is_far], minlength=len(shapes)) > 0
@@ -373,17 +373,17 @@ class _Around:
 
 
 @functools.lru_cache(maxsize=8)
-def _transformer(source: int, target: int) -> Any:
-    """Return the projection between two EPSG systems, x (east) first."""
+def _transformer(source: int, target: int, file: Path) -> Any:
+    """Return the projection between two EPSG systems that a map names, x (east) first."""
     pyproj = import_extra("pyproj")
     try:
         systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
         if not systems[1].is_projected:
-            raise DataError(f"EPSG:{target} is not a projected coordinate system", cure=CURE)
+            raise DataError(f"EPSG:{target} is not a projected coordinate system", file=file, cure=CURE)
         return pyproj.Transformer.from_crs(*systems, always_xy=True)
     except pyproj.exceptions.ProjError as error:
         problem = f"a coordinate system (EPSG:{source}, EPSG:{target}) is unknown"
-        raise DataError(problem, cure=CURE) from error
+        raise DataError(problem, file=file, cure=CURE) from error
 
 
 def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
