@@ -657,6 +657,27 @@ def test_other_data_or_options_are_not_resumed(thirty, tmp_path):
     assert leftovers(tmp_path) == ["set", "src"]
 
 
+@pytest.mark.parametrize(
+    "changes", [{"place": [3, 0]}, {"place": [0.5, 1]}, {"place": 1}, {"filtered": "x"}, {"skipped": [{"file": 1}]}]
+)  # fmt: skip
+def test_forged_note_is_reported_in_one_line(thirty, tmp_path, changes):
+    def stop(done, files, scenarios):
+        if scenarios == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(thirty, tmp_path / "set", Conversion(shard_size=4), stop)
+    note = tmp_path / ".set.partial" / "progress" / "00000.json"
+    value = json.loads(note.read_text())["value"]
+    value["note"].update(changes)
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+    note.write_text(json.dumps({"sha256": digest, "value": value}))
+    with pytest.raises(
+        DataError, match=r"\.set\.partial: unfinished output is damaged .*; remove this folder"
+    ):
+        convert(thirty, tmp_path / "set", Conversion(shard_size=4))
+
+
 def test_two_conversions_to_one_set_at_once_are_refused(thirty, tmp_path):
     def second(done, files, scenarios):
         if scenarios == 1:

@@ -416,6 +416,8 @@ def test_links_in_place_of_checkpoints_are_no_checkpoints(tmp_path: Path):
     checkpoints.save(1, {"a": 1})
     for name in (path.name, "step-000000003"):
         (checkpoints.folder / name).symlink_to(path)
+    (checkpoints.folder / ".step-1.old-1").symlink_to(path)
+    os.mkfifo(checkpoints.folder / ".step-000000004.partial")
     assert checkpoints.steps() == [1]
     checkpoints.drop_after(1)
     assert [entry.name for entry in checkpoints.folder.iterdir()] == ["step-000000001"]

@@ -8,6 +8,7 @@ fraction of a second; an audit that needs it is passed in.
 from __future__ import annotations
 
 import hashlib
+import operator
 import os
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -24,7 +25,7 @@ from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, with_steps
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
-from drivax.reading import check_regular
+from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
@@ -332,12 +333,15 @@ class _Sink:
         self.filtered = 0
         self.place = (0, 0)
         # Continue after the last closed shard of an interrupted conversion.
-        for note in writer.notes:
-            self.place = tuple(note["place"])
-            self.filtered = note["filtered"]
-            for row in note["skipped"]:
-                file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
-                self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
+        with explain_damage(writer.folder, "remove this folder", "unfinished output is damaged"):
+            for note in writer.notes:
+                file, items = map(operator.index, note["place"])
+                if not 0 <= file < len(data.inputs) or items < 0:
+                    raise ValueError(f"file {file} of {len(data.inputs)}")
+                self.place, self.filtered = (file, items), int(note["filtered"])
+                for row in note["skipped"]:
+                    path = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
+                    self.skipped.append(BadRecord(path, row["record"], str(row["problem"]), row["cure"]))
         self._notes = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import re
-import shutil
 import sys
 import threading
 import zlib
@@ -26,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.files import atomic_write, replace_folder, sync_folder, write_text
+from drivax.files import atomic_write, remove, replace_folder, sync_folder, write_text
 from drivax.reading import check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
@@ -134,10 +133,9 @@ class Checkpoints:
         for other in self.steps():
             if other > step:
                 self._delete(other)
-        for leftover in self.folder.glob(".step-*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        for link in filter(Path.is_symlink, self.folder.glob("step-*")):
-            link.unlink()
+        links = filter(Path.is_symlink, self.folder.glob("step-*"))
+        for leftover in (*self.folder.glob(".step-*"), *links):
+            remove(leftover)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
         """Return the stored state, or a part of it (for example ``.parameters``).
@@ -183,9 +181,9 @@ class Checkpoints:
     def _delete(self, step: int) -> None:
         # Rename it first, so that a partially deleted folder does not look like a checkpoint.
         hidden_folder = self.folder / f".step-{step}.old-{os.getpid()}"
-        shutil.rmtree(hidden_folder, ignore_errors=True)
+        remove(hidden_folder)
         self._path(step).rename(hidden_folder)
-        shutil.rmtree(hidden_folder, ignore_errors=True)
+        remove(hidden_folder)
 
 
 def _is_own(path: Path) -> bool:
