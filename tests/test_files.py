@@ -25,6 +25,7 @@ from drivax.files import (
     explain_full_disk,
     format_bytes,
     free_bytes,
+    inside,
     replace_folder,
     restore_folder,
     write_json,
@@ -400,6 +401,16 @@ def test_symbolic_links_under_hidden_names_are_not_followed(tmp_path: Path):
     folder.close()
     assert names(tmp_path) == {"victim", "file", "run", "set"}
     assert names(victim) == {"file"} and (victim / "file").read_text() == "kept"
+
+
+def test_links_inside_a_folder_are_refused(tmp_path: Path):
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert inside(tmp_path / "link", "new", "file") == tmp_path / "link" / "new" / "file"
+    for names in (("link",), ("link", "file"), ("dangling",)):
+        if names == ("dangling",):
+            (tmp_path / "dangling").symlink_to(tmp_path / "missing")
+        with pytest.raises(DataError, match=f"{names[0]}: is a symbolic link; replace the link by what it"):
+            inside(tmp_path, *names)
 
 
 def test_failure_removes_the_parents_that_it_created(tmp_path: Path):

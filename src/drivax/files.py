@@ -186,15 +186,20 @@ def write_json(path: Path, value: Any, follow: bool = True) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False), follow)
 
 
-def refuse_link(folder: Path) -> Path:
-    """Return a folder inside a run.
+def inside(folder: Path, *names: str) -> Path:
+    """Return ``folder/names[0]/names[1]/...``, to write there; ``folder`` itself may be a symbolic link.
 
     Raises:
-        DataError: It is a symbolic link, by which a stranger's run could write or delete anywhere.
+        DataError: One of the names is a symbolic link, by which a stranger's folder could lead anywhere.
     """
-    if folder.is_symlink():
-        raise DataError("is a symbolic link", file=folder, cure="replace the link by the folder itself")
-    return folder
+    path = folder
+    for name in names:
+        path /= name
+        if path.is_symlink():
+            raise DataError(
+                "is a symbolic link", file=path, cure="replace the link by what it leads to, or remove it"
+            )
+    return path
 
 
 def file_digest(path: Path) -> str:

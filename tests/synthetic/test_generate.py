@@ -252,6 +252,13 @@ def test_disk_space_is_checked_before_the_work(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_benchmark_refuses_links_in_its_folder(tmp_path):
+    (tmp_path / "sets").mkdir()
+    (tmp_path / "sets" / "test").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="sets/test: is a symbolic link; replace the link"):
+        generate_benchmark(tmp_path / "sets", progress=lambda done, total: pytest.fail("drew a scenario"))
+
+
 def test_failed_generation_leaves_no_files(tmp_path):
     def broken(scenarios):
         raise RuntimeError("audit broke")

@@ -281,7 +281,7 @@ def test_checkpoint_of_a_stranger_is_refused_in_one_line(tmp_path: Path, changes
     (tmp_path / "outside").write_bytes(b"secret")
     checkpoints, state = Checkpoints(tmp_path / "checkpoints"), {"a": np.ones(3, np.float32)}
     path = checkpoints.save(1, state, 0.5)
-    (path / "arrays" / "device").symlink_to("/dev/null")
+    os.mkfifo(path / "arrays" / "device")
     edit(path, **changes)
     with pytest.raises(DataError, match="use another checkpoint, or train again") as raised:
         checkpoints.restore(state)
@@ -289,6 +289,19 @@ def test_checkpoint_of_a_stranger_is_refused_in_one_line(tmp_path: Path, changes
     if "files" not in changes or isinstance(changes["files"], list):
         with pytest.raises(DataError, match=r"about\.json: is damaged"):
             checkpoints.best()
+
+
+def test_links_in_a_checkpoint_are_refused(tmp_path: Path):
+    checkpoints, state = Checkpoints(tmp_path / "checkpoints"), {"a": np.ones(3, np.float32)}
+    path = checkpoints.save(1, state)
+    for name in ("arrays", "arrays/manifest.ocdbt", "about.json"):
+        (path / name).rename(tmp_path / "moved")
+        (path / name).symlink_to(tmp_path / "moved")
+        with pytest.raises(DataError, match=f"{name}: is a symbolic link; replace the link"):
+            checkpoints.restore(state)
+        (path / name).unlink()
+        (tmp_path / "moved").rename(path / name)
+    assert (checkpoints.restore(state)["a"] == state["a"]).all()
 
 
 def test_large_about_is_not_read(tmp_path: Path):

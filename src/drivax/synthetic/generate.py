@@ -25,6 +25,7 @@ from types import MappingProxyType
 from typing import Any
 
 from drivax.errors import UsageError
+from drivax.files import inside
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
 from drivax.scenario.select.splits import Shares, parse_shares
@@ -372,7 +373,7 @@ def generate_benchmark(
 
     Raises:
         UsageError: Wrong arguments, or one of the sets exists and is not to be overwritten.
-        DataError: The disk has too little space, or a worker died.
+        DataError: The disk has too little space, a set's name is a symbolic link, or a worker died.
     """
     options = options or Generation()
     options.check()
@@ -385,7 +386,7 @@ def generate_benchmark(
     check_set_space(out, options.sizes, sum(counts.values()))
     for name in SPLITS:
         # Refuses an existing set.
-        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)
+        ScenarioWriter(inside(Path(out), name), options.sizes, overwrite=options.overwrite)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
@@ -399,6 +400,6 @@ def generate_benchmark(
 
         split_options = dataclasses.replace(options, world=world)
         sets[name] = write_set(
-            Path(out) / name, counts[name], split.seed, split_options, notes, report, audit
+            inside(Path(out), name), counts[name], split.seed, split_options, notes, report, audit
         )
     return sets

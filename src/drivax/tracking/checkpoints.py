@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.files import atomic_write, remove, replace_folder, sync_folder, write_text
+from drivax.files import atomic_write, inside, remove, replace_folder, sync_folder, write_text
 from drivax.reading import check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
@@ -245,8 +245,11 @@ def _check_types(about: Mapping[str, Any]) -> None:
 
 
 def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing, damaged, or no regular file."""
-    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if not file.is_dir()}
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or no regular file."""
+    entries = {entry.relative_to(path): entry for entry in sorted(path.rglob("*"))}
+    for name in entries:
+        inside(path, *name.parts)
+    files = {name.as_posix(): entry for name, entry in entries.items() if not entry.is_dir()}
     for file in files.values():
         check_regular(file, _OTHER)
     for name, expected in checksums.items():
