@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zlib
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tensorstore
 
 from drivax.errors import DataError
 from drivax.tracking.checkpoints import Checkpoints, is_part, pack, unpack
@@ -302,6 +304,38 @@ def test_links_in_a_checkpoint_are_refused(tmp_path: Path):
         (path / name).unlink()
         (tmp_path / "moved").rename(path / name)
     assert (checkpoints.restore(state)["a"] == state["a"]).all()
+
+
+def test_state_larger_than_the_memory_is_refused(tmp_path: Path):
+    state = jax.ShapeDtypeStruct((1 << 40,), np.float32)
+    checkpoints, problem = (
+        Checkpoints(tmp_path / "checkpoints"),
+        r"states 4\.4 TB of arrays, more than the .* of memory",
+    )
+    path = checkpoints.save(1, {"a": np.ones(3, np.float32)})
+    edit(path, leaves=[{**checkpoints.about(1)["leaves"][0], "shape": [1 << 40]}])
+    with pytest.raises(DataError, match=f"step-000000001: {problem}; use another checkpoint"):
+        checkpoints.restore({"a": state})
+    (tmp_path / "policy.npz").touch()
+    os.truncate(tmp_path / "policy.npz", 1 << 42)
+    with pytest.raises(DataError, match=rf"policy\.npz: {problem}"):
+        unpack(tmp_path / "policy.npz", {"a": state})
+
+
+def test_chunks_larger_than_their_array_are_refused(tmp_path: Path):
+    """A chunk of equal values unpacks from few bytes to any size."""
+    checkpoints, state = Checkpoints(tmp_path), {"a": np.ones(3, np.float32)}
+    path = checkpoints.save(1, state)
+    arrays = path / "arrays"
+    shutil.rmtree(arrays / "d")
+    shutil.rmtree(arrays / "ocdbt.process_0")
+    (arrays / "manifest.ocdbt").unlink()
+    store = {"driver": "ocdbt", "base": f"file://{arrays}/", "path": "00000/"}
+    metadata = {"shape": [3], "chunks": [1 << 36], "dtype": "<f4"}
+    tensorstore.open({"driver": "zarr", "kvstore": store, "metadata": metadata}, create=True).result()
+    edit(path, files={})
+    with pytest.raises(DataError, match=r"arrays cannot be read \(array 00000 has 3 values, but chunks of"):
+        checkpoints.restore(state)
 
 
 def test_large_about_is_not_read(tmp_path: Path):
