@@ -11,7 +11,7 @@ import hashlib
 import operator
 import os
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,7 +22,7 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, count_text, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
-from drivax.datasets.reader import BadRecord, Reader, with_steps
+from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
 from drivax.reading import check_regular, explain_damage
@@ -286,20 +286,31 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
     """Return what a conversion shares with one that it resumes.
 
-    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read.
-    Companions (maps, poses) are not compared.
+    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
+    companions (maps, poses, tables) included.
     """
-    digest = hashlib.sha256()
-    for entry in data.inputs:
-        size, ends = _ends(entry.path)
-        digest.update(f"{data.relative(entry.path)}\t{size}\t{entry.format}\t{ends}\n".encode())
+    companions = {
+        file: None
+        for entry in data.inputs if entry.format is not None
+        for file in companion_files(find_reader(entry.format), entry.path)
+    }  # fmt: skip
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
-        "files": digest.hexdigest(),
+        "files": _digest(data, {entry.path: entry.format for entry in data.inputs}),
+        "companions": _digest(data, companions),
         "audit": has_audit,
         **{name: value for name, value in vars(options).items() if name not in _WITHOUT_EFFECT},
     }
+
+
+def _digest(data: Survey, formats: Mapping[Path, str | None]) -> str:
+    """Return the SHA-256 (hex) of names, sizes, formats and ends of files."""
+    digest = hashlib.sha256()
+    for path, name in formats.items():
+        size, ends = _ends(path)
+        digest.update(f"{data.relative(path)}\t{size}\t{name}\t{ends}\n".encode())
+    return digest.hexdigest()
 
 
 def _ends(path: Path) -> tuple[int, str]:
