@@ -10,7 +10,10 @@ from typing import Any
 
 #: Begins a formula in spreadsheets, or hides the character that does; numbers are safe.
 _FORMULA = r"(?=[=+\-@\t\r\n])(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
-_ACTIVE, _NEUTRAL = re.compile(f"'*{_FORMULA}"), re.compile(f"'+{_FORMULA}")
+#: Where a spreadsheet may begin a cell: at the beginning, and after what separates cells in some country or program.
+_AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", r"\"*[=+\-@]"
+_ACTIVE = re.compile(rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})")
+_NEUTRAL = re.compile(rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})")
 _QUOTED = re.compile(r'[,"\r\n]')
 #: Controls (C0, DEL, C1), marks and overrides of direction, line separators, and undecodable bytes of file names.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -27,7 +30,10 @@ def show(text: object = "", file: Any = None) -> None:
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`)."""
+    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`).
+
+    This includes text after a separator in a cell, such as ``;=1``: some spreadsheets begin a cell there.
+    """
     return "".join(",".join(_csv_cell(str(cell)) for cell in row) + "\n" for row in rows)
 
 
@@ -36,9 +42,9 @@ def csv_rows(text: str) -> list[list[str]]:
     rows = list(csv.reader(io.StringIO(text, newline="")))
     if "'" not in text:
         return rows
-    return [[cell[1:] if _NEUTRAL.match(cell) else cell for cell in row] for row in rows]
+    return [[_NEUTRAL.sub("", cell) for cell in row] for row in rows]
 
 
 def _csv_cell(cell: str) -> str:
-    cell = f"'{cell}" if _ACTIVE.match(cell) else cell
+    cell = _ACTIVE.sub("'", cell)
     return '"' + cell.replace('"', '""') + '"' if _QUOTED.search(cell) else cell
