@@ -30,7 +30,8 @@ def rows_of(text: str) -> list[list[str]]:
 def test_formulas_become_text_and_are_read_back(text):
     written = csv_text([[text, "0.5"]])
     (cells,) = csv.reader(io.StringIO(written, newline=""))
-    assert cells == [f"'{text}", "0.5"]
+    blank, formula = (text[0], f"'{text[1:]}") if text[0].isspace() else ("", text)
+    assert cells == [f"'{blank}{formula}", "0.5"]
     assert rows_of(written) == [[text, "0.5"]]
 
 
@@ -47,7 +48,7 @@ def test_numbers_and_other_text_are_written_as_before(text):
 def test_any_cells_are_read_back_and_none_begins_a_formula():
     rng = random.Random(0)
     rows = [
-        ["".join(rng.choices("=+-@\t\r\n'\",0.e a\u00e9", k=rng.randrange(6))) for _ in range(5)]
+        ["".join(rng.choices("=+-@\t\r\n'\",;|0.e a\u00e9", k=rng.randrange(8))) for _ in range(5)]
         for _ in range(2000)
     ]
     rows = [["key", *row] for row in rows]
@@ -56,6 +57,16 @@ def test_any_cells_are_read_back_and_none_begins_a_formula():
         for cell in row:
             if cell[:1] in tuple("=+-@\t\r\n"):
                 float(cell)
+
+
+@pytest.mark.parametrize("text", [";=1+1", ",=1", "a|@b", "a\t-b", "a\n=1", ';"=1"', ";'=1", "a;;+1;=2"])
+def test_formulas_after_separators_become_text(text):
+    """With other separators, spreadsheets split cells in which drivax sees no separator."""
+    written = csv_text([["x", text]])
+    assert csv_rows(written) == [["x", text]]
+    for separator in ";,|\t":
+        for row in csv.reader(io.StringIO(written, newline=""), delimiter=separator):
+            assert all(cell[:1] not in tuple("=+-@") for cell in row if cell), row
 
 
 def test_names_cannot_control_a_terminal(capsys, tmp_path):

@@ -25,6 +25,7 @@ from drivax.files import (
     explain_full_disk,
     format_bytes,
     free_bytes,
+    inside,
     replace_folder,
     restore_folder,
     write_json,
@@ -402,6 +403,16 @@ def test_symbolic_links_under_hidden_names_are_not_followed(tmp_path: Path):
     assert names(victim) == {"file"} and (victim / "file").read_text() == "kept"
 
 
+def test_links_inside_a_folder_are_refused(tmp_path: Path):
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert inside(tmp_path / "link", "new", "file") == tmp_path / "link" / "new" / "file"
+    for names in (("link",), ("link", "file"), ("dangling",)):
+        if names == ("dangling",):
+            (tmp_path / "dangling").symlink_to(tmp_path / "missing")
+        with pytest.raises(DataError, match=f"{names[0]}: is a symbolic link; replace the link by what it"):
+            inside(tmp_path, *names)
+
+
 def test_failure_removes_the_parents_that_it_created(tmp_path: Path):
     with pytest.raises(ZeroDivisionError), replace_folder(tmp_path / "a" / "b" / "run"):
         raise ZeroDivisionError
@@ -422,6 +433,82 @@ def test_changed_note_does_not_count(tmp_path: Path):
     folder = PartialFolder(tmp_path / "set", {"seed": 1})
     assert folder.open() == []
     folder.close()
+
+
+#: Makes what drivax never writes under a hidden name.
+LITTER = {
+    "garbage": lambda path: path.write_bytes(b"\xff\0{["),
+    "large number": lambda path: path.write_text("1" * 10_000),
+    "nested": lambda path: path.write_text("[" * 100_000),
+    "sparse": lambda path: (path.touch(), os.truncate(path, 1 << 40)),
+    "folder": lambda path: (path / "entry").mkdir(parents=True),
+    "pipe": os.mkfifo,
+    "link": lambda path: path.symlink_to("/etc/hostname"),
+    "circular link": lambda path: path.symlink_to(path.name),
+}
+
+
+@pytest.fixture
+def alarm():
+    """Raise TimeoutError in a test that waits for a pipe."""
+
+    def ring(*_: object):
+        raise TimeoutError
+
+    former = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, former)
+
+
+@pytest.mark.parametrize("kind", LITTER)
+@pytest.mark.parametrize(
+    "name", ["", "lock", "identity.json", "progress", "progress/00000.json", "content", "old"]
+)
+def test_litter_under_hidden_names_is_replaced(tmp_path: Path, kind: str, name: str, alarm: None):
+    for use in ("resume", "replace", "restore", "write a file"):
+        path = tmp_path / use / "out"
+        litter = started(path, {"seed": 1}).root / name
+        files.remove(litter)
+        LITTER[kind](litter)
+        if use == "resume":
+            folder = PartialFolder(path, {"seed": 1})
+            for number in range(len(folder.open()), 2):
+                folder.note(number, {})
+            folder.publish()
+            folder.close()
+        elif use == "write a file" and not can_resume(path):
+            write_text(path, "")
+        elif use == "replace":
+            with replace_folder(path):
+                pass
+        else:
+            restore_folder(path)
+            continue
+        assert names(path.parent) == {"out"}
+
+
+def test_notes_after_the_intact_ones_are_removed(tmp_path: Path):
+    progress = started(tmp_path / "set", {"seed": 1}).root / "progress"
+    (progress / "00001.json").mkdir()
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == [{"part": "first"}]
+    folder.note(1, {})
+    assert names(progress) == {"00000.json", "00001.json"}
+    folder.close()
+
+
+def test_file_does_not_replace_the_unfinished_folder_of_another_command(tmp_path: Path):
+    folder = PartialFolder(tmp_path / "out", {"seed": 1})
+    folder.open()
+    with pytest.raises(UsageError, match="another process is writing it"):
+        write_text(tmp_path / "out", "")
+    folder.note(0, {})
+    folder.close()
+    with pytest.raises(UsageError, match="an unfinished output was started with other data"):
+        write_text(tmp_path / "out", "")
+    assert can_resume(tmp_path / "out")
 
 
 # --- Errors of the system.

@@ -9,7 +9,10 @@ from typing import Any
 
 #: Begins a formula in spreadsheets, or hides the character that does; numbers are safe.
 _FORMULA = r"(?=[=+\-@\t\r\n])(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
-_ACTIVE, _NEUTRAL = re.compile(f"'*{_FORMULA}"), re.compile(f"'+{_FORMULA}")
+#: Where a spreadsheet may begin a cell: at the beginning, and after what separates cells in some country or program.
+_AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", r"\"*[=+\-@]"
+_ACTIVE = re.compile(rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})")
+_NEUTRAL = re.compile(rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})")
 _QUOTED = re.compile(r'[,"\r\n]')
 #: Controls (C0, DEL, C1), marks and overrides of direction, line separators, and undecodable bytes of file names.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -26,16 +29,19 @@ def show(text: object = "", file: Any = None) -> None:
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`)."""
+    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`).
+
+    This includes text after a separator in a cell, such as ``;=1``: some spreadsheets begin a cell there.
+    """
     return "".join(",".join(_csv_cell(str(cell)) for cell in row) + "\n" for row in rows)
 
 
 def csv_rows(lines: Iterable[str]) -> Iterator[list[str]]:
     """Yield the rows of :func:`csv_text` from its lines, with the cells as they were."""
     for row in csv.reader(lines):
-        yield [cell[1:] if cell[:1] == "'" and _NEUTRAL.match(cell) else cell for cell in row]
+        yield [_NEUTRAL.sub("", cell) if "'" in cell else cell for cell in row]
 
 
 def _csv_cell(cell: str) -> str:
-    cell = f"'{cell}" if _ACTIVE.match(cell) else cell
+    cell = _ACTIVE.sub("'", cell)
     return '"' + cell.replace('"', '""') + '"' if _QUOTED.search(cell) else cell

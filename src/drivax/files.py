@@ -9,8 +9,9 @@ While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
     old/           the replaced ``sets/a``, on disks that cannot exchange two folders
     spool*/        temporary files of the writer
 
-The next writer of ``sets/a`` takes over what a killed process left. Symbolic links to outputs, which the user names,
-are followed; links inside them, which a stranger may have made, are replaced or refused.
+The next writer of ``sets/a`` takes over what a killed process left. If a note is damaged, too large or no regular file,
+its part is written again; whatever else drivax does not create under a hidden name is removed. Symbolic links to
+outputs, which the user names, are followed; links inside them, which a stranger may have made, are replaced or refused.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+import stat
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,8 +36,12 @@ from drivax.errors import MAKE_ROOM, DataError, UsageError
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 #: Errors of disks without locks or without exchange.
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
+#: Files of a partial folder; all else are folders.
+_FILES = ("identity.json", "lock")
 #: What a later process needs to resume a partial folder.
-_RESUMABLE = ("content", "progress", "identity.json", "lock")
+_RESUMABLE = ("content", "progress", *_FILES)
+#: Largest note that is read, in bytes.
+_MOST_NOTE = 64 << 20
 #: Files that a process opens besides those of its data.
 _OTHER_FILES = 128
 
@@ -151,6 +157,10 @@ def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)
+    if _is_own(partial, folder=True):  # of a folder of this name, which another process may write or resume
+        folder = PartialFolder(target)
+        folder.open()
+        folder.close()
     with explain_full_disk(path, size), _open_locked(partial, wait=True) as file:
         try:
             file.truncate()  # a killed process may have left it
@@ -176,15 +186,20 @@ def write_json(path: Path, value: Any, follow: bool = True) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False), follow)
 
 
-def refuse_link(folder: Path) -> Path:
-    """Return a folder inside a run.
+def inside(folder: Path, *names: str) -> Path:
+    """Return ``folder/names[0]/names[1]/...``, to write there; ``folder`` itself may be a symbolic link.
 
     Raises:
-        DataError: It is a symbolic link, by which a stranger's run could write or delete anywhere.
+        DataError: One of the names is a symbolic link, by which a stranger's folder could lead anywhere.
     """
-    if folder.is_symlink():
-        raise DataError("is a symbolic link", file=folder, cure="replace the link by the folder itself")
-    return folder
+    path = folder
+    for name in names:
+        path /= name
+        if path.is_symlink():
+            raise DataError(
+                "is a symbolic link", file=path, cure="replace the link by what it leads to, or remove it"
+            )
+    return path
 
 
 def file_digest(path: Path) -> str:
@@ -234,19 +249,19 @@ class PartialFolder:
             UsageError: Another process is writing the folder, or its unfinished content has another identity.
         """
         self._new_parents = [parent for parent in self._target.parents if not parent.exists()]
-        self._take_lock()
         try:
-            for entry in self.root.iterdir():
-                _unlink_link(entry)
+            self._take_lock()
             self._restore()
             notes = self._read_notes(restart)
         except BaseException:
             self._release()
             raise
         try:
-            self._clear(_RESUMABLE if notes else ("lock",))
+            _clear(self.root, _RESUMABLE if notes else ("lock",))
             if not notes:
                 self._start()
+            elif self.identity is not None:
+                _clear(self.root / "progress", {_note_name(number) for number in range(len(notes))})
         except BaseException:
             self.close()
             raise
@@ -257,7 +272,7 @@ class PartialFolder:
         if self.identity is not None:
             sync_folder(self.content)
             note = {"sha256": _digest(value), "value": value}
-            write_json(self.root / "progress" / f"{number:05d}.json", note)
+            write_json(self.root / "progress" / _note_name(number), note)
 
     def publish(self) -> None:
         """Rename the content to its final name; an existing folder keeps the name until that moment."""
@@ -276,7 +291,7 @@ class PartialFolder:
         """Release the lock, and remove all files but finished parts that a later process can resume."""
         self._restore()
         resumable = self.content.is_dir() and any((self.root / "progress").glob("*.json"))
-        self._clear(_RESUMABLE if resumable else ("lock",))
+        _clear(self.root, _RESUMABLE if resumable else ("lock",))
         if not resumable:  # The lock goes last: another process must not start while files are being removed.
             (self.root / "lock").unlink(missing_ok=True)
             for folder in (self.root, *self._new_parents):
@@ -307,7 +322,7 @@ class PartialFolder:
             raise UsageError(problem, file=self.path, cure=cure)
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
-            note = _read_json(self.root / "progress" / f"{len(notes):05d}.json")
+            note = _read_json(self.root / "progress" / _note_name(len(notes)))
             if not isinstance(note, dict) or _digest(note.get("value")) != note.get("sha256"):
                 break
             notes.append(note["value"])
@@ -319,22 +334,15 @@ class PartialFolder:
             (self.root / "progress").mkdir()
             write_json(self.root / "identity.json", self.identity)
 
-    def _clear(self, keep: tuple[str, ...]) -> None:
-        for entry in self.root.iterdir():
-            if entry.name in keep:
-                continue
-            if entry.is_dir():
-                shutil.rmtree(entry, ignore_errors=True)
-            else:
-                entry.unlink()
-
     def _take_lock(self) -> None:
-        _unlink_link(self.root)
+        _remove_foreign(self.root, folder=True)
         try:
             self._lock = _open_locked(self.root / "lock")
         except BlockingIOError as error:
             cure = "wait for it, or choose another name"
             raise UsageError("another process is writing it", file=self.path, cure=cure) from error
+        for entry in self.root.iterdir():
+            _remove_foreign(entry, folder=entry.name not in _FILES)
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -373,10 +381,38 @@ def _follow(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _unlink_link(path: Path) -> None:
-    """Remove a symbolic link under a hidden name, which is not drivax's and may lead anywhere."""
-    if path.is_symlink():
-        path.unlink()
+def remove(path: Path) -> None:
+    """Remove whatever has a name: a folder with its content, or a file; of a symbolic link, the link."""
+    if _is_own(path, folder=True):
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _is_own(path: Path, folder: bool) -> bool:
+    """Return whether a path is a folder or regular file itself, not a pipe or a link, which may lead anywhere."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISDIR(mode) if folder else stat.S_ISREG(mode)
+
+
+def _remove_foreign(path: Path, folder: bool) -> None:
+    """Remove what has a hidden name but is not of the kind, folder or file, that drivax creates there."""
+    if not _is_own(path, folder):
+        remove(path)
+
+
+def _clear(folder: Path, keep: Collection[str]) -> None:
+    """Remove all but some entries of a folder."""
+    for entry in folder.iterdir():
+        if entry.name not in keep:
+            remove(entry)
+
+
+def _note_name(number: int) -> str:
+    return f"{number:05d}.json"
 
 
 def _hidden_path(path: Path) -> Path:
@@ -388,7 +424,7 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as cleanup:
-            _unlink_link(path)
+            _remove_foreign(path, folder=False)
             path.touch()
             file = cleanup.enter_context(path.open("r+b"))
             try:
@@ -421,7 +457,10 @@ def _digest(value: Any) -> str:
 
 
 def _read_json(path: Path) -> Any:
+    """Return the JSON value of a note; None if drivax did not write it."""
     try:
-        return json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
-        return None
+        if _is_own(path, folder=False) and path.stat().st_size <= _MOST_NOTE:
+            return json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        pass
+    return None

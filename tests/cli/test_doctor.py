@@ -166,6 +166,12 @@ def test_scenario_sets_are_referred_to_inspect(tmp_path, capsys):
     convert(tmp_path / "shard.tfrecord", tmp_path / "set")
     status, out = asked(tmp_path / "set", capsys)
     assert status == 1 and "a scenario set of drivax already" in out and "drivax inspect" in out
+    assert "seal.json" not in out and "changed" not in out
+    manifest = tmp_path / "set" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("shard.tfrecord", "other.tfrecord") + " ")
+    assert "manifest.json: changed since drivax wrote it" in asked(tmp_path / "set", capsys)[1]
+    (tmp_path / "set" / "seal.json").unlink()
+    assert "seal.json: is missing, as in folders of earlier versions" in asked(tmp_path / "set", capsys)[1]
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow
 import pytest
 
+from datasets.samples import av2_motion, av2_sensor, nuplan, nuscenes
 from drivax.cli import main
 from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.doctor import estimate
@@ -655,6 +656,59 @@ def test_other_data_or_options_are_not_resumed(thirty, tmp_path):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4))
     assert convert(thirty, tmp_path / "set", Conversion(shard_size=4, overwrite=True)).written == 0
     assert leftovers(tmp_path) == ["set", "src"]
+
+
+@pytest.mark.parametrize(
+    ("sample", "companion"),
+    [
+        (av2_motion.write, "log_map_archive_*.json"),
+        (av2_sensor.write, "log_map_archive_*.json"),
+        (av2_sensor.write, "city_SE3_egovehicle.feather"),
+        (nuplan.write_full, "map.gpkg"),
+        (nuplan.write_full, "nuplan-maps-*.json"),
+        (nuscenes.write, "expansion/*.json"),
+        (nuscenes.write, "ego_pose.json"),
+    ],
+)
+def test_conversion_is_not_resumed_with_other_companions(tmp_path, sample, companion):
+    (tmp_path / "src").mkdir()
+    path = sample(tmp_path / "src")
+    (file,) = [file for file in (tmp_path / "src").rglob("*") if file.match(companion)]
+    content = file.read_bytes()
+
+    def stop(done, files, scenarios):
+        raise KeyboardInterrupt
+
+    for src in (path, tmp_path / "src"):
+        out = tmp_path / f"set of {src.name}"
+        with pytest.raises(KeyboardInterrupt):
+            convert(src, out, Conversion(shard_size=1), stop)
+        file.write_bytes(content + b" ")
+        with pytest.raises(UsageError, match=r"other options \(companions\).*--overwrite to start again"):
+            convert(src, out, Conversion(shard_size=1))
+        file.write_bytes(content)
+        assert convert(src, out, Conversion(shard_size=1)).written == 1
+
+
+@pytest.mark.parametrize(
+    "changes", [{"place": [3, 0]}, {"place": [0.5, 1]}, {"place": 1}, {"filtered": "x"}, {"skipped": [{"file": 1}]}]
+)  # fmt: skip
+def test_forged_note_is_reported_in_one_line(thirty, tmp_path, changes):
+    def stop(done, files, scenarios):
+        if scenarios == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(thirty, tmp_path / "set", Conversion(shard_size=4), stop)
+    note = tmp_path / ".set.partial" / "progress" / "00000.json"
+    value = json.loads(note.read_text())["value"]
+    value["note"].update(changes)
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+    note.write_text(json.dumps({"sha256": digest, "value": value}))
+    with pytest.raises(
+        DataError, match=r"\.set\.partial: unfinished output is damaged .*; remove this folder"
+    ):
+        convert(thirty, tmp_path / "set", Conversion(shard_size=4))
 
 
 def test_two_conversions_to_one_set_at_once_are_refused(thirty, tmp_path):

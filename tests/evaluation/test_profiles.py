@@ -1,6 +1,7 @@
 """The devkit profile: inputs from scenarios and runs, and the table of both definitions."""
 
 import csv
+import shutil
 from dataclasses import replace
 from itertools import combinations
 
@@ -125,6 +126,19 @@ def test_scenario_of_another_set_is_refused(data, run):
     moved = replace(table, keys={**table.keys, "scenario_id": ("free", "elsewhere")})
     with pytest.raises(DataError, match="record elsewhere: is not in the scenario set"):
         devkit_rows(moved, data)
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_judge_does_not_write_through_a_link(data, run, tmp_path, capsys, exists):
+    out, victim = tmp_path / "run", tmp_path / "victim"
+    shutil.copytree(run[1], out)
+    (out / "devkit.csv").unlink(missing_ok=True)
+    (out / "devkit.csv").symlink_to(victim)
+    if exists:
+        victim.write_text("kept")
+    assert main(["judge", str(out), "--overwrite"]) == 1
+    assert "devkit.csv: is a symbolic link; replace the link" in capsys.readouterr().err
+    assert victim.exists() == exists and (not exists or victim.read_text() == "kept")
 
 
 def test_judge_writes_and_prints_both_definitions(data, run, capsys):

@@ -34,6 +34,18 @@ def written(runs, tmp_path):
     return {file.name: file for file in write_tables(runs, tmp_path / "tables")}
 
 
+@pytest.mark.parametrize("name", ["tables", "tables/results.csv", "videos", "report.html"])
+def test_report_does_not_write_through_links_in_a_run(runs, tmp_path, capsys, name):
+    victim, link = tmp_path / "victim", runs[0] / name
+    victim.mkdir()
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(victim / "file" if "." in name else victim)
+    options = {"tables": ["--tables"], "videos": ["--video", "worst:1"]}.get(name.split("/")[0], [])
+    assert main(["report", str(runs[0]), *options, "--overwrite"]) == 1
+    assert f"{name}: is a symbolic link; replace the link" in capsys.readouterr().err
+    assert not any(victim.iterdir())
+
+
 def test_each_table_has_three_files(written):
     names = {name.rsplit(".", 1)[0] for name in written}
     assert names == {"results", "differences", "collisions", "by-difficulty"} and len(written) == 12

@@ -683,6 +683,21 @@ def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"shard": 1}, {"scenarios": None}, {"scenarios": [{}, {}]}, {"file": "../shard-00001.npy"}, {"count": 2.0}],
+)  # fmt: skip
+def test_forged_note_costs_its_shard_only(tmp_path: Path, changes: dict):
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=5)
+    note = tmp_path / ".set.partial" / "progress" / "00001.json"
+    value = json.loads(note.read_text())["value"]
+    (value if changes.keys() <= value.keys() else value["shard"]).update(changes)
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+    note.write_text(json.dumps({"sha256": digest, "value": value}))
+    assert continued(tmp_path / "set") == [2]
+
+
 @pytest.mark.parametrize("damage", ["flip", "delete", "delete checksums", "truncate", "note counts less"])
 def test_damaged_shard_of_an_unfinished_set_is_written_again(tmp_path: Path, damage: str):
     continued(tmp_path / "whole")

@@ -2,8 +2,22 @@
 
 from pathlib import Path
 
+import pytest
+
+from drivax.errors import DataError
 from drivax.stats.intervals import Interval
-from drivax.studies.demo import Demo
+from drivax.studies.demo import Demo, run_demo
+
+
+@pytest.mark.parametrize(
+    "name", ["sets", "training", "training/policy", "evaluation/expert", "report.html", "demo.json"]
+)
+def test_demo_refuses_links_in_its_folder(tmp_path, name):
+    out, elsewhere = tmp_path / "demo", tmp_path / "elsewhere"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).symlink_to(elsewhere)
+    with pytest.raises(DataError, match=f"{name}: is a symbolic link; replace the link"):
+        run_demo(out, overwrite=True, log=pytest.fail)
 
 
 def test_difference_of_a_single_scenario_has_no_interval():

@@ -11,7 +11,7 @@ from drivax.cli import main
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -458,6 +458,36 @@ def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     fewer = replace(LONGTAIL, claims=LONGTAIL.claims[:-1])
     with pytest.raises(UsageError, match="contains a study with another definition"):
         runner._open_folder(Study(fewer, StudyConfig(), sets, tmp_path / "study"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "runs",
+        "runs/bc/seed-0",
+        "drives",
+        "scores/x.npz",
+        "test",
+        "results.json",
+        "report.html",
+        "critical.html",
+    ],
+)
+def test_links_in_the_folder_of_a_study_are_refused(data, tmp_path, name):
+    """Nothing is read, trained or written behind them."""
+    elsewhere, link = tmp_path / "elsewhere", tmp_path / "study" / name
+    elsewhere.mkdir()
+    study = Study(LONGTAIL, StudyConfig(), StudySets(data.path, data.path, (data.path,)), tmp_path / "study")
+    runner._open_folder(study)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(elsewhere)
+    uses = {
+        "runs/bc/seed-0": lambda: runner._is_finished(runner.Job(study, "bc", 0, np.zeros((1, 1), bool))),
+        "scores/x.npz": lambda: study.scores("x"),
+    }
+    with pytest.raises(DataError, match=f"{name}: is a symbolic link; replace the link"):
+        uses.get(name, lambda: runner._open_folder(study))()
+    assert not any(elsewhere.iterdir())
 
 
 def test_evaluated_run_without_checkpoints_is_not_trained_again(data, tmp_path):

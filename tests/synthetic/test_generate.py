@@ -16,6 +16,7 @@ from numpy._core import _multiarray_umath as umath
 from drivax.cli.generate import Generate, run, summary
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit
+from drivax.files import PartialFolder
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic import generate as generation
@@ -234,6 +235,7 @@ def test_invalid_requests_are_refused(tmp_path):
         ((1, 0, Generation(world=WorldConfig(rare_rate=1.5))), "rare_rate is 1.5; use a share from 0 to 1"),
         ((1, 0, Generation(world=WorldConfig(scenarios_per_map=0))), "scenarios_per_map is 0; use 1"),
         ((1, 0, Generation(workers=-1)), "workers is -1; use 0 or more"),
+        ((1, 0, Generation(split="80/30")), "'80/30' is not a split; give percentages"),
         ((1, 0, Generation(capacity="tiny")), "unknown capacity 'tiny'; use one of default, large"),
     ):
         with pytest.raises(UsageError, match=text):
@@ -250,6 +252,13 @@ def test_disk_space_is_checked_before_the_work(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_benchmark_refuses_links_in_its_folder(tmp_path):
+    (tmp_path / "sets").mkdir()
+    (tmp_path / "sets" / "test").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="sets/test: is a symbolic link; replace the link"):
+        generate_benchmark(tmp_path / "sets", progress=lambda done, total: pytest.fail("drew a scenario"))
+
+
 def test_failed_generation_leaves_no_files(tmp_path):
     def broken(scenarios):
         raise RuntimeError("audit broke")
@@ -257,6 +266,21 @@ def test_failed_generation_leaves_no_files(tmp_path):
     with pytest.raises(RuntimeError, match="audit broke"):
         generate(tmp_path / "set", 1, 0, audit=broken)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_set_appears_together_with_its_lists(tmp_path, monkeypatch):
+    publish = PartialFolder.publish
+
+    def publish_and_stop(folder):
+        publish(folder)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PartialFolder, "publish", publish_and_stop)
+    with pytest.raises(KeyboardInterrupt):
+        run(Generate(tmp_path / "set", scenarios=2, workers=0, split="0/100/0"))
+    lists = tmp_path / "set" / "splits"
+    assert len((lists / "validation.txt").read_text().splitlines()) == 2
+    assert {file.name for file in lists.iterdir()} == {"train.txt", "validation.txt", "test.txt", "seal.json"}
 
 
 @pytest.mark.slow

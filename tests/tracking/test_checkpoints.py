@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zlib
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tensorstore
 
 from drivax.errors import DataError
 from drivax.tracking.checkpoints import Checkpoints, is_part, pack, unpack
@@ -281,7 +283,7 @@ def test_checkpoint_of_a_stranger_is_refused_in_one_line(tmp_path: Path, changes
     (tmp_path / "outside").write_bytes(b"secret")
     checkpoints, state = Checkpoints(tmp_path / "checkpoints"), {"a": np.ones(3, np.float32)}
     path = checkpoints.save(1, state, 0.5)
-    (path / "arrays" / "device").symlink_to("/dev/null")
+    os.mkfifo(path / "arrays" / "device")
     edit(path, **changes)
     with pytest.raises(DataError, match="use another checkpoint, or train again") as raised:
         checkpoints.restore(state)
@@ -289,6 +291,51 @@ def test_checkpoint_of_a_stranger_is_refused_in_one_line(tmp_path: Path, changes
     if "files" not in changes or isinstance(changes["files"], list):
         with pytest.raises(DataError, match=r"about\.json: is damaged"):
             checkpoints.best()
+
+
+def test_links_in_a_checkpoint_are_refused(tmp_path: Path):
+    checkpoints, state = Checkpoints(tmp_path / "checkpoints"), {"a": np.ones(3, np.float32)}
+    path = checkpoints.save(1, state)
+    for name in ("arrays", "arrays/manifest.ocdbt", "about.json"):
+        (path / name).rename(tmp_path / "moved")
+        (path / name).symlink_to(tmp_path / "moved")
+        with pytest.raises(DataError, match=f"{name}: is a symbolic link; replace the link"):
+            checkpoints.restore(state)
+        (path / name).unlink()
+        (tmp_path / "moved").rename(path / name)
+    assert (checkpoints.restore(state)["a"] == state["a"]).all()
+
+
+def test_state_larger_than_the_memory_is_refused(tmp_path: Path):
+    state = jax.ShapeDtypeStruct((1 << 40,), np.float32)
+    checkpoints, problem = (
+        Checkpoints(tmp_path / "checkpoints"),
+        r"states 4\.4 TB of arrays, more than the .* of memory",
+    )
+    path = checkpoints.save(1, {"a": np.ones(3, np.float32)})
+    edit(path, leaves=[{**checkpoints.about(1)["leaves"][0], "shape": [1 << 40]}])
+    with pytest.raises(DataError, match=f"step-000000001: {problem}; use another checkpoint"):
+        checkpoints.restore({"a": state})
+    (tmp_path / "policy.npz").touch()
+    os.truncate(tmp_path / "policy.npz", 1 << 42)
+    with pytest.raises(DataError, match=rf"policy\.npz: {problem}"):
+        unpack(tmp_path / "policy.npz", {"a": state})
+
+
+def test_chunks_larger_than_their_array_are_refused(tmp_path: Path):
+    """A chunk of equal values unpacks from few bytes to any size."""
+    checkpoints, state = Checkpoints(tmp_path), {"a": np.ones(3, np.float32)}
+    path = checkpoints.save(1, state)
+    arrays = path / "arrays"
+    shutil.rmtree(arrays / "d")
+    shutil.rmtree(arrays / "ocdbt.process_0")
+    (arrays / "manifest.ocdbt").unlink()
+    store = {"driver": "ocdbt", "base": f"file://{arrays}/", "path": "00000/"}
+    metadata = {"shape": [3], "chunks": [1 << 36], "dtype": "<f4"}
+    tensorstore.open({"driver": "zarr", "kvstore": store, "metadata": metadata}, create=True).result()
+    edit(path, files={})
+    with pytest.raises(DataError, match=r"arrays cannot be read \(array 00000 has 3 values, but chunks of"):
+        checkpoints.restore(state)
 
 
 def test_large_about_is_not_read(tmp_path: Path):
@@ -416,6 +463,8 @@ def test_links_in_place_of_checkpoints_are_no_checkpoints(tmp_path: Path):
     checkpoints.save(1, {"a": 1})
     for name in (path.name, "step-000000003"):
         (checkpoints.folder / name).symlink_to(path)
+    (checkpoints.folder / ".step-1.old-1").symlink_to(path)
+    os.mkfifo(checkpoints.folder / ".step-000000004.partial")
     assert checkpoints.steps() == [1]
     checkpoints.drop_after(1)
     assert [entry.name for entry in checkpoints.folder.iterdir()] == ["step-000000001"]

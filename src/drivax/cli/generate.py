@@ -15,8 +15,6 @@ from drivax.cli import record_of
 from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.scenario.schema import CAPACITIES, Scenario
-from drivax.scenario.select.splits import parse_shares, write_splits
-from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.generate import (
@@ -80,7 +78,6 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
         raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
     if args.benchmark and world != WorldConfig(domain=world.domain):
         raise UsageError("the benchmark has a fixed world", cure="leave out all of its settings but --domain")
-    shares = None if args.split is None else parse_shares(args.split)
     workers = (os.cpu_count() or 1) if args.workers is None else args.workers
     options = record_of(Generation, args, workers=workers, world=world)
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
@@ -93,8 +90,6 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
             sets = generate_benchmark(args.out, options, args.scenarios, report, _audit)
         else:
             sets = {"": generate(args.out, scenarios, args.seed or 0, options, report, _audit)}
-    if shares is not None:
-        write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     if args.benchmark:
         show(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
     show("\n".join(map(summary, sets.values())))

@@ -35,10 +35,10 @@ def run(args: Judge) -> int:
     """Evaluate, write the table, and print means of both definitions."""
     from drivax.evaluation.episode_table import EpisodeTable
     from drivax.evaluation.profiles import FILE, devkit_rows, format_rows, write_rows
-    from drivax.files import check_output
+    from drivax.files import check_output, inside
     from drivax.tracking.progress import Progress
 
-    table, out = EpisodeTable.read(args.run), args.run / FILE
+    table, out = EpisodeTable.read(args.run), inside(args.run, FILE)
     check_output(out, args.overwrite)
     with Progress("evaluating", "episodes", len(table)) as bar:
         rows = devkit_rows(table, table.open_set(args.data), lambda done, _: bar.update(done))

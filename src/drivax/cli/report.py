@@ -53,6 +53,7 @@ class Report:
 def run(args: Report) -> int:
     """Write the page, the videos or the tables, and print their path."""
     from drivax.errors import UsageError
+    from drivax.files import inside
     from drivax.report.pages.report import write_report
     from drivax.report.pictures.video import write_videos
     from drivax.report.table_files import write_tables
@@ -67,7 +68,7 @@ def run(args: Report) -> int:
         raise UsageError("--metrics chooses columns of --tables", cure="pass --tables, or leave it out")
     episodes = args.video if args.video is not None else args.side_by_side
     if episodes is not None:
-        out = args.out or args.runs[-1] / "videos"
+        out = args.out or inside(args.runs[-1], "videos")
         with Progress("drawing", "videos") as bar:
             files = write_videos(
                 args.runs, out, episodes, args.side_by_side is not None, args.data, args.theme, args.overwrite,
@@ -76,12 +77,11 @@ def run(args: Report) -> int:
         show(f"{out} ({len(files)} videos)")
         return 0
     if args.tables:
-        out = args.out or args.runs[-1] / "tables"
+        out = args.out or inside(args.runs[-1], "tables")
         files = write_tables(args.runs, out, args.data, args.overwrite, args.metrics)
         show(f"{out} ({', '.join(file.name for file in files)})")
         return 0
-    path = write_report(
-        args.runs, args.out or args.runs[-1] / "report.html", args.data, args.episodes, args.overwrite
-    )
+    out = args.out or inside(args.runs[-1], "report.html")
+    path = write_report(args.runs, out, args.data, args.episodes, args.overwrite)
     show(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

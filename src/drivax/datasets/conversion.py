@@ -8,9 +8,10 @@ fraction of a second; an audit that needs it is passed in.
 from __future__ import annotations
 
 import hashlib
+import operator
 import os
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,10 +22,10 @@ from typing import Any, TypeVar, get_args
 
 from drivax.datasets.doctor import Estimate, count_text, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
-from drivax.datasets.reader import BadRecord, Reader, with_steps
+from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
 from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
-from drivax.reading import check_regular
+from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
@@ -285,20 +286,31 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
     """Return what a conversion shares with one that it resumes.
 
-    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read.
-    Companions (maps, poses) are not compared.
+    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
+    companions (maps, poses, tables) included.
     """
-    digest = hashlib.sha256()
-    for entry in data.inputs:
-        size, ends = _ends(entry.path)
-        digest.update(f"{data.relative(entry.path)}\t{size}\t{entry.format}\t{ends}\n".encode())
+    companions = {
+        file: None
+        for entry in data.inputs if entry.format is not None
+        for file in companion_files(find_reader(entry.format), entry.path)
+    }  # fmt: skip
     return {
         "drivax": metadata.version("drivax"),
         "schema": SCHEMA_VERSION,
-        "files": digest.hexdigest(),
+        "files": _digest(data, {entry.path: entry.format for entry in data.inputs}),
+        "companions": _digest(data, companions),
         "audit": has_audit,
         **{name: value for name, value in vars(options).items() if name not in _WITHOUT_EFFECT},
     }
+
+
+def _digest(data: Survey, formats: Mapping[Path, str | None]) -> str:
+    """Return the SHA-256 (hex) of names, sizes, formats and ends of files."""
+    digest = hashlib.sha256()
+    for path, name in formats.items():
+        size, ends = _ends(path)
+        digest.update(f"{data.relative(path)}\t{size}\t{name}\t{ends}\n".encode())
+    return digest.hexdigest()
 
 
 def _ends(path: Path) -> tuple[int, str]:
@@ -332,12 +344,15 @@ class _Sink:
         self.filtered = 0
         self.place = (0, 0)
         # Continue after the last closed shard of an interrupted conversion.
-        for note in writer.notes:
-            self.place = tuple(note["place"])
-            self.filtered = note["filtered"]
-            for row in note["skipped"]:
-                file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
-                self.skipped.append(BadRecord(file, row["record"], row["problem"], row["cure"]))
+        with explain_damage(writer.folder, "remove this folder", "unfinished output is damaged"):
+            for note in writer.notes:
+                file, items = map(operator.index, note["place"])
+                if not 0 <= file < len(data.inputs) or items < 0:
+                    raise ValueError(f"file {file} of {len(data.inputs)}")
+                self.place, self.filtered = (file, items), int(note["filtered"])
+                for row in note["skipped"]:
+                    path = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
+                    self.skipped.append(BadRecord(path, row["record"], str(row["problem"]), row["cure"]))
         self._notes = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()

@@ -18,6 +18,8 @@ from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
+from drivax.scenario.store import MANIFEST
+from drivax.seal import SEAL, check_seal
 
 #: Most files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
@@ -85,7 +87,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
     if path.is_dir() and (error := unsupported.explain_own(path)) is not None:
-        return Diagnosis(path, problems=(BadRecord.of(error, path),))
+        return Diagnosis(path, problems=(BadRecord.of(error, path), *_seal_problems(path)))
     data = attempt(survey, path, format, file=path)
     if isinstance(data, BadRecord):
         return Diagnosis(path, problems=(data,))
@@ -107,6 +109,19 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
         problems=tuple(problems),
         convertible=any(part.convertible for part in parts),
     )
+
+
+def _seal_problems(folder: Path) -> Iterator[BadRecord]:
+    """Yield what is wrong with the seal of a scenario set or run folder."""
+    if not (folder / SEAL).exists():
+        problem = "is missing, as in folders of earlier versions: changes of files that decide results are not found"
+        yield BadRecord(
+            folder / SEAL, None, problem, "copy the whole folder again, or run the command that wrote it"
+        )
+        return
+    for file in (folder / MANIFEST, folder / "run.json"):
+        if (problem := attempt(check_seal, file, file=file)) is not None:
+            yield problem
 
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:

@@ -125,6 +125,14 @@ class Reader(Protocol):
         ...
 
 
+def companion_files(reader: Any, path: Path) -> tuple[Path, ...]:
+    """Return the files that a reader reads together with ``path``, some of which may be missing: maps, poses, tables.
+
+    Readers that read such files have a method of this name.
+    """
+    return reader.companion_files(path) if hasattr(reader, "companion_files") else ()
+
+
 def with_steps(reader: Any, steps: int) -> Reader:
     """Return the reader for scenarios of ``steps`` steps; only those that cut logs into recordings (nuPlan) differ."""
     return replace(reader, steps=steps) if hasattr(reader, "steps") else reader

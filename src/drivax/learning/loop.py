@@ -15,7 +15,7 @@ import numpy as np
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.memory import report_out_of_memory
-from drivax.files import explain_full_disk, refuse_link
+from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
@@ -269,7 +269,7 @@ def _seed_folder(
     config: TrainConfig, data: ScenarioSet, notes: Mapping[str, Any], out: Path, seed: int
 ) -> RunFolder:
     """Open the folder of one of several seeds, or create it."""
-    path = refuse_link(out / f"seed-{seed}")
+    path = inside(out, f"seed-{seed}")
     if (path / RUN_FILE).is_file():
         return RunFolder.open(path)
     return RunFolder.create(path, replace(config, seed=seed), [data], kind="training", **notes)

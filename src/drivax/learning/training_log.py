@@ -192,7 +192,7 @@ class TrainingLog:
         self.checkpoints.drop_after(-1 if step is None else step)
         self.checkpoints.delete_superseded()
         for leftover in self.folder.path.glob(".*.partial*"):
-            if leftover.is_file():
+            if not leftover.is_dir() or leftover.is_symlink():
                 leftover.unlink()
         self._ranks = []
         if step is not None:

@@ -9,7 +9,7 @@ from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation import result_tables
 from drivax.evaluation.episode_table import ADDED, EpisodeTable, Tags
 from drivax.evaluation.pairing import comparable
-from drivax.files import check_output, write_text
+from drivax.files import check_output, inside, write_text
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.report.episodes import EvaluatedSet
 from drivax.report.runs import read_evaluations
@@ -40,18 +40,20 @@ def write_tables(
         metrics: Extra columns of ``episodes.csv``, or sets of metrics, for ``results``, ``differences`` and ``by-TAG``.
 
     Raises:
-        DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
+        DataError: A run folder or the scenario set is missing or damaged, the set is not the evaluated one, or a file
+            in ``out`` is a symbolic link.
         UsageError: A file exists, no run is an evaluation, or no run has one of the metrics.
     """
     texts = {}
     for table in _tables(read_evaluations(runs), data, metrics):
         formats = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
         texts |= {f"{table.name}.{suffix}": text for suffix, text in formats.items()}
-    for name in texts:
-        check_output(out / name, overwrite)
-    for name, text in texts.items():
-        write_text(out / name, text)
-    return [out / name for name in texts]
+    files = {inside(out, name): text for name, text in texts.items()}
+    for file in files:
+        check_output(file, overwrite)
+    for file, text in files.items():
+        write_text(file, text)
+    return list(files)
 
 
 def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:

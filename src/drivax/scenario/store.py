@@ -19,7 +19,6 @@ import contextlib
 import dataclasses
 import hashlib
 import math
-import shutil
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -42,11 +41,12 @@ from drivax.files import (
     check_space,
     explain_full_disk,
     file_digest,
+    remove,
     restore_folder,
     sync_and_close,
     write_json,
 )
-from drivax.reading import MOST_TEXT, explain_damage, parse_json, read_array_header, read_bytes
+from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, parse_json, read_array_header, read_bytes
 from drivax.scenario.schema import (
     NAMES,
     SCHEMA_VERSION,
@@ -130,21 +130,22 @@ class ScenarioWriter:
                 break
             self._shards.append(part["shard"])
             self._entries += part["scenarios"]
-            self.notes.append(part["note"])
+            self.notes.append(part.get("note"))
         self._known = {_key(entry) for entry in self._entries}
         names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
         for entry in self._partial.content.iterdir():  # Remove unfinished shards and files.
             if entry.name not in names:
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+                remove(entry)
         return self
 
     def _is_finished(self, part: Mapping[str, Any]) -> bool:
         """Whether a closed shard is as it was written, and full; a last one of fewer records is written again."""
-        if not part["shard"]["count"] == len(part["scenarios"]) == self._shard_size:
-            return False
-        with contextlib.suppress(DataError):
-            Shard(self._partial.content, part["shard"], self._buffer.dtype, part["scenarios"]).check_digest()
-            return True
+        with contextlib.suppress(DataError, *DAMAGE):
+            shard, entries = part["shard"], part["scenarios"]
+            _check_entries([*self._shards, shard], entries)
+            if shard["count"] == len(entries) == self._shard_size:
+                Shard(self._partial.content, shard, self._buffer.dtype, entries).check_digest()
+                return True
         return False
 
     @property
@@ -531,19 +532,24 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
-    most = len(manifest["scenarios"])
-    for number, shard in enumerate(manifest["shards"]):
+    _check_entries(manifest["shards"], manifest["scenarios"])
+    if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
+        raise DataError("field table is not this version's", file=file, cure=AGAIN)
+
+
+def _check_entries(shards: Sequence[Mapping[str, Any]], scenarios: Sequence[Mapping[str, Any]]) -> None:
+    """Check the names, types and counts of shards and of scenarios."""
+    most = len(scenarios)
+    for number, shard in enumerate(shards):
         name, count, digest = itemgetter("file", "count", "sha256")(shard)
         if name != shard_name(number) or type(count) is not int or not 0 <= count <= most:
             raise ValueError(f"shard {number} is {name!r} with {count!r} of {most} records")
         if not isinstance(digest, str):
             raise ValueError(f"shard {number} has no checksum")
-    for number, entry in enumerate(manifest["scenarios"]):
+    for number, entry in enumerate(scenarios):
         SourceCounts(**entry["source"])
         if any(type(entry[name]) is not kind for name, kind in _ENTRY.items()):
             raise ValueError(f"scenario {number} has a value of another type")
-    if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
-        raise DataError("field table is not this version's", file=file, cure=AGAIN)
 
 
 def shard_name(number: int) -> str:

@@ -20,6 +20,7 @@ from drivax.curation.methods import METHODS
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import Scale, WeightConfig, permute_scores, sampling_weights
 from drivax.errors import UsageError, did_you_mean
+from drivax.files import inside
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.metrics.catalogue import METRICS
@@ -291,12 +292,11 @@ class Study:
 
     def run(self, arm: str, seed: int) -> Path:
         """Return the run folder of a training."""
-        return self.folder / "runs" / arm / f"seed-{seed}"
+        return inside(self.folder, "runs", arm, f"seed-{seed}")
 
     def evaluation(self, name: str, seed: int | None = None) -> Path:
         """Return the evaluation folder of an arm with one seed, or of a planner."""
-        folder = self.folder / "drives" / name
-        return folder if seed is None else folder / f"seed-{seed}"
+        return inside(self.folder, "drives", name, *([] if seed is None else [f"seed-{seed}"]))
 
     def evaluations(self, arm: str) -> tuple[str, ...]:
         """Return the names of an arm's evaluations: the first baseline is evaluated at other checkpoints, too."""
@@ -310,16 +310,16 @@ class Study:
     @property
     def test(self) -> Path:
         """The scenario set of the test."""
-        return self.folder / "test"
+        return inside(self.folder, "test")
 
     @property
     def results(self) -> Path:
         """The results as JSON."""
-        return self.folder / "results.json"
+        return inside(self.folder, "results.json")
 
     def scores(self, method: str) -> Path:
         """Return the file of a method's scores of the training set."""
-        return self.folder / "scores" / f"{method}.npz"
+        return inside(self.folder, "scores", f"{method}.npz")
 
     def train_config(self, arm: str, seed: int) -> TrainConfig:
         """Return the training configuration of an arm with one seed."""

@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.evaluation.result_tables import paired_difference
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
-from drivax.files import write_json
+from drivax.files import inside, write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -120,6 +120,7 @@ def run_demo(
 
     Raises:
         UsageError: ``out`` is not empty, and ``overwrite`` is false.
+        DataError: A name in ``out`` is a symbolic link.
     """
     config = config or DemoConfig()
     if out.exists() and any(out.iterdir()) and not overwrite:
@@ -127,31 +128,34 @@ def run_demo(
             "output folder already exists", file=out, cure="choose another --out or pass --overwrite"
         )
     out.mkdir(parents=True, exist_ok=True)
+    training_set, held_out_set = inside(out, "sets", "train"), inside(out, "sets", "held_out")
+    run_folder, report_file = inside(out, "training", "policy"), inside(out, "report.html")
+    evaluations = {name: inside(out, "evaluation", name) for name in (*REFERENCES, "policy")}
+    result_file = inside(out, "demo.json")
     stages = _Stages(log)
     stages.start(
         "generation",
         f"{config.training} training and {config.held_out} held-out scenarios of the built-in world",
     )
-    training = _generate_set(out / "sets" / "train", config.training, _TRAINING_SEED, config)
-    held_out = _generate_set(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
+    training = _generate_set(training_set, config.training, _TRAINING_SEED, config)
+    held_out = _generate_set(held_out_set, config.held_out, _HELD_OUT_SEED, config)
     stages.start("training", f"training by the preset {config.preset}")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
     # No scenarios are set aside for validation: the held-out set is the test.
-    run = train(training_config, training, out / "training" / "policy", validation=None, overwrite=True).path
+    run = train(training_config, training, run_folder, validation=None, overwrite=True).path
     stages.start("evaluation", "evaluating on the held-out scenarios")
-    runs, results = [], {}
+    results = {}
     planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}
     planners["policy"] = load_policy(
         run, ScenarioBank.from_scenarios(held_out[:1]), trust=settings.modules_of(training_config)
     )
     for name, (planner, task) in planners.items():
-        folder = out / "evaluation" / name
+        folder = evaluations[name]
         folder.parent.mkdir(exist_ok=True)
         evaluation = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
         results[name] = run_evaluation(evaluation, planner, held_out, folder, overwrite=True)
-        runs.append(folder)
     stages.start("report", "writing the report")
-    report = write_report([run, *runs], out / "report.html", overwrite=True)
+    report = write_report([run, *evaluations.values()], report_file, overwrite=True)
     policy = results["policy"]
     differences = {
         name: {metric: paired_difference(policy, results[name], metric).as_dict() for metric in _METRICS}
@@ -159,7 +163,7 @@ def run_demo(
     }
     summaries = [result.summary() for result in results.values()]
     demo = Demo(report, summaries, differences, stages.seconds())
-    write_json(out / "demo.json", demo.as_json())
+    write_json(result_file, demo.as_json())
     return demo
 
 

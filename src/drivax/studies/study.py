@@ -29,7 +29,7 @@ from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
-from drivax.files import refuse_link, write_json
+from drivax.files import inside, write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import hashes, train, usable_steps
@@ -57,6 +57,8 @@ from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.workers import one_core_each
 
+#: What a study writes into its folder, besides the files of a run folder.
+_OUTPUTS = ("scores", "test", "runs", "drives", "results.json", "report.html", "critical.html")
 _PROGRESS = "validation/progress_ratio"
 Log = Callable[[str], None]
 
@@ -97,6 +99,7 @@ def run_study(
         The contents of ``results.json``.
 
     Raises:
+        DataError: A set is damaged, or a name in the study's folder is a symbolic link.
         UsageError: The baselines do not drive well enough, events are not labelled where arms or strata need them, or
             the folder holds another study, runs with other settings, or evaluations of other runs.
     """
@@ -156,7 +159,7 @@ def _write_pages(
     """
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
-    write_report(study.definition, results, tables, actions, study.folder / "report.html")
+    write_report(study.definition, results, tables, actions, inside(study.folder, "report.html"))
     table_of_row: dict[int, ScoreTable] = {}
     for name in PLAYER_METHODS:
         if name in tables:
@@ -165,7 +168,7 @@ def _write_pages(
         return
     write_player(
         [data[row] for row in table_of_row],
-        study.folder / "critical.html",
+        inside(study.folder, "critical.html"),
         overwrite=True,
         title="most critical scenarios",
         details=[criticality_html(table, row) for row, table in table_of_row.items()],
@@ -178,6 +181,8 @@ def _open_folder(study: Study) -> None:
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
+    for name in _OUTPUTS:
+        inside(study.folder, name)
     if study.folder.exists() and any(study.folder.iterdir()):
         _check_folder(study, data, definition)
         return
@@ -325,7 +330,7 @@ def _run_job(job: Job) -> float:
 def _train_and_evaluate_arm(job: Job) -> float:
     start, study = time.perf_counter(), job.study
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
-    steps = Checkpoints(refuse_link(run / "checkpoints")).steps()
+    steps = Checkpoints(inside(run, "checkpoints")).steps()
     _check_not_evaluated(job, steps)
     validation = ScenarioSet.open(study.sets.validation)
     # Of a finished training, this only deletes what an interruption left.

@@ -25,8 +25,10 @@ from types import MappingProxyType
 from typing import Any
 
 from drivax.errors import UsageError
+from drivax.files import inside
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
+from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, check_set_space
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_many
 from drivax.tracking.workers import worker_pool
@@ -83,6 +85,7 @@ class Generation:
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
         egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.egos``).
+        split: Percentages of train/validation/test, as 80/10/10, for the lists in ``splits/``, by map; None: no lists.
         overwrite: Replace an existing scenario set.
         world: Settings of the world.
     """
@@ -91,6 +94,7 @@ class Generation:
     capacity: str = "default"
     future_s: float = 8.0
     egos: int = 1
+    split: str | None = None
     overwrite: bool = False
     world: WorldConfig = field(default_factory=WorldConfig)
 
@@ -108,13 +112,18 @@ class Generation:
             )
         if not 8.0 <= self.future_s <= 60.0:
             raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
-        _ = self.sizes  # refuses wrong numbers of egos
+        _ = self.shares, self.sizes  # refuse wrong splits and numbers of egos
         self.world.check()
 
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario with these options."""
         return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+
+    @property
+    def shares(self) -> Shares | None:
+        """The percentages of ``split``."""
+        return None if self.split is None else parse_shares(self.split)
 
 
 @dataclass(frozen=True)
@@ -225,7 +234,9 @@ def write_set(
     counts = _Counts()
     check_set_space(out, options.sizes, scenarios)
     with (
-        ScenarioWriter(out, options.sizes, source, overwrite=options.overwrite) as writer,
+        ScenarioWriter(
+            out, options.sizes, source, overwrite=options.overwrite, shares=options.shares
+        ) as writer,
         closing(_draws(scenarios, seed, options)) as draws,
         closing(_audit_batches(_count_draws(draws, counts, scenarios, progress), audit)) as pairs,
     ):
@@ -362,7 +373,7 @@ def generate_benchmark(
 
     Raises:
         UsageError: Wrong arguments, or one of the sets exists and is not to be overwritten.
-        DataError: The disk has too little space, or a worker died.
+        DataError: The disk has too little space, a set's name is a symbolic link, or a worker died.
     """
     options = options or Generation()
     options.check()
@@ -375,7 +386,7 @@ def generate_benchmark(
     check_set_space(out, options.sizes, sum(counts.values()))
     for name in SPLITS:
         # Refuses an existing set.
-        ScenarioWriter(Path(out) / name, options.sizes, overwrite=options.overwrite)
+        ScenarioWriter(inside(Path(out), name), options.sizes, overwrite=options.overwrite)
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
@@ -389,6 +400,6 @@ def generate_benchmark(
 
         split_options = dataclasses.replace(options, world=world)
         sets[name] = write_set(
-            Path(out) / name, counts[name], split.seed, split_options, notes, report, audit
+            inside(Path(out), name), counts[name], split.seed, split_options, notes, report, audit
         )
     return sets

@@ -11,9 +11,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import os
 import re
-import shutil
 import sys
 import threading
 import zlib
@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.files import atomic_write, replace_folder, sync_folder, write_text
+from drivax.files import atomic_write, format_bytes, inside, remove, replace_folder, sync_folder, write_text
 from drivax.reading import check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
@@ -134,10 +134,9 @@ class Checkpoints:
         for other in self.steps():
             if other > step:
                 self._delete(other)
-        for leftover in self.folder.glob(".step-*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        for link in filter(Path.is_symlink, self.folder.glob("step-*")):
-            link.unlink()
+        links = filter(Path.is_symlink, self.folder.glob("step-*"))
+        for leftover in (*self.folder.glob(".step-*"), *links):
+            remove(leftover)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
         """Return the stored state, or a part of it (for example ``.parameters``).
@@ -183,9 +182,9 @@ class Checkpoints:
     def _delete(self, step: int) -> None:
         # Rename it first, so that a partially deleted folder does not look like a checkpoint.
         hidden_folder = self.folder / f".step-{step}.old-{os.getpid()}"
-        shutil.rmtree(hidden_folder, ignore_errors=True)
+        remove(hidden_folder)
         self._path(step).rename(hidden_folder)
-        shutil.rmtree(hidden_folder, ignore_errors=True)
+        remove(hidden_folder)
 
 
 def _is_own(path: Path) -> bool:
@@ -247,8 +246,11 @@ def _check_types(about: Mapping[str, Any]) -> None:
 
 
 def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing, damaged, or no regular file."""
-    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if not file.is_dir()}
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or no regular file."""
+    entries = {entry.relative_to(path): entry for entry in sorted(path.rglob("*"))}
+    for name in entries:
+        inside(path, *name.parts)
+    files = {name.as_posix(): entry for name, entry in entries.items() if not entry.is_dir()}
     for file in files.values():
         check_regular(file, _OTHER)
     for name, expected in checksums.items():
@@ -277,7 +279,7 @@ def unpack(file: Path, template: State) -> State:
     check_seal(file)
     requested_leaves = _named_leaves(template)
     # Every array has a header and an entry in the archive's directory.
-    most = sum(leaf.size * leaf.dtype.itemsize + 4096 for _, leaf in requested_leaves) + 4096
+    most = _check_size(file, [leaf for _, leaf in requested_leaves]) + 4096 * (len(requested_leaves) + 1)
     arrays = read_arrays(file, "use another copy", 2 * most)
     stored_leaves = [
         {"name": name, "type": str(array.dtype), "shape": array.shape} for name, array in arrays.items()
@@ -386,8 +388,9 @@ def _load_arrays(
     """
     import orbax.checkpoint as ocp
 
+    _check_size(path, templates.values())
     numbers = {leaf["name"]: f"{number:05d}" for number, leaf in enumerate(leaves)}
-    arrays = {name: _zeros(leaf) for name, leaf in templates.items()}
+    arrays = {name: np.zeros(*_stored_type(leaf)) for name, leaf in templates.items()}
     nonempty = {numbers[name]: array for name, array in arrays.items() if array.size}
     restored_arrays: dict[str, Any] = {}
     try:
@@ -406,18 +409,33 @@ def _load_arrays(
     return arrays
 
 
-def _zeros(leaf: Any) -> np.ndarray[Any, Any]:
-    """Return zeros of the shape and type in which a leaf is stored."""
+def _stored_type(leaf: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return the shape and type in which a leaf is stored."""
     if _is_key(leaf):
         leaf = jax.eval_shape(jax.random.key_data, leaf)
-    return np.zeros(np.shape(leaf), getattr(leaf, "dtype", type(leaf)))
+    return np.shape(leaf), np.dtype(getattr(leaf, "dtype", type(leaf)))
+
+
+def _check_size(path: Path, leaves: Iterable[Any]) -> int:
+    """Return the bytes of leaves; raise DataError if the memory of this machine cannot hold them."""
+    size = sum(math.prod(shape) * dtype.itemsize for shape, dtype in map(_stored_type, leaves))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > memory:
+        problem = f"states {format_bytes(size)} of arrays, more than the {format_bytes(memory)} of memory"
+        raise DataError(problem, file=path, cure="use another checkpoint, or a machine with more memory")
+    return size
 
 
 def _check_shapes(stored_arrays: Mapping[str, Any], arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
-    """Raise ValueError for the first array that is stored in another shape, which Orbax would allocate."""
+    """Raise ValueError for the first array that is stored in another shape or in chunks that are larger than it."""
     for number, array in arrays.items():
-        if tuple(stored_arrays[number].shape) != array.shape:
-            raise ValueError(f"array {number} has shape {stored_arrays[number].shape}, not {array.shape}")
+        stored_array = stored_arrays[number]
+        if tuple(stored_array.shape) != array.shape:
+            raise ValueError(f"array {number} has shape {stored_array.shape}, not {array.shape}")
+        if math.prod(stored_array.storage.chunk_shape) > array.size:
+            raise ValueError(
+                f"array {number} has {array.size} values, but chunks of {stored_array.storage.chunk_shape}"
+            )
 
 
 def _rebuild(array: np.ndarray[Any, Any], template: Any) -> Any:

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from drivax import kernels, settings
 from drivax.errors import DataError, UsageError
-from drivax.files import check_output, refuse_link, replace_folder, restore_folder, write_text
+from drivax.files import check_output, inside, replace_folder, restore_folder, write_text
 from drivax.plugins import is_dotted
 from drivax.reading import explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
@@ -176,7 +176,7 @@ class RunFolder:
         Raises:
             DataError: It is a symbolic link.
         """
-        return refuse_link(self.path / "checkpoints")
+        return inside(self.path, "checkpoints")
 
     @property
     def metrics(self) -> Path:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from drivax.errors import DataError
-from drivax.files import refuse_link, sync_and_close, write_text
+from drivax.files import inside, remove, sync_and_close, write_text
 from drivax.reading import DAMAGE, read_lines
 
 #: Least time between two flushes (s).
@@ -35,8 +35,8 @@ class JsonLines:
         if resume_step is not None and self.path.exists():
             rows = [row for row in read_rows(self.path) if row["step"] <= resume_step]
             write_text(self.path, "".join(f"{json.dumps(row)}\n" for row in rows), follow=False)
-        elif self.path.is_symlink():
-            self.path.unlink()
+        else:
+            remove(self.path)  # perhaps a link or a pipe
         self._file = self.path.open("wb" if resume_step is None else "ab")
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
@@ -99,7 +99,7 @@ class MetricLog:
         self, folder: str | Path, resume_step: int | None = None, tensorboard: bool | None = None
     ) -> None:
         folder = Path(folder)
-        events = refuse_link(folder / "tensorboard")
+        events = inside(folder, "tensorboard")
         self._rows = JsonLines(folder / "metrics.jsonl", resume_step)
         self.sinks: list[JsonLines | TensorBoard] = [self._rows]
         if tensorboard is None:

@@ -84,6 +84,10 @@ class ArgoverseMotion:
         """Return 1, since every scenario becomes one window; 0 for another kind of file."""
         return int(read_head(path, 4) == tables.PARQUET_MAGIC)
 
+    def companion_files(self, path: Path) -> tuple[Path, ...]:
+        """Return the map of the scenario."""
+        return (_map_path(path),)
+
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a scenario, or the bad record in its place."""
         yield attempt(decode, path, file=path)

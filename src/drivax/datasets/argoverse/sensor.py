@@ -90,6 +90,10 @@ class ArgoverseSensor:
             return 0
         return parsing.windows_of(len(np.unique(times)))
 
+    def companion_files(self, path: Path) -> tuple[Path, ...]:
+        """Return the poses and the files of the map."""
+        return (path.with_name(POSES), *sorted((path.parent / "map").glob("*")))
+
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of a log, or the bad record in its place."""
         yield attempt(decode, path, file=path)

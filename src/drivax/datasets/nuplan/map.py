@@ -89,6 +89,15 @@ def find_map(log: Path, name: str) -> Path:
     return path
 
 
+def map_files(log: Path) -> tuple[Path, ...]:
+    """Return the file that lists the maps, and the GeoPackages of all maps; nothing without maps."""
+    try:
+        listing = _listing(log)
+    except DataError:
+        return ()
+    return (listing, *sorted(listing.parent.glob("*/*/map.gpkg")))
+
+
 def _listing(log: Path) -> Path:
     """Find the file that lists the maps and their versions."""
     roots = [root for folder in log.resolve().parents for root in (folder / "maps", folder)]

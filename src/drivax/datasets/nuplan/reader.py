@@ -15,7 +15,15 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.datasets import parsing
-from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, features_around, find_map
+from drivax.datasets.nuplan.map import (
+    City,
+    city_map,
+    corridor,
+    feature_id,
+    features_around,
+    find_map,
+    map_files,
+)
 from drivax.datasets.nuplan.sqlite import Database, open_database
 from drivax.datasets.parsing import flatten
 from drivax.datasets.reader import BadRecord, Description, attempt
@@ -117,6 +125,10 @@ class NuPlan:
                 )
         except DataError:
             return 0
+
+    def companion_files(self, path: Path) -> tuple[Path, ...]:
+        """Return all maps, and the file that lists them."""
+        return map_files(path)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the recording of each :class:`Piece` in order of time, or a bad record in its place."""

@@ -107,6 +107,10 @@ class NuScenes:
         except DataError:
             return 0
 
+    def companion_files(self, path: Path) -> tuple[Path, ...]:
+        """Return the tables and the maps."""
+        return (*sorted(path.parent.glob("*.json")), *sorted(_maps(path).glob("*.json")))
+
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """Yield the scenes in file order, and a bad record in place of each that cannot be read."""
         tables = attempt(Tables.read, path.parent, file=path)

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 from drivax.errors import UsageError, did_you_mean, missing_package
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.files import atomic_write, check_output
+from drivax.files import atomic_write, check_output, inside
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, rank_scenarios, rollouts_of
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
@@ -60,7 +60,8 @@ def write_videos(
         progress: Called with (done, total) after every file.
 
     Raises:
-        DataError: A run folder or the scenario set is missing or damaged, or the set is not the evaluated one.
+        DataError: A run folder or the scenario set is missing or damaged, the set is not the evaluated one, or a file
+            in ``out`` is a symbolic link.
         UsageError: A file exists, ``which`` or the theme is invalid, the scenario has no episode, or a package is not
             installed.
     """
@@ -105,7 +106,7 @@ def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path
     if ranked:
         digits = len(str(len(names)))
         names = [f"{rank:0{digits}d}-{name}" for rank, name in enumerate(names, start=1)]
-    return [out / f"{name}.mp4" for name in names]
+    return [inside(out, f"{name}.mp4") for name in names]
 
 
 def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light") -> Iterator[Picture]:
