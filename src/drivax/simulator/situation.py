@@ -95,7 +95,7 @@ def measure(
         limit_mps=lanes.limit,
         routed=routed,
         logged=logged[AgentColumn.VALID] > 0,
-        ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
+        ignored=contact.ignored_overlaps(codes).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
         moved_m=_step_length(context),
@@ -167,7 +167,7 @@ def _measure_contacts(
         fault, kind = contact.classify_contacts(frame, context.slot, begins, speed, others_speed, unlawful)
     codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ignored = (codes == Contact.IGNORED) | (codes == Contact.HIT)
+        ignored = contact.ignored_overlaps(codes) | (codes == Contact.HIT)
         ttc = contact.time_to_collision(frame, context.slot, ignored)
     return codes, fault.any(), kind, ttc
 
@@ -197,7 +197,7 @@ def _requested_facts(
     if reads & _SCHEDULE:
         facts |= _schedule_facts(bank, context)
     if "gap_m" in reads:
-        facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+        facts["gap_m"] = contact.nearest_gap(frame, context.slot, contact.ignored_overlaps(codes))
     if "time_gap_s" in reads:
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], STOPPED_MPS)
         facts["time_gap_s"] = jnp.clip(leader_gap(bank, context, frame) / speed, 0.0, LONGEST_GAP_S)
