@@ -452,7 +452,9 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
 @pytest.mark.parametrize("decay_share", [1.0, 0.5])
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, decay_share):
     """Adam's step under a constant gradient is its rate; the policy of TD3+BC takes every second step."""
-    config = replace(kind, updates=10, last_rate=0.25, decay_share=decay_share, policy_rate=1e-3, gradient_norm=1e6)
+    config = replace(
+        kind, updates=10, last_rate=0.25, decay_share=decay_share, policy_rate=1e-3, gradient_norm=1e6
+    )
     weights = jnp.zeros(1)
 
     def rates(config, count):

@@ -136,7 +136,7 @@ def test_p_values_are_adjusted_within_their_group():
 def test_claims_without_a_test_do_not_raise_the_number_that_decides():
     claim, rng = LONGTAIL.claims[0], np.random.default_rng(0)
     episodes = draw_failures({claim.arm: 0.14, claim.reference: 0.16}, rng)
-    undefined = [name for name in METRICS if name != claim.metric][0]
+    undefined = next(name for name in METRICS if name != claim.metric)
     episodes[claim.arm][undefined] = np.full((SEEDS, SCENARIOS), np.nan)
     strata = Strata([str(number) for number in range(SCENARIOS)], np.arange(SCENARIOS) % 2 == 0, None)
     (alone,) = decide_claims([claim], episodes, strata)

@@ -249,7 +249,13 @@ class Driving:
         return bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
 
     def _draw(
-        self, bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None, later: int = 0
+        self,
+        bank: ScenarioBank,
+        key: Array,
+        count: int,
+        earliest: int,
+        latest: int | None = None,
+        later: int = 0,
     ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
         """Draw scenarios, steps, slots of egos, and keys of episodes.
 

@@ -57,7 +57,8 @@ class Cloning:
         batch: Logged steps per update.
         updates: Updates per iteration.
         learning_rate, last_rate: Initial learning rate of Adam, and the final one relative to it; 1: constant.
-        decay_share: Share of the run (of pretraining, in a warm start) over which the rate decays linearly, then constant.
+        decay_share: Share of the run (of pretraining, in a warm start) over which the rate decays linearly; it is
+            constant afterwards.
         gradient_norm: Maximum global norm of the gradient; None: no clipping.
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
     """
