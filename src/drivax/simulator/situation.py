@@ -125,7 +125,7 @@ def entry_strand(bank: ScenarioBank, context: AgentContext, reads: frozenset[str
     return queries.lane_passage(bank, context.index, xy, heading, ground, -1).strand
 
 
-def replace_strand(facts: Facts, done: Bool[Array, ""], strand: Integer | None) -> Facts:
+def replace_strand(facts: Facts, done: Bool[Array, ""], strand: Any) -> Facts:
     """Set the fact ``strand``, if it is measured, to ``strand`` where the episode is ``done``."""
 
     def select(path: tuple[Any, ...], fact: Array) -> Array:
