@@ -45,18 +45,19 @@ EACH_TARGET(void measure_contacts(const Contacts& arguments, int64_t first, int6
 namespace drivax::TARGET {
 
 // As in drivax.simulator.contact.
-enum Contact : int8_t { kAbsent, kApart, kHit, kIgnored, kAtFault, kParted, kGone, kCodes };
+enum Contact : int8_t { kAbsent, kApart, kHit, kIgnored, kAtFault, kParted, kGone, kReturned };
 enum CollisionType : int8_t { kNone, kRearEnd, kRearEnded, kSideSwipe, kHeadOn, kVulnerable, kStoppedObject };
 
 // What a slot holds at this step.
 enum Now { kEmpty, kSeparate, kTouching, kTouchingAtFault, kStates };
 
 constexpr int8_t next_contact(int before, int now) {
-  const bool was_hit = before == kHit || before == kAtFault || before == kParted || before == kGone;
+  const bool was_hit = before == kHit || before >= kAtFault;
   if (now == kEmpty) return was_hit ? kGone : kAbsent;
   if (now == kSeparate) return was_hit ? kParted : kApart;
   // A slot that overlaps as it appears is ignored. A contact after kParted is never a new fault.
-  if (before == kIgnored || before == kAbsent || before == kGone) return kIgnored;
+  if (before == kAbsent) return kIgnored;
+  if (before == kGone) return kReturned;
   if (before == kApart) return now == kTouchingAtFault ? kAtFault : kHit;
   return before == kParted ? (int)kHit : before;
 }
@@ -139,7 +140,7 @@ static Ints decide(Measurement& m, const MovingBoxes& other, const int32_t* slot
     }
     const int8_t code = kNext.code[now][before];
     a.codes[slot] = code;
-    ignored[lane] = code == kHit || code == kIgnored ? -1 : 0;
+    ignored[lane] = code == kHit || code == kIgnored || code == kReturned ? -1 : 0;
   }
   return ignored;
 }

@@ -239,7 +239,6 @@ class Judge:
             for a in range(1, count):
                 if not self.tracks.valid[a, t]:
                     code.pop(a, None)
-                    were_hit.discard(a)
                 elif not self.overlap(a, t):
                     code[a] = "apart"
                 elif code.get(a, "ignored") == "ignored":

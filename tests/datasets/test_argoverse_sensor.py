@@ -138,6 +138,11 @@ def test_frames_without_a_pose_are_left_out_and_counted(rewritten):
     assert recording.lost == {"frames_without_pose": 2} and len(recording.timestamps_s) == FRAMES - 2
 
 
+def test_repeated_rows_are_counted(rewritten):
+    path = rewritten(lambda boxes: {name: [*values, values[0]] for name, values in boxes.items()})
+    assert decode(path).lost == {"repeated_rows": 1}
+
+
 def test_columns_of_unknown_names_are_counted(rewritten):
     path = rewritten(
         lambda boxes: boxes | {"vx_m": boxes["qw"]},

@@ -227,6 +227,21 @@ def test_boxes_without_a_track_are_counted(tmp_path):
     assert recording.tracks.track_id.tolist() == list(range(12))
 
 
+def test_repeated_boxes_of_a_track_are_counted(tmp_path):
+    """A copy of each box of a track, 1 m to the east: the later rows count."""
+    path = sample.write(tmp_path)
+    (before,) = read(path)
+    copy = (
+        "INSERT INTO lidar_box SELECT randomblob(8), lidar_pc_token, track_token, next_token, prev_token, x + 1, y, z, "
+        "width, length, height, vx, vy, vz, yaw, confidence FROM lidar_box WHERE track_token = ?"
+    )
+    change(path, copy, sample.token("track", 0))
+    (recording,) = read(path)
+    assert recording.lost == {"repeated_boxes": 96}
+    shift = recording.tracks.xy - before.tracks.xy
+    np.testing.assert_allclose(shift[recording.tracks.track_id == 1, :, 0].max(), 1.0)
+
+
 def test_tables_columns_and_layers_of_unknown_names_are_counted(tmp_path):
     path = sample.write(tmp_path)
     change(path, "CREATE TABLE lidar_pc_annotation (token BLOB, type TEXT)")

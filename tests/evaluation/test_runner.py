@@ -20,6 +20,7 @@ from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.record import record
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.starts import NoisyStart
@@ -224,6 +225,20 @@ def test_fail_crashed_equals_hand_computed_values():
 def test_planner_of_another_action_space_is_refused(data):
     with pytest.raises(UsageError, match="another action space"):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
+
+
+def test_scenarios_of_one_identity_are_refused_for_planners_that_look_them_up():
+    """The hashes of the two ids are equal."""
+    ids = ("44662", "169336")
+    twins = [assemble(replace(straight_road([car()]), scenario_id=name), SMALL) for name in ids]
+
+    @record
+    class Prepared(Expert):
+        def prepare(self, scenario_of):
+            raise AssertionError("not reached")
+
+    with pytest.raises(UsageError, match="scenarios 44662 and 169336 have the same identity"):
+        evaluate(Prepared(), twins)
 
 
 def test_plain_function_is_refused_as_planner(data):

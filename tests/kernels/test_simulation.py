@@ -66,7 +66,7 @@ def contact_problem(seed, slots, batch=BATCH):
     own = np.minimum(slot, slots - 1)[:, None] == np.arange(slots)
     frame = random_frames(rng, slots, batch, rng.choice([0.0, 0.3, 1.0]), rng.choice([3.0, 12.0]), own)
     previous = random_frames(rng, slots, batch)
-    before = rng.choice(7, (batch, slots), p=[0.1, 0.6, 0.06, 0.06, 0.06, 0.06, 0.06]).astype(np.int8)
+    before = rng.choice(8, (batch, slots), p=[0.1, 0.6, *[0.05] * 6]).astype(np.int8)
     unlawful = rng.random(batch) < 0.5
     return random_context(rng, slot, batch), frame, previous, jnp.asarray(before), jnp.asarray(unlawful)
 

@@ -203,6 +203,14 @@ def test_demonstrations_follow_the_log(bank, driving):
     np.testing.assert_allclose(*map(np.array, zip(*pairs, strict=True)), atol=1e-5)
 
 
+def test_demonstrations_leave_out_gaps_of_the_log(bank, driving):
+    """Ego is not logged at steps 40 to 43; the action of step 39 looks at 41."""
+    gap = replace(bank, agents=bank.agents.at[:, 40:44, 0, AgentColumn.VALID].set(0.0))
+    observation, *_ = jax.jit(driving.demonstrations, static_argnums=2)(gap, jax.random.key(3), 256)
+    steps = set(np.asarray(observation["moment"][:, 0, 1]).astype(int))
+    assert 37 in steps and not steps & set(range(38, 44))
+
+
 def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):
     """Two steps of one action equal two single steps; rewards add up, and an ended episode waits for its reset."""
     task = replace(driving.task, rewards=RewardConfig(preset="pace"))

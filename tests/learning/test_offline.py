@@ -452,10 +452,12 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "every"), [(IQL, 1), (TD3_BC, TD3_BC.delay)])
-@pytest.mark.parametrize("falling", [1.0, 0.5])
-def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
+@pytest.mark.parametrize("decay_share", [1.0, 0.5])
+def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, decay_share):
     """Adam's step under a constant gradient is its rate; the policy of TD3+BC takes every second step."""
-    config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
+    config = replace(
+        kind, updates=10, last_rate=0.25, decay_share=decay_share, policy_rate=1e-3, gradient_norm=1e6
+    )
     weights = jnp.zeros(1)
 
     def rates(config, count):
@@ -468,9 +470,17 @@ def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
         return -np.asarray(jax.lax.scan(move, adam.init(weights), None, count)[1])
 
     count = 40 // every + 1
-    share = np.minimum(np.arange(count) / (falling * 40 // every), 1.0)
+    share = np.minimum(np.arange(count) / (decay_share * 40 // every), 1.0)
     np.testing.assert_allclose(rates(config, count), 1e-3 - 0.75e-3 * share, rtol=1e-4)
     # A share of less than one update is one update.
-    np.testing.assert_allclose(rates(replace(config, falling=1e-3), 2), [1e-3, 0.25e-3], rtol=1e-4)
-    with pytest.raises(UsageError, match=r"falling is 0\.0; use more than 0"):
-        replace(config, falling=0.0)
+    np.testing.assert_allclose(rates(replace(config, decay_share=1e-3), 2), [1e-3, 0.25e-3], rtol=1e-4)
+    with pytest.raises(UsageError, match=r"decay_share is 0\.0; use more than 0"):
+        replace(config, decay_share=0.0)
+
+
+@pytest.mark.parametrize("kind", ["bc", "iql"])
+def test_former_key_of_the_decay_share_is_read(kind):
+    config = settings.load(TrainConfig, {"algorithm": {"kind": kind, "falling": 0.25}})
+    assert config.algorithm.decay_share == 0.25
+    changed = settings.load(TrainConfig, f"offline/{kind}", ["--algorithm.falling", "0.25"])
+    assert changed.algorithm.decay_share == 0.25

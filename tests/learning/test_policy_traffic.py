@@ -11,7 +11,7 @@ from drivax import settings
 from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policies import open_policy, policy_traffic
+from drivax.learning.policies import PolicyTraffic, open_policy, policy_traffic
 from drivax.planners.planner_traffic import TrafficDriver
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
@@ -43,6 +43,12 @@ def test_a_run_of_seeds_that_was_killed_at_its_start_is_refused(tmp_path):
     RunFolder.create(tmp_path / "run", TrainConfig(), kind="seeds", seeds=2)
     with pytest.raises(DataError, match=r"no folder seed-N .*; continue the training with --resume"):
         open_policy(tmp_path / "run")
+
+
+def test_seeds_of_two_runs_are_different_traffic(tmp_path):
+    """Episodes are paired by the name of their traffic."""
+    names = [PolicyTraffic(run=str(tmp_path / run / "seed-0")).name for run in ("ppo", "sac")]
+    assert names == ["driven_by_ppo/seed-0", "driven_by_sac/seed-0"]
 
 
 @pytest.mark.slow

@@ -48,6 +48,16 @@ def test_advantages_by_hand():
     np.testing.assert_allclose(result, [2.125, 2.5])
 
 
+def test_values_that_overflow_stay_in_their_episode():
+    """The next episode's values are infinite, as is that of the terminal state, which counts as zero."""
+    reward, value = jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 3.0, jnp.inf])
+    for after, terminated, expected in ((jnp.inf, True, -1.0), (7.0, False, 2.5)):
+        ends, inside = jnp.array([False, terminated, False]), jnp.array([False, not terminated, False])
+        value_tp1 = jnp.array([3.0, after, jnp.inf])
+        result, _ = generalised_advantages(reward, value, value_tp1, ends, inside, 0.5, 0.5)
+        np.testing.assert_allclose(result[:2], [1.5 + 0.25 * expected, expected])
+
+
 @pytest.mark.parametrize(
     ("ratio", "advantage", "loss", "slope"),
     [

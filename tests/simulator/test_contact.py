@@ -201,7 +201,10 @@ def test_contact_memory():
         (c.AT_FAULT, True, False, False, c.GONE),
         (c.GONE, False, False, False, c.GONE),
         (c.GONE, False, True, False, c.PARTED),  # its fault stays decided
-        (c.GONE, True, True, False, c.IGNORED),
+        (c.GONE, True, True, True, c.RETURNED),
+        (c.RETURNED, True, True, True, c.RETURNED),
+        (c.RETURNED, False, True, False, c.PARTED),  # also after it was ignored
+        (c.RETURNED, False, False, False, c.GONE),
     ]
     before, touching, valid, fault, expected = (np.array(column) for column in zip(*rows, strict=True))
     before = jnp.asarray(before, jnp.int8)

@@ -21,7 +21,7 @@ from drivax.synthetic.roads.network import map_features
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from metric_scenes import two_way_road
-from scenes import LANE_M, car, line, straight_road
+from scenes import GLIMPSE, LANE_M, car, line, straight_road
 
 T = (np.arange(STEPS) - 10) * 0.1
 SIZE = replace(CAPACITIES["default"], agents=2, parked=2, lights=2)
@@ -211,6 +211,28 @@ def scored(bank, row):
         return SIMULATOR.replay(bank, state, now, jnp.zeros(2))[1].reward_terms
 
     return jax.lax.map(one, jnp.arange(10, 90))
+
+
+def test_episodes_that_start_in_a_lane_change_come_from_the_old_lane():
+    """Ego is 2 m aside at the start, 0.15 m beyond the line between the lanes; the change counts two steps later."""
+    bank = ScenarioBank.from_scenarios([assemble(straight_road([along(10 * T, aside(-2.0, LANE_M))]), SIZE)])
+    task = Task(observation=GLIMPSE, rewards=RewardConfig(preset="safety", lane_change=0.2), metrics="none")
+    simulator = Simulator(replace(task, ends=()))
+
+    @jax.jit
+    def start(bank, is_reset):
+        state = simulator.reset(bank, 0)
+        done, fresh = jnp.asarray(True), simulator.new_episode(bank, 0)
+        again, _ = simulator.step_or_reset(bank, state, jnp.zeros(2), done, fresh)
+        state = jax.tree.map(lambda first, then: jnp.where(is_reset, first, then), state, again)
+        changes = []
+        for _ in range(3):
+            state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), jnp.zeros(2))
+            changes.append(state.facts.lane_changed)
+        return jnp.stack(changes)
+
+    for is_reset in (True, False):
+        assert start(bank, is_reset).tolist() == [False, True, False]
 
 
 @pytest.fixture(scope="module")

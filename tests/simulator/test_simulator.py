@@ -1,6 +1,7 @@
 """The simulator as a whole: log replay, resets, groups, invariance, sizes."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from drivax.evaluation.rollout import drive, evaluation_task
 from drivax.planners.simple import ConstantVelocity, Expert, IdmPlanner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import Flag
+from drivax.scenario.schema import STEPS, Flag
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
@@ -189,6 +190,19 @@ def test_step_or_reset_equals_step_and_reset(single, world):
     for a, b in ((plain, same), (plain, with_frame), (reset(world, rows[3]), restarted)):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), a, b)
     assert not bool(transition.terminated) and not bool(transition.truncated)
+
+
+def test_a_stop_before_the_episode_is_as_old_as_it_was_long_ago():
+    """Ego stands 1 m before a stop line up to step 5; episodes start at that step, and 1 and 5 steps later."""
+    driven_m = 0.6 * np.clip(np.arange(STEPS) - 5, 0, None)
+    ego = car(36.6)
+    ego |= {
+        "xy": ego["xy"] + driven_m[:, None] * [1.0, 0.0],
+        "velocity": (driven_m > 0)[:, None] * [6.0, 0.0],
+    }
+    bank, simulator = bank_of(straight_road([ego], light=RED)), measuring("red_light")
+    reset = jax.jit(jax.vmap(partial(simulator.reset, bank, 0)))
+    assert reset(jnp.array([5, 6, 10])).lights.pause[:, 0].tolist() == [0, 1, 5]
 
 
 @pytest.mark.slow

@@ -164,6 +164,9 @@ def test_a_single_cluster_has_no_interval():
 
 def test_clusters_without_defined_episodes_are_excluded():
     assert bootstrap_mean([1.0, None, 3.0], ["a", "b", "c"], seed=4) == bootstrap_mean([1.0, 3.0], seed=4)
+    by_seed = np.random.default_rng(0).normal(size=(3, 8))
+    padded = np.pad(by_seed, ((0, 1), (0, 40)), constant_values=np.nan)
+    assert interquartile_bootstrap(padded, seed=4) == interquartile_bootstrap(by_seed, seed=4)
 
 
 def test_seeds_repeat_and_chunks_do_not_matter(monkeypatch):

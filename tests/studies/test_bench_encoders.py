@@ -17,6 +17,11 @@ TINY = [
 ]  # fmt: skip
 
 
+def test_settings_of_the_simulator_are_refused(capsys):
+    assert main(["bench", "--encoders", "--batch", "512", "--trust-code", "mine", *TINY]) == 2
+    assert "leave out --batch --trust-code" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_command_counts_and_times(capsys, monkeypatch):
     assert main(["bench", "--encoders", "--json", *TINY]) == 0

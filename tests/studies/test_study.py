@@ -133,6 +133,18 @@ def test_p_values_are_adjusted_within_their_group():
     assert len(claimed) == len(set(claimed)) == 54
 
 
+def test_claims_without_a_test_do_not_raise_the_number_that_decides():
+    claim, rng = LONGTAIL.claims[0], np.random.default_rng(0)
+    episodes = draw_failures({claim.arm: 0.14, claim.reference: 0.16}, rng)
+    undefined = next(name for name in METRICS if name != claim.metric)
+    episodes[claim.arm][undefined] = np.full((SEEDS, SCENARIOS), np.nan)
+    strata = Strata([str(number) for number in range(SCENARIOS)], np.arange(SCENARIOS) % 2 == 0, None)
+    (alone,) = decide_claims([claim], episodes, strata)
+    among, untested = decide_claims([claim, replace(claim, metric=undefined)], episodes, strata)
+    assert untested.effect is None and alone.verdict == "undecided"
+    assert among.needed == alone.needed and "would decide" in alone.needed
+
+
 def test_undecided_claims_name_the_seeds_or_recordings_that_would_decide():
     few = CrossedEffect(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
     seeds = int(describe_sample_size(few, 1).split()[0])

@@ -19,7 +19,7 @@ from drivax.tasks.observations import PRESETS, ObservationConfig, OwnGroup
 from drivax.tasks.perception import Perception
 from drivax.tasks.task import Task
 from drivax.testing import check_feature
-from scenes import LANE_M, RED, bank_of, car, line, straight_road
+from scenes import GLIMPSE, LANE_M, RED, bank_of, car, line, straight_road
 
 RADIUS_M, STRAIGHT_M = 50.0, 40.0
 EXAMPLES = (
@@ -230,6 +230,20 @@ def test_car_following_has_the_inputs_of_idm(obs):
     curve = np.sqrt(2.5 * RADIUS_M)
     expected = [[16.6 / 50, 9 / 15, 0, 1, 13.4 / 15], [90 / 50, 0, 0, 0, curve / 15]]
     np.testing.assert_allclose(obs["everything"]["car_following"][:2], expected, atol=0.01)
+
+
+def test_without_a_route_nothing_shows_the_logged_path():
+    """Where the bank stores ego's logged path instead of a route, no leader and no light is on it."""
+    own = (OwnGroup(example_features.car_following), OwnGroup(example_features.stop_line))
+    simulator = Simulator(Task(observation=replace(GLIMPSE, own=own)))
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)], light=RED))
+    look, found = jax.jit(lambda b: simulator.observe(b, simulator.context(b, 0, 10))), {}
+    for name, on_lanes in (("route", True), ("none", False)):
+        found[name] = jax.device_get(look(replace(bank, on_lanes=jnp.array([on_lanes]))))
+    np.testing.assert_allclose(found["route"]["car_following"][[0, 3]], [15.2 / 50, 1], atol=1e-3)
+    assert found["route"]["lights"][0, -1] == 1.0 and found["route"]["stop_line"][2] == 1.0
+    np.testing.assert_allclose(found["none"]["car_following"], [90 / 50, 0, 0, 0, 13.4 / 15], atol=1e-6)
+    assert found["none"]["lights"][0, -1] == 0.0 and found["none"]["stop_line"][2] == 0.0
 
 
 @pytest.mark.slow

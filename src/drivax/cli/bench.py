@@ -14,6 +14,7 @@ import tyro
 
 from drivax import settings
 from drivax.cli import record_of
+from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -51,9 +52,17 @@ class Bench(BenchConfig):
     """Print one JSON object instead of text."""
 
 
+#: Flags without a meaning for encoders.
+_OF_SIMULATOR = ("data", "scenarios", "batch", "steps", "traffic", "trust_code", "metrics")
+
+
 def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Run the benchmark and print its results."""
     if args.encoders:
+        ignored = [name for name in _OF_SIMULATOR if getattr(args, name) != getattr(Bench, name)]
+        if ignored:
+            flags = " ".join(f"--{name.replace('_', '-')}" for name in ignored)
+            raise UsageError("--encoders times no simulator", cure=f"leave out {flags}")
         times = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
         show(json.dumps(times, indent=1) if args.json else _encoders_text(times))
         return 0

@@ -200,15 +200,14 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        At a step where the ego is not valid, step 10 is taken instead. A later motion that the log lacks counts as the
-        present one; :meth:`expert_steps` leaves such steps out.
+        At a step where the ego is not valid now and in the next two, step 10 is taken instead.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
             context = self._logged_context(bank, *index)
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
-        *index, _ = self._draw(data, key, count, CURRENT_STEP)
+        *index, _ = self._draw(data, key, count, CURRENT_STEP, later=2)
         return jax.vmap(_bind_bank(demonstrate, data))(*index)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
@@ -250,11 +249,18 @@ class Driving:
         return bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
 
     def _draw(
-        self, bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int | None = None
+        self,
+        bank: ScenarioBank,
+        key: Array,
+        count: int,
+        earliest: int,
+        latest: int | None = None,
+        later: int = 0,
     ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
-        """Draw scenarios, steps at which the ego is valid (else step 10), slots of egos, and keys of episodes.
+        """Draw scenarios, steps, slots of egos, and keys of episodes.
 
-        Steps are at most the third last. The slot is None if all egos are the recorded ones.
+        The ego is valid at the step and at the ``later`` next ones; else it is step 10. Steps are at most the third
+        last. The slot is None if all egos are the recorded ones.
         """
         index_key, step_key = jax.random.split(key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
@@ -268,7 +274,9 @@ class Driving:
         last = last if latest is None else jnp.minimum(last, latest)
         step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
         # Egos are always valid at the current step.
-        is_valid = bank.agents[index, step, 0 if slot is None else slot, AgentColumn.VALID] > 0
+        ego = 0 if slot is None else slot[:, None]
+        steps = step[:, None] + jnp.arange(later + 1)
+        is_valid = (bank.agents[index[:, None], steps, ego, AgentColumn.VALID] > 0).all(axis=1)
         step = jnp.where(is_valid & (step <= last), step, CURRENT_STEP)
         # Unused, and not computed, with logged starts and without conditions.
         keys = jax.random.split(jax.random.fold_in(step_key, 1), count)

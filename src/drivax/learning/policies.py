@@ -139,9 +139,14 @@ class PolicyTraffic(PlannerTraffic):
 
     @property
     def name(self) -> str:
-        """Name in tables: ``driven_by_RUN``, with the traffic of the other agents unless it is the log."""
+        """Name in tables: ``driven_by_RUN``, with the traffic of the other agents unless it is the log.
+
+        Of a seed it is ``driven_by_RUN/seed-N``.
+        """
         base = "" if self.base.name == "log" else f"+{self.base.name}"
-        return f"driven_by_{_name(self.run)}{base}"
+        name = _name(self.run)
+        run = f"{Path(self.run).resolve().parent.name}/" if name.startswith("seed-") else ""
+        return f"driven_by_{run}{name}{base}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """Return the bank with the policy, and with what ``base`` needs."""

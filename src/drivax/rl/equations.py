@@ -28,16 +28,16 @@ def generalised_advantages(
     Returns:
         Advantages, and value targets ``A_t + V(s_t)``.
     """
-    not_terminated_t = 1.0 - terminated_t.astype(jnp.float32)
-    delta_t = reward_t + gamma * not_terminated_t * value_tp1 - value_t
-    decay_t = gamma * lambda_ * not_terminated_t * (1.0 - truncated_t.astype(jnp.float32))
+    # Select, do not multiply by zero: a value that overflowed must not reach the episode before it.
+    delta_t = reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1) - value_t
 
     def step(advantage_tp1: Array, step_t: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta, decay = step_t
-        advantage = delta + decay * advantage_tp1
+        delta, ends = step_t
+        advantage = delta + jnp.where(ends, 0.0, gamma * lambda_ * advantage_tp1)
         return advantage, advantage
 
-    _, advantages = jax.lax.scan(step, jnp.zeros_like(delta_t[0]), (delta_t, decay_t), reverse=True)
+    steps_t = delta_t, terminated_t | truncated_t
+    _, advantages = jax.lax.scan(step, jnp.zeros_like(delta_t[0]), steps_t, reverse=True)
     return advantages, advantages + value_t
 
 
@@ -95,7 +95,7 @@ def td_target(
     A truncated step bootstraps the value of its final state. No gradient flows into the targets. With n-step returns,
     ``gamma`` is that of n steps.
     """
-    # Select, do not multiply by zero: a value that overflowed must not reach a terminated step.
+    # Selected for the reason in :func:`generalised_advantages`.
     return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))
 
 

@@ -28,7 +28,8 @@ from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, F
 _STEP_M, _POINTS, _RECTANGLES = 2.0, 46, 9
 #: Largest distance along the route to the nearest of its points at which a pose is alongside it, m.
 ALONGSIDE_M = 2.0 * _STEP_M
-_FALLBACK_LIMIT_MPS = 13.4
+#: Speed limit of lanes without one, m/s.
+FALLBACK_LIMIT_MPS = 13.4
 #: Free space next to the car, m; lateral acceleration in curves, m/s2; braking towards curves, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
 #: Margin of the corridor on either side of ego, m; agents outside it are ignored.
@@ -45,7 +46,7 @@ _RULES: dict[str, Any] = {
     "red": LightState.STOP, "red_arrow": LightState.ARROW_STOP,
     "yellow": LightState.CAUTION, "yellow_arrow": LightState.ARROW_CAUTION,
     "step_m": _STEP_M, "near_m": _NEAR_M, "ends_m": 2.0 * _STEP_M, "level_m": LEVEL_M, "side_m": _SIDE_M,
-    "least_gap_m": LEAST_GAP_M, "free_m": FREE_M, "limit_mps": _FALLBACK_LIMIT_MPS, "curve_mps2": _CURVE_MPS2,
+    "least_gap_m": LEAST_GAP_M, "free_m": FREE_M, "limit_mps": FALLBACK_LIMIT_MPS, "curve_mps2": _CURVE_MPS2,
     "curve_braking_mps2": _CURVE_BRAKING_MPS2, "yellow_braking_mps2": _YELLOW_BRAKING_MPS2,
     "stop_short_m": STOP_SHORT_M,
 }  # fmt: skip
@@ -148,7 +149,7 @@ def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scal
 
 def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
     """Return the present speed limit, or the lower speed that the curves ahead require, m/s."""
-    limit = jnp.where(path[0, RouteColumn.LIMIT] > 0, path[0, RouteColumn.LIMIT], _FALLBACK_LIMIT_MPS)
+    limit = jnp.where(path[0, RouteColumn.LIMIT] > 0, path[0, RouteColumn.LIMIT], FALLBACK_LIMIT_MPS)
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
     curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M

@@ -39,8 +39,8 @@ class Contact(enum.IntEnum):
 
     ``IGNORED``: has overlapped since it appeared and does not count until it separates; ``HIT``: overlaps without the
     evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED``: separated again after ``HIT`` or ``AT_FAULT``;
-    ``GONE``: absent after any of these three. An agent that was gone and reappears in an overlap is ``IGNORED``, then
-    ``APART``: its earlier hit is forgotten.
+    ``GONE``: absent after any of these three; ``RETURNED``: was gone and has overlapped since it reappeared, ignored
+    until it is ``PARTED``.
     """
 
     ABSENT = 0
@@ -50,6 +50,7 @@ class Contact(enum.IntEnum):
     AT_FAULT = 4
     PARTED = 5
     GONE = 6
+    RETURNED = 7
 
 
 class CollisionType(enum.IntEnum):
@@ -86,6 +87,11 @@ def first_contacts(before: Int[Array, " S"], touching: Bool[Array, " S"]) -> Boo
     return touching & (before == Contact.APART)
 
 
+def ignored_overlaps(codes: Int[Array, " S"]) -> Bool[Array, " S"]:
+    """Mask of the overlaps that do not count until the agents separate, by contact code."""
+    return (codes == Contact.IGNORED) | (codes == Contact.RETURNED)
+
+
 def next_contacts(
     before: Int[Array, " S"], touching: Bool[Array, " S"], valid: Bool[Array, " S"], fault: Bool[Array, " S"]
 ) -> Int[Array, " S"]:
@@ -95,11 +101,10 @@ def next_contacts(
     """
     c = Contact
     # A slot that overlaps as it appears is ignored. A contact after ``PARTED`` is never a new fault.
-    is_ignored = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
-    code = jnp.where(before == c.PARTED, c.HIT, before)
-    code = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), code)
-    contact = jnp.where(is_ignored, c.IGNORED, code)
-    was_hit = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
+    contact = jnp.where(before == c.PARTED, c.HIT, before)
+    contact = jnp.where(before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), contact)
+    contact = jnp.where(before == c.ABSENT, c.IGNORED, jnp.where(before == c.GONE, c.RETURNED, contact))
+    was_hit = (before == c.HIT) | (before >= c.AT_FAULT)
     apart, absent = jnp.where(was_hit, c.PARTED, c.APART), jnp.where(was_hit, c.GONE, c.ABSENT)
     return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
 

@@ -14,7 +14,7 @@ from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 
 #: A stop before a right turn on red: maximum speed, maximum distance to the line, and steps for which it is remembered.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
-#: Steps of the history that are searched for a stop before the episode.
+#: Steps of the history, the present one included, that are searched for a stop before the episode.
 _LOOK_BACK_STEPS = 16
 #: Steps after lines were crossed off the route at which the agent's heading decides which light counts.
 _DECISION_STEPS = 20
@@ -33,16 +33,19 @@ def _pauses(speed: Float[Array, ""], distance_m: Float[Array, " L"]) -> Bool[Arr
 
 
 def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
-    """Return the stop-line memory that the recent motion of a context implies."""
+    """Return the stop-line memory of the step before a context, which its recent motion implies.
+
+    :func:`check_lights` adds the present step.
+    """
     length = bank.length_m(context.index, context.slot)
     ground = context.z - bank.height_m(context.index, context.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(context, length)
-    for age in range(_LOOK_BACK_STEPS - 1, -1, -1):
-        front = fronts[-1 - age]
+    for age in range(_LOOK_BACK_STEPS - 2, -1, -1):
+        front = fronts[-2 - age]
         # With equal positions nothing crosses; the result is the distance to each line.
         _, distance_m = light_crossing(bank, context.index, front, front, ground)
-        pause = jnp.where(_pauses(context.history[-1 - age, MOTION_SPEED], distance_m), age, pause)
+        pause = jnp.where(_pauses(context.history[-2 - age, MOTION_SPEED], distance_m), age, pause)
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
 

@@ -17,7 +17,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import forget_crossings, remember_lights
-from drivax.simulator.situation import forget_strand, measure, surroundings
+from drivax.simulator.situation import entry_strand, measure, replace_strand, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of, present_frame
 from drivax.simulator.types import (
@@ -91,9 +91,10 @@ class Simulator:
     def new_episode(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> EpisodeStart:
-        """Return the :meth:`context` of a new episode and its stop-line memory."""
+        """Return the :meth:`context` of a new episode, and what its recent motion implies."""
         context = self.context(bank, index, step, slot, key)
-        return EpisodeStart(context, remember_lights(bank, context))
+        strand = entry_strand(bank, context, self.task.reads)
+        return EpisodeStart(context, remember_lights(bank, context), strand)
 
     def frame(
         self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int,
@@ -272,7 +273,7 @@ def _clear_memory(state: SimState, start: EpisodeStart, done: Bool[Array, ""]) -
     """Replace the memory of an episode that is ``done`` by that of the next, which begins at ``start``."""
     return replace(
         state,
-        facts=forget_strand(state.facts, done),
+        facts=replace_strand(state.facts, done, start.strand),
         contacts=jnp.where(done, jnp.int8(Contact.ABSENT), state.contacts),
         lights=jax.tree.map(partial(jnp.where, done), start.lights, state.lights),
         start=jnp.where(done, start.context.step, state.start),

@@ -61,8 +61,8 @@ def measure(
     """Measure the driven agent.
 
     ``context`` has the present step and motion; its ``route_m`` and ``z``, ``contacts``, ``lights`` and the fact
-    ``strand`` (None in a reset, -1 where a collector begins an episode) are those of the step before. ``frame`` and
-    ``previous`` are all agents now and one step before. Facts that ``reads`` does not name are None and not computed.
+    ``strand`` (None: that of :func:`entry_strand`) are those of the step before. ``frame`` and ``previous`` are all
+    agents now and one step before. Facts that ``reads`` does not name are None and not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
@@ -95,7 +95,7 @@ def measure(
         limit_mps=lanes.limit,
         routed=routed,
         logged=logged[AgentColumn.VALID] > 0,
-        ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
+        ignored=contact.ignored_overlaps(codes).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
         moved_m=_step_length(context),
@@ -112,14 +112,27 @@ def measure(
     return Situation(context, _select_facts(facts, reads), around), codes, lights
 
 
-def forget_strand(facts: Facts, done: Bool[Array, ""]) -> Facts:
-    """Set the ``strand`` fact, if it is measured, to -1 (none) where the episode is ``done``."""
+def entry_strand(bank: ScenarioBank, context: AgentContext, reads: frozenset[str]) -> Integer | None:
+    """Return the strand from which an episode's first lane passage starts; None if ``reads`` needs no passages.
 
-    def forget(path: tuple[Any, ...], fact: Array) -> Array:
-        return jnp.where(done, jnp.int16(-1), fact) if path[0].name == "strand" else fact
+    An agent that changes lanes at the start comes from its pose 15 steps ago.
+    """
+    if not reads & _PASSAGES:
+        return None
+    x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
+    xy, heading = jnp.stack([x, y]), jnp.stack([jnp.cos(psi), jnp.sin(psi)])
+    ground = context.z - bank.height_m(context.index, context.slot) / 2
+    return queries.lane_passage(bank, context.index, xy, heading, ground, -1).strand
+
+
+def replace_strand(facts: Facts, done: Bool[Array, ""], strand: Any) -> Facts:
+    """Set the fact ``strand``, if it is measured, to ``strand`` where the episode is ``done``."""
+
+    def select(path: tuple[Any, ...], fact: Array) -> Array:
+        return jnp.where(done, strand, fact) if path[0].name == "strand" else fact
 
     # As a tree: facts that are not read are None, which the constructor refuses under type checks.
-    return jax.tree_util.tree_map_with_path(forget, facts)
+    return jax.tree_util.tree_map_with_path(select, facts)
 
 
 def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Surroundings:
@@ -167,7 +180,7 @@ def _measure_contacts(
         fault, kind = contact.classify_contacts(frame, context.slot, begins, speed, others_speed, unlawful)
     codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ignored = (codes == Contact.IGNORED) | (codes == Contact.HIT)
+        ignored = contact.ignored_overlaps(codes) | (codes == Contact.HIT)
         ttc = contact.time_to_collision(frame, context.slot, ignored)
     return codes, fault.any(), kind, ttc
 
@@ -197,7 +210,7 @@ def _requested_facts(
     if reads & _SCHEDULE:
         facts |= _schedule_facts(bank, context)
     if "gap_m" in reads:
-        facts["gap_m"] = contact.nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+        facts["gap_m"] = contact.nearest_gap(frame, context.slot, contact.ignored_overlaps(codes))
     if "time_gap_s" in reads:
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], STOPPED_MPS)
         facts["time_gap_s"] = jnp.clip(leader_gap(bank, context, frame) / speed, 0.0, LONGEST_GAP_S)
@@ -210,13 +223,9 @@ def _requested_facts(
 
 
 def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, strand: Any) -> dict[str, Array]:
-    """Return the facts of lane passages; ``strand`` is that of the step before, None in a reset."""
+    """Return the facts of lane passages; ``strand`` is that of the step before, None for :func:`entry_strand`."""
     ego, ground = frame.box[context.slot], _ground(bank, context, frame)
-    if strand is None:
-        # An agent that changes lanes at the start comes from its pose 15 steps ago.
-        x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
-        heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
-        strand = queries.lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
+    strand = entry_strand(bank, context, _PASSAGES) if strand is None else strand
     passage = queries.lane_passage(bank, context.index, ego[:2], ego[2:4], ground, strand)
     return {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
 
@@ -243,7 +252,7 @@ def _select_facts(facts: Facts, reads: frozenset[str]) -> Facts:
     def select(path: tuple[Any, ...], fact: Array) -> Array | None:
         return fact if path[0].name in names else None
 
-    # As a tree, for the reason in :func:`forget_strand`.
+    # As a tree, for the reason in :func:`replace_strand`.
     return facts if names >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(select, facts)
 
 

@@ -176,10 +176,11 @@ class LightMemory:
 
 @record
 class EpisodeStart:
-    """First context of an episode and its stop-line memory."""
+    """First context of an episode, its stop-line memory, and the strand of its lane a moment earlier, if measured."""
 
     context: AgentContext
     lights: LightMemory
+    strand: Any = None
 
 
 @record

@@ -205,11 +205,14 @@ def interquartile_bootstrap(
     if any(seed_values.size != labels.size for seed_values in by_seed):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")
     sums, counts = _seed_totals(np.stack(by_seed), labels)
+    # Seeds and clusters without a value are no part of the sample.
+    has_values = np.ix_(counts.any(axis=1), counts.any(axis=0))
+    sums, counts = sums[has_values], counts[has_values]
     n, (seeds, cluster_count) = int(counts.sum()), sums.shape
     if not n:
         return UNDEFINED
     mean = _interquartile(np.ones(seeds, int), sums.sum(axis=1), counts.sum(axis=1))
-    if np.count_nonzero(counts.any(axis=0)) < 2:
+    if cluster_count < 2:
         return Interval(mean, None, None, n)
     rng, means = np.random.default_rng(seed), np.empty(resamples)
     for resample in range(resamples):

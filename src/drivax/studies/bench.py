@@ -28,7 +28,7 @@ from drivax.metrics.selection import MetricNames
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.contact import Contact, overlaps, time_to_collision
+from drivax.simulator.contact import ignored_overlaps, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator, map_where
 from drivax.simulator.traffic.bank_data import prepare_bank
@@ -346,7 +346,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return project_on_route(bank, state.context.row, state.context.history[-1, :2], state.context.route_m)
 
     def ttc(bank: ScenarioBank, state: SimState) -> Any:
-        return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)
+        return time_to_collision(frame(bank, state), state.context.slot, ignored_overlaps(state.contacts))
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
         # Time of the accumulators alone: no metric reads the surroundings, and the compiler removes their computation.

@@ -167,8 +167,9 @@ def decide_claims(
         members = [index for index, name in enumerate(groups) if name == group]
         effects = [results[index].effect for index in members]
         adjusted_ps = holm_adjust([None if effect is None else effect.p for effect in effects])
+        tests = sum(effect is not None for effect in effects)
         for index, p in zip(members, adjusted_ps, strict=True):
-            results[index] = _decide(replace(results[index], adjusted_p=p), len(members))
+            results[index] = _decide(replace(results[index], adjusted_p=p), tests)
     return results
 
 
@@ -189,15 +190,15 @@ def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> 
     return ClaimResult(claim, effect, difference, (math.expm1(ratio.difference), low, high), None)
 
 
-def _decide(result: ClaimResult, claims: int) -> ClaimResult:
-    """Return the result with its verdict; its group has ``claims`` claims."""
+def _decide(result: ClaimResult, tests: int) -> ClaimResult:
+    """Return the result with its verdict; its group has ``tests`` claims that can be tested."""
     if result.effect is None or result.adjusted_p is None:
         needed = "fewer than two recordings define it"
         if result.difference is not None:
             needed = "the mean of an arm is not positive: no ratio"
         return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
-        return replace(result, needed=describe_sample_size(result.effect, claims))
+        return replace(result, needed=describe_sample_size(result.effect, tests))
     lower_is_better = METRICS[result.claim.metric].better == "low"
     better = (result.effect.difference < 0) == lower_is_better
     return replace(result, verdict="supported" if better else "contradicted")

@@ -16,7 +16,7 @@ from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLaye
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.simulator.ahead import ahead, has_route
+from drivax.simulator.ahead import FALLBACK_LIMIT_MPS, ahead, has_route
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.lights import is_red
 from drivax.simulator.types import MOTION_SPEED, AgentContext
@@ -106,14 +106,16 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
 
     Gap to the leader or a light that requires a stop, at most 90 m, in units of 50 m; closing speed and speed of the
     leader (0 without one); whether there is one; speed by the limit and the curves ahead. Speeds in units of 15 m/s.
-    Without a route on lanes it looks along the path that :func:`~drivax.simulator.ahead.has_route` calls privileged.
+    Without a route on lanes nothing leads, and the last is 13.4 m/s, as without a limit.
     """
     speed = context.history[-1, MOTION_SPEED]
     inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)
-    leads = inputs.gap < _FARTHEST_M
-    gap = jnp.minimum(inputs.gap, _FARTHEST_M) / POSITION_M
+    routed = has_route(bank, context)
+    leads = routed & (inputs.gap < _FARTHEST_M)
+    gap = jnp.where(leads, inputs.gap, _FARTHEST_M) / POSITION_M
     speeds = jnp.stack([speed - inputs.leader, inputs.leader]) * leads / SPEED_MPS
-    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), inputs.desired / SPEED_MPS])
+    desired = jnp.where(routed, inputs.desired, FALLBACK_LIMIT_MPS) / SPEED_MPS
+    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), desired])
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:

@@ -427,13 +427,13 @@ def _lights(
 ) -> Observation:
     """Return the group ``lights``: those on the route first, then the others, each by distance.
 
-    Without a route on lanes they are those on the path that the bank stores instead (``ahead.has_route``).
+    Without a route on lanes all are off the route.
     """
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_BEHIND_M)
     perception = config.perception
-    on_route = line[LightRow.ARC + bank.ego_number(context.row)] < NEVER_M
+    on_route = (line[LightRow.ARC + bank.ego_number(context.row)] < NEVER_M) & has_route(bank, context)
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
     first = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
     exists = relevant[first] & (jnp.arange(config.lights) < state.shape[0])

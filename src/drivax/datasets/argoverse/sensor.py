@@ -126,7 +126,7 @@ def decode(path: Path) -> Recording:
     log_id = path.resolve().parent.name
     try:
         clock, lost_frames = _clock(boxes, poses)
-        tracks = _tracks(boxes, poses, clock)
+        tracks, repeated = _tracks(boxes, poses, clock)
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure or _SKIP) from error
     return Recording(
@@ -142,6 +142,7 @@ def decode(path: Path) -> Recording:
         lost=parsing.nonzero(
             local_map.lost,
             frames_without_pose=lost_frames,
+            repeated_rows=repeated,
             unknown_fields=len((boxes.unread - _OTHERS) | poses.unread),
         ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
@@ -157,8 +158,11 @@ def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
     return frames[has_pose], int((~has_pose).sum())
 
 
-def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
-    """Return all tracks in the city's frame; the ego is row 0 and valid at every step."""
+def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> tuple[Tracks, int]:
+    """Return all tracks in the city's frame, and the number of boxes of a track that has another one in the frame.
+
+    The ego is row 0 and valid at every step.
+    """
     pose = _poses(poses, clock)
     stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row
     category = boxes.texts["category"]
@@ -174,8 +178,9 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
     valid = np.zeros(states.shape[:2], bool)
     states[1 + row, step], valid[1 + row, step] = table, True
     states[0], valid[0] = _ego(boxes, np.flatnonzero(is_ego), pose), True
+    repeated = len(rows) - int(valid[1:].sum())
     kinds = [_KINDS.get(category.text(int(rows[number])), AgentKind.OTHER) for number in first]
-    return Tracks(
+    tracks = Tracks(
         xy=states[..., :2].copy(),
         z=states[..., 2].copy(),
         heading=states[..., 3].copy(),
@@ -185,6 +190,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
         kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),
         track_id=np.concatenate(([0], 1 + codes)),
     )
+    return tracks, repeated
 
 
 def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:

@@ -285,8 +285,11 @@ def agents(database: Database) -> _Agents:
     return {token: (number, kind) for number, (token, kind) in enumerate(kinds.items(), start=1)}
 
 
-def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, int]:
-    """Return the tracks of a piece, ego in row 0, and the number of boxes without a track."""
+def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, dict[str, int]]:
+    """Return the tracks of a piece, ego in row 0, and the number of boxes without a track, or of one that has another.
+
+    Of several boxes of a track in a sweep the last one counts.
+    """
     steps = len(piece.sweeps)
     boxes, owners, lost = _boxes(log, piece, agents_by_token)
     tokens = sorted({owner for _, owner in owners}, key=lambda token: agents_by_token[token][0])
@@ -310,7 +313,7 @@ def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, in
         kind=np.array([kind for _, kind in entries], np.int8),
         track_id=np.array([number for number, _ in entries], np.int64),
     )
-    return states, lost
+    return states, {"boxes_without_track": lost, "repeated_boxes": len(owners) - len(set(owners))}
 
 
 def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -417,7 +420,7 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
         tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
         lost=parsing.nonzero(
             lost,
-            boxes_without_track=lost_boxes,
+            **lost_boxes,
             lights=lost_lights,
             roadblocks=lost_roadblocks,
             unknown_fields=log.unknown_fields + city.unknown_layers,

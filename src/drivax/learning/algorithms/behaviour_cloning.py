@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,8 @@ class Cloning:
         batch: Logged steps per update.
         updates: Updates per iteration.
         learning_rate, last_rate: Initial learning rate of Adam, and the final one relative to it; 1: constant.
-        falling: Share of the run (of pretraining, in a warm start) over which the rate decays linearly, then constant.
+        decay_share: Share of the run (of pretraining, in a warm start) over which the rate decays linearly; it is
+            constant afterwards.
         gradient_norm: Maximum global norm of the gradient; None: no clipping.
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
     """
@@ -67,20 +68,23 @@ class Cloning:
     updates: int = 50
     learning_rate: float = 1e-3
     last_rate: float = 0.1
-    falling: float = 1.0
+    decay_share: float = 1.0
     gradient_norm: float | None = 1.0
     mask_clipped: bool = True
+
+    #: Former key.
+    renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "batch", "updates")
         check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_least(self, 0, "learning_rate", "last_rate")
         check_above_zero(self, "gradient_norm")
-        check_decay_share(self.falling)
+        check_decay_share(self.decay_share)
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
         """Return the optimiser of a run of ``updates``."""
-        updates = max(round(self.falling * updates), 1)
+        updates = max(round(self.decay_share * updates), 1)
         return clipped_adam(self.learning_rate, self.gradient_norm, updates=updates, last=self.last_rate)
 
     def batch_loss(

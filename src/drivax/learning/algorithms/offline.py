@@ -137,7 +137,7 @@ class OfflineConfig:
         tau: Polyak averaging rate of target networks.
         policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
         last_rate: Final learning rates relative to the initial ones; 1: constant.
-        falling: Share of the run over which the rates decay linearly; they are constant afterwards.
+        decay_share: Share of the run over which the rates decay linearly; they are constant afterwards.
         gradient_norm: Maximum global norm of each network's gradient.
         normalise: Normalise every feature of an observation by its mean and standard deviation over logged steps.
         fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
@@ -152,10 +152,13 @@ class OfflineConfig:
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     last_rate: float = 1.0
-    falling: float = 1.0
+    decay_share: float = 1.0
     gradient_norm: float = 10.0
     normalise: bool = False
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
+
+    #: Former key.
+    renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "batch", "updates")
@@ -163,7 +166,7 @@ class OfflineConfig:
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
         check_shares(self, "gamma", "tau")
         check_above_zero(self, "gradient_norm")
-        check_decay_share(self.falling)
+        check_decay_share(self.decay_share)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -236,7 +239,7 @@ class Offline(OffPolicy[Config]):
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
         """Return Adam for a network that every n-th update changes."""
         config = self.config
-        updates = max(round(config.falling * self.updates) // every, 1) if config.last_rate != 1.0 else 0
+        updates = max(round(config.decay_share * self.updates) // every, 1) if config.last_rate != 1.0 else 0
         return clipped_adam(rate, config.gradient_norm, updates=updates, last=config.last_rate)
 
     def init(self, data: Any, key: Array) -> OfflineState:

@@ -112,4 +112,4 @@ def clip_per_network(norm: float) -> optax.GradientTransformation:
 def check_decay_share(share: float) -> None:
     """Raise UsageError if the share of a run over which a rate decays is outside (0, 1]."""
     if not 0.0 < share <= 1.0:
-        raise UsageError(f"falling is {share}", cure="use more than 0 and at most 1")
+        raise UsageError(f"decay_share is {share}", cure="use more than 0 and at most 1")
