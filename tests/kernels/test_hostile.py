@@ -75,7 +75,7 @@ def calls():
 def hostile(rng, shape, dtype):
     """Random numbers of an array: any, or mostly those that files hold."""
     dtype, share = np.dtype(dtype), rng.choice([0.0, 0.02, 0.5, 1.0])
-    if dtype == bool:
+    if dtype.kind == "b":
         return rng.integers(0, 256 if share else 2, shape, np.uint8).view(bool)
     if dtype.kind == "f":
         usual = rng.normal(size=shape) * rng.choice([0.5, 3.0, 40.0])

@@ -11,7 +11,7 @@ import pytest
 from drivax import kernels
 from drivax.kernels import library
 from drivax.networks.encoders import max_pool
-from kernels.compare import needs_kernels, run_tests
+from kernels.compare import TARGETS, needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -105,16 +105,26 @@ def test_compiled_programs_name_the_build():
     assert f"drivax_encode_sets_{digest}" in text
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "c++")) is None, reason="no C++ compiler")
-def test_sanitizers_find_no_error_in_the_kernels(repository, tmp_path):
-    """AddressSanitizer and UndefinedBehaviorSanitizer, over the tests of all kernels."""
-    built = tmp_path / "libdrivax.so"
-    command = [sys.executable, str(repository / "native" / "build.py"), "--sanitize", "--out", str(built)]
-    subprocess.run(command, check=True)
+@pytest.fixture(scope="module")
+def sanitized(repository, tmp_path_factory):
+    """The library with AddressSanitizer and UndefinedBehaviorSanitizer, and the environment that it needs."""
+    compiler = os.environ.get("CXX", "c++")
+    if shutil.which(compiler) is None:
+        pytest.skip("no C++ compiler")
+    built = tmp_path_factory.mktemp("sanitized") / "libdrivax.so"
+    script = repository / "native" / "build.py"
+    subprocess.run([sys.executable, str(script), "--strict", "--sanitize", "--out", str(built)], check=True)
     paths = [f"-print-file-name={name}.so" for name in ("libasan", "libubsan", "libstdc++")]
-    runtimes = [
-        subprocess.check_output([os.environ.get("CXX", "c++"), path], text=True).strip() for path in paths
-    ]
-    variables = {"LD_PRELOAD": ":".join(runtimes), "ASAN_OPTIONS": "detect_leaks=0"}
-    run_tests(repository / "tests" / "kernels", DRIVAX_NATIVE_LIBRARY=str(built), **variables)
+    runtimes = [subprocess.check_output([compiler, path], text=True).strip() for path in paths]
+    return {
+        "DRIVAX_NATIVE_LIBRARY": str(built),
+        "LD_PRELOAD": ":".join(runtimes),
+        "ASAN_OPTIONS": "detect_leaks=0",
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [*TARGETS, "best"])
+def test_sanitizers_find_no_error_in_the_kernels(repository, sanitized, target):
+    """Over the tests of all kernels, with 10,000 random maps and 10,000 calls with any numbers."""
+    run_tests(repository / "tests" / "kernels", "slow or not slow", DRIVAX_NATIVE=target, **sanitized)
