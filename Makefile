@@ -52,7 +52,7 @@ test: $(STAMP)
 
 # Includes the native kernels, if there is a C++ compiler.
 test-all: $(STAMP)
-	if command -v $${CXX:-c++} > /dev/null; then $(BIN)/python native/build.py; fi
+	if command -v $${CXX:-c++} > /dev/null; then $(BIN)/python native/build.py --strict; fi
 	DRIVAX_OPTIMISED=1 $(PYTEST) $(ARGS)
 
 MINUTES ?= 60

@@ -10,16 +10,16 @@ struct AgentRows {
   const float* offsets_m;       // [offsets]: ascending places on the route, relative to ego, to project agents on
   const float* box;             // [batch, slots, 6]: x, y, cos, sin, length, width
   const float* velocity;        // [batch, slots, 2]
-  const bool* valid;            // [batch, slots]
+  Mask valid;                   // [batch, slots]
   const int32_t* kind;          // [batch, slots]
   const int32_t* slot;          // [batch], of ego
   const int32_t* index;         // [batch]: scenario
   const int32_t* row;           // [batch]: route
   const float* route_m;         // [batch]: arc length of ego
-  const bool* has_route;        // [batch]
+  Mask has_route;               // [batch]
   const float* motion;          // [batch, 4]: ego's x, y, heading, speed
   const float* direction;       // [batch, 2]: ego's cos, sin
-  int64_t scenarios, routes_count, points, offsets, batch, slots, count;
+  int64_t scenarios = -1, routes_count = -1, points = -1, offsets = -1, slots = -1, count = -1;
   const int32_t* kinds;  // [4], of the columns of the type
   // Units; largest distances beside the route and, along it, from the nearest point; horizon.
   float position_m, speed_mps, size_m, side_m, alongside_m, horizon_s;
@@ -66,7 +66,7 @@ enum { kSizeHeight = 2, kSizeColumns = 4, kMotionSpeed = 3, kTypes = 4 };
 // The rank of an agent is the number of agents that are nearer, or as near with a lower slot.
 INLINE int64_t find_nearest(const AgentRows& a, int64_t sample, const View& view, const AgentScratch& scratch) {
   const float* box = a.box + sample * a.slots * kBoxColumns;
-  const bool* valid = a.valid + sample * a.slots;
+  const Mask valid = a.valid + sample * a.slots;
   int64_t size = 0;
   for (int64_t slot = 0; slot < a.slots; ++slot) {
     const float dx = box[slot * kBoxColumns + kBoxX] - view.x, dy = box[slot * kBoxColumns + kBoxY] - view.y;
@@ -109,7 +109,7 @@ INLINE RoutePlace place_on_path(const Path& path, int64_t number) {
 
 INLINE Path read_path(const AgentRows& a, int64_t sample, const AgentScratch& scratch) {
   const int64_t number = clamp_row(a.row[sample], a.routes_count);
-  const float end_m = a.route_points[number] > 1 ? (float)(a.route_points[number] - 1) : -1;
+  const float end_m = end_of_route(a.route_points[number]);
   const int64_t last = a.points > 1 ? a.points - 2 : 0;
   Path path = {a.routes + number * a.points * kRouteColumns, a.points > 1 ? kRouteColumns : 0};
   path.begin = a.offsets;
@@ -306,34 +306,33 @@ static AgentScratch scratch_of(const AgentRows& a) {
   return scratch;
 }
 
-static ffi::Error observe_agents(ffi::ThreadPool pool, Float size, Float routes, Int route_points, Float offsets_m,
-                                 Float box, Float velocity, Bool valid, Int kind, Int slot, Int index, Int row,
-                                 Float route_m, Bool has_route, Float motion, Float direction, Numbers columns,
-                                 Numbers kinds, float position_m, float speed_mps, float size_m, float side_m,
-                                 float alongside_m, float horizon_s, Result<Float> rows, Result<Bool> mask) {
+static ffi::Error observe_agents(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                                 Numbers columns, Numbers kinds, float position_m, float speed_mps, float size_m,
+                                 float side_m, float alongside_m, float horizon_s) {
+  Arrays arrays(pool, arguments, results);
   AgentRows a;
-  a.size = size.typed_data();
-  a.routes = routes.typed_data();
-  a.route_points = route_points.typed_data();
-  a.offsets_m = offsets_m.typed_data();
-  a.box = box.typed_data();
-  a.velocity = velocity.typed_data();
-  a.valid = valid.typed_data();
-  a.kind = kind.typed_data();
-  a.slot = slot.typed_data();
-  a.index = index.typed_data();
-  a.row = row.typed_data();
-  a.route_m = route_m.typed_data();
-  a.has_route = has_route.typed_data();
-  a.motion = motion.typed_data();
-  a.direction = direction.typed_data();
-  a.scenarios = axis_from_last(size, 3);
-  a.routes_count = axis_from_last(routes, 3);
-  a.points = axis_from_last(routes, 2);
-  a.offsets = offsets_m.element_count();
-  a.batch = slot.element_count();
-  a.slots = axis_from_last(valid, 1);
-  a.count = axis_from_last(*mask, 1);
+  a.columns = columns.begin();
+  a.column_count = columns.size();
+  arrays.common(a.size, {a.scenarios, a.slots, 4});
+  arrays.common(a.routes, {a.routes_count, a.points, 7});
+  arrays.common(a.route_points, {a.routes_count});
+  arrays.common(a.offsets_m, {a.offsets});
+  arrays.batched(a.box, {a.slots, 6});
+  arrays.batched(a.velocity, {a.slots, 2});
+  arrays.batched(a.valid, {a.slots});
+  arrays.batched(a.kind, {a.slots});
+  arrays.batched(a.slot, {});
+  arrays.batched(a.index, {});
+  arrays.batched(a.row, {});
+  arrays.batched(a.route_m, {});
+  arrays.batched(a.has_route, {});
+  arrays.batched(a.motion, {4});
+  arrays.batched(a.direction, {2});
+  arrays.batched(a.rows, {a.count, a.column_count});
+  arrays.batched(a.mask, {a.count});
+  arrays.nonempty({a.scenarios, a.slots, a.routes_count, a.points, a.offsets});
+  arrays.columns(columns, kAgentRowColumns);
+  arrays.require(kinds.size() == 4, "there are four types of agents");
   a.kinds = kinds.begin();
   a.position_m = position_m;
   a.speed_mps = speed_mps;
@@ -341,23 +340,15 @@ static ffi::Error observe_agents(ffi::ThreadPool pool, Float size, Float routes,
   a.side_m = side_m;
   a.alongside_m = alongside_m;
   a.horizon_s = horizon_s;
-  a.columns = columns.begin();
-  a.column_count = columns.size();
-  a.rows = rows->typed_data();
-  a.mask = mask->typed_data();
-  divide(pool, a.batch, 32, [&](int64_t first, int64_t last) {
+  return arrays.run(32, [&](int64_t first, int64_t last) {
     const AgentScratch scratch = scratch_of(a);
     CALL(observe_agents, a, first, last, scratch);
   });
-  return ffi::Error::Success();
 }
 
-BIND(observe_agents, observe_agents,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Float>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>()
-     .Arg<Int>().Arg<Int>().Arg<Int>().Arg<Int>().Arg<Float>().Arg<Bool>().Arg<Float>().Arg<Float>()
+BIND(observe_agents,
      .Attr<Numbers>("columns").Attr<Numbers>("kinds").Attr<float>("position_m").Attr<float>("speed_mps")
-     .Attr<float>("size_m").Attr<float>("side_m").Attr<float>("alongside_m").Attr<float>("horizon_s")
-     .Ret<Float>().Ret<Bool>())
+     .Attr<float>("size_m").Attr<float>("side_m").Attr<float>("alongside_m").Attr<float>("horizon_s"))
 
 }  // namespace drivax
 

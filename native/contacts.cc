@@ -17,15 +17,15 @@ struct Contacts : ContactRules {
   const float* box;                // [batch, slots, 6]
   const float* velocity;           // [batch, slots, 2]
   const float* z;                  // [batch, slots]
-  const bool* valid;               // [batch, slots]
+  Mask valid;                      // [batch, slots]
   const int32_t* kind;             // [batch, slots]
   const float* previous_velocity;  // [batch, slots, 2], one step before
-  const bool* previous_valid;      // [batch, slots]
+  Mask previous_valid;             // [batch, slots]
   const int32_t* slot;             // [batch]: the driven agent
   const float* speed;              // [batch]: its larger one of before and after the step
-  const bool* unlawful;            // [batch]: whether a lateral hit is its fault
+  Mask unlawful;                   // [batch]: whether a lateral hit is its fault
   const int8_t* before;            // [batch, slots]: codes one step before
-  int64_t batch, slots;
+  int64_t slots = -1;
   int8_t* codes;                   // [batch, slots]
   bool* at_fault;                  // [batch]: whether a contact that begins is its fault
   int8_t* type;                    // [batch]: of the nearest contact that begins
@@ -170,7 +170,7 @@ INLINE void measure(Measurement& m, int32_t* slots, int count) {
 void measure_contacts(const Contacts& a, int64_t first, int64_t last) {
   for (int64_t sample = first; sample < last; ++sample) {
     const int64_t start = sample * a.slots;
-    const bool* valid = a.valid + start;
+    const Mask valid = a.valid + start;
     const int8_t* before = a.before + start;
     const float* z = a.z + start;
     // An agent outside all slots is measured as the last one, but no slot is its own.
@@ -210,36 +210,30 @@ XLA_FFI_REGISTER_STRUCT_ATTR_DECODING(
 
 namespace drivax {
 
-static ffi::Error measure_contacts(ffi::ThreadPool pool, Float box, Float velocity, Float z, Bool valid, Int kind,
-                                   Float previous_velocity, Bool previous_valid, Int slot, Float speed, Bool unlawful,
-                                   Byte before, ContactRules rules, Result<Byte> codes, Result<Bool> at_fault,
-                                   Result<Byte> type, Result<Float> time_s) {
+static ffi::Error measure_contacts(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                                   ContactRules rules) {
+  Arrays arrays(pool, arguments, results);
   Contacts a = {rules};
-  a.box = box.typed_data();
-  a.velocity = velocity.typed_data();
-  a.z = z.typed_data();
-  a.valid = valid.typed_data();
-  a.kind = kind.typed_data();
-  a.previous_velocity = previous_velocity.typed_data();
-  a.previous_valid = previous_valid.typed_data();
-  a.slot = slot.typed_data();
-  a.speed = speed.typed_data();
-  a.unlawful = unlawful.typed_data();
-  a.before = before.typed_data();
-  a.slots = axis_from_last(valid, 1);
-  a.batch = slot.element_count();
-  a.codes = codes->typed_data();
-  a.at_fault = at_fault->typed_data();
-  a.type = type->typed_data();
-  a.time_s = time_s->typed_data();
-  divide(pool, a.batch, 64, [&](int64_t first, int64_t last) { CALL(measure_contacts, a, first, last); });
-  return ffi::Error::Success();
+  arrays.batched(a.box, {a.slots, 6});
+  arrays.batched(a.velocity, {a.slots, 2});
+  arrays.batched(a.z, {a.slots});
+  arrays.batched(a.valid, {a.slots});
+  arrays.batched(a.kind, {a.slots});
+  arrays.batched(a.previous_velocity, {a.slots, 2});
+  arrays.batched(a.previous_valid, {a.slots});
+  arrays.batched(a.slot, {});
+  arrays.batched(a.speed, {});
+  arrays.batched(a.unlawful, {});
+  arrays.batched(a.before, {a.slots});
+  arrays.batched(a.codes, {a.slots});
+  arrays.batched(a.at_fault, {});
+  arrays.batched(a.type, {});
+  arrays.batched(a.time_s, {});
+  arrays.nonempty({a.slots});
+  return arrays.run(64, [&](int64_t first, int64_t last) { CALL(measure_contacts, a, first, last); });
 }
 
-BIND(measure_contacts, measure_contacts,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>().Arg<Int>().Arg<Float>().Arg<Bool>()
-     .Arg<Int>().Arg<Float>().Arg<Bool>().Arg<Byte>().Attrs<ContactRules>()
-     .Ret<Byte>().Ret<Bool>().Ret<Byte>().Ret<Float>())
+BIND(measure_contacts, .Attrs<ContactRules>())
 
 }  // namespace drivax
 

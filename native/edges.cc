@@ -11,9 +11,9 @@ struct EdgeQuery {
   const int32_t* scenario;  // [batch]
   const float* centre;      // [batch, 2]
   const float* corners;     // [batch, 4, 2]
-  const bool* near_lane;    // [batch, 4]: whether a lane is near the corner
+  Mask near_lane;           // [batch, 4]: whether a lane is near the corner
   const float* ground;      // [batch]: height
-  int64_t side_cells, side_grid, split, not_drivable;
+  int64_t side_cells = -1, side_grid, split, not_drivable;
   float cutoff_m, level_m;
   bool long_ego;            // corners are outside of the cells around the centre: read those around each
   float* offroad_m;         // [batch, 4]: positive off the road
@@ -133,41 +133,38 @@ void query_edges(const EdgeQuery& q, float* scratch, int64_t first, int64_t last
 
 namespace drivax {
 
-static ffi::Error query_edges(ffi::ThreadPool pool, Float edges, Short start, Float origin, Int sides, Int scenario,
-                              Float centre, Float corners, Bool near_lane, Float ground, float cell_m,
-                              int32_t longest_run, bool long_ego, float cutoff_m, float level_m, int32_t split,
-                              int32_t not_drivable, Result<Float> offroad_m) {
+static ffi::Error query_edges(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                              float cell_m, int32_t longest_run, bool long_ego, float cutoff_m, float level_m,
+                              int32_t split, int32_t not_drivable) {
+  Arrays arrays(pool, arguments, results);
   EdgeQuery q;
-  q.grid = segment_grid(edges, start, origin, cell_m, longest_run);
-  q.sides = sides.typed_data();
-  q.scenario = scenario.typed_data();
-  q.centre = centre.typed_data();
-  q.corners = corners.typed_data();
-  q.near_lane = near_lane.typed_data();
-  q.ground = ground.typed_data();
-  q.side_cells = axis_from_last(sides, 1);
+  take_grid(arrays, q.grid, 5, cell_m, longest_run);
+  arrays.common(q.sides, {q.grid.scenarios, q.side_cells});
+  arrays.batched(q.scenario, {});
+  arrays.batched(q.centre, {2});
+  arrays.batched(q.corners, {4, 2});
+  arrays.batched(q.near_lane, {4});
+  arrays.batched(q.ground, {});
+  arrays.batched(q.offroad_m, {4});
   q.side_grid = side_of_square(q.side_cells);
   q.split = split;
   q.not_drivable = not_drivable;
   q.cutoff_m = cutoff_m;
   q.level_m = level_m;
   q.long_ego = long_ego;
-  q.offroad_m = offroad_m->typed_data();
-  divide(pool, scenario.element_count(), 64, [&](int64_t first, int64_t last) {
+  arrays.require(q.side_grid * q.side_grid == q.side_cells, "no grid has this many cells");
+  arrays.require(1 <= split && split <= 4, "a word has two bits for each of at most 4 x 4 parts");
+  return arrays.run(64, [&](int64_t first, int64_t last) {
     thread_local std::vector<float> scratch;
     const size_t size = edge_scratch(q.grid);
     if (scratch.size() < size) scratch.resize(size);
     CALL(query_edges, q, scratch.data(), first, last);
   });
-  return ffi::Error::Success();
 }
 
-BIND(query_edges, query_edges,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Short>().Arg<Float>().Arg<Int>()
-     .Arg<Int>().Arg<Float>().Arg<Float>().Arg<Bool>().Arg<Float>()
+BIND(query_edges,
      .Attr<float>("cell_m").Attr<int32_t>("longest_run").Attr<bool>("long_ego").Attr<float>("cutoff_m")
-     .Attr<float>("level_m").Attr<int32_t>("split").Attr<int32_t>("not_drivable")
-     .Ret<Float>())
+     .Attr<float>("level_m").Attr<int32_t>("split").Attr<int32_t>("not_drivable"))
 
 }  // namespace drivax
 

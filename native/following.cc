@@ -33,7 +33,7 @@ struct Following : FollowingRules {
   const float* box;             // [batch, slots, 6]
   const float* velocity;        // [batch, slots, 2]
   const float* z;               // [batch, slots]
-  const bool* valid;            // [batch, slots]
+  Mask valid;                   // [batch, slots]
   const int8_t* light_state;    // [batch, lights]
   const int32_t* slot;          // [batch]: the driven agent
   const int32_t* index;         // [batch]: its scenario
@@ -42,7 +42,7 @@ struct Following : FollowingRules {
   const float* route_m;         // [batch]: its arc length
   const float* speed;           // [batch]
   const float* min_gap_m;       // [batch]: that the driver keeps behind a standing leader
-  int64_t batch, slots, rows, route_size, scenarios, light_rows, lights;
+  int64_t slots = -1, rows = -1, route_size = -1, scenarios = -1, light_rows = -1, lights = -1;
   float* gap_m;                 // [batch]
   float* leader_mps;            // [batch]
   float* desired_mps;           // [batch]
@@ -82,12 +82,12 @@ static void read_path(const Following& a, int64_t sample, Path* path) {
   const int64_t row = clamp_row(a.row[sample], a.rows);
   const float* route = a.routes + row * a.route_size * kRouteColumns;
   const float along_m = a.route_m[sample];
-  const int32_t last = a.route_points[row] - 1;
+  const float end_m = end_of_route(a.route_points[row]);
   path->count = 0;
   // The first point counts for leaders even where the route has ended.
   for (int i = 0; i < kPoints; ++i) {
     const float at = along_m + a.step_m * i;
-    const bool is_on_route = at <= (float)last && last > 0;
+    const bool is_on_route = at <= end_m && end_m > 0;
     if (i && !is_on_route) break;
     const RoutePlace place = place_on_route(route, a.route_size, at);
     path->x[i] = place[kRouteX];
@@ -317,46 +317,36 @@ XLA_FFI_REGISTER_STRUCT_ATTR_DECODING(
 
 namespace drivax {
 
-static ffi::Error look_ahead(ffi::ThreadPool pool, Float routes, Int route_points, Float light_line, Float box,
-                             Float velocity, Float z, Bool valid, Byte light_state, Int slot, Int index, Int row,
-                             Int arc, Float route_m, Float speed, Float min_gap_m, FollowingRules rules,
-                             Result<Float> gap_m, Result<Float> leader_mps, Result<Float> desired_mps) {
-  if (rules.points != kPoints || rules.rectangles != kRectangles || rules.closest != kClosest)
-    return ffi::Error::InvalidArgument("compiled for other numbers of points, rectangles or agents");
+static ffi::Error look_ahead(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                             FollowingRules rules) {
+  Arrays arrays(pool, arguments, results);
   Following a = {rules};
-  a.routes = routes.typed_data();
-  a.route_points = route_points.typed_data();
-  a.light_line = light_line.typed_data();
-  a.box = box.typed_data();
-  a.velocity = velocity.typed_data();
-  a.z = z.typed_data();
-  a.valid = valid.typed_data();
-  a.light_state = light_state.typed_data();
-  a.slot = slot.typed_data();
-  a.index = index.typed_data();
-  a.row = row.typed_data();
-  a.arc = arc.typed_data();
-  a.route_m = route_m.typed_data();
-  a.speed = speed.typed_data();
-  a.min_gap_m = min_gap_m.typed_data();
-  a.batch = slot.element_count();
-  a.slots = axis_from_last(valid, 1);
-  a.rows = axis_from_last(routes, 3);
-  a.route_size = axis_from_last(routes, 2);
-  a.scenarios = axis_from_last(light_line, 3);
-  a.light_rows = axis_from_last(light_line, 2);
-  a.lights = axis_from_last(light_line, 1);
-  a.gap_m = gap_m->typed_data();
-  a.leader_mps = leader_mps->typed_data();
-  a.desired_mps = desired_mps->typed_data();
-  divide(pool, a.batch, 32, [&](int64_t first, int64_t last) { CALL(look_ahead, a, first, last); });
-  return ffi::Error::Success();
+  arrays.common(a.routes, {a.rows, a.route_size, 7});
+  arrays.common(a.route_points, {a.rows});
+  arrays.common(a.light_line, {a.scenarios, a.light_rows, a.lights});
+  arrays.batched(a.box, {a.slots, 6});
+  arrays.batched(a.velocity, {a.slots, 2});
+  arrays.batched(a.z, {a.slots});
+  arrays.batched(a.valid, {a.slots});
+  arrays.batched(a.light_state, {a.lights});
+  arrays.batched(a.slot, {});
+  arrays.batched(a.index, {});
+  arrays.batched(a.row, {});
+  arrays.batched(a.arc, {});
+  arrays.batched(a.route_m, {});
+  arrays.batched(a.speed, {});
+  arrays.batched(a.min_gap_m, {});
+  arrays.batched(a.gap_m, {});
+  arrays.batched(a.leader_mps, {});
+  arrays.batched(a.desired_mps, {});
+  arrays.nonempty({a.rows, a.route_size, a.scenarios, a.light_rows, a.slots});
+  arrays.require(rules.points == kPoints && rules.rectangles == kRectangles && rules.closest == kClosest,
+                 "compiled for other numbers of points, rectangles or agents");
+  arrays.require(0 <= rules.slot_bits && rules.slot_bits < 32, "slots take up all bits of a distance");
+  return arrays.run(32, [&](int64_t first, int64_t last) { CALL(look_ahead, a, first, last); });
 }
 
-BIND(look_ahead, look_ahead,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>()
-     .Arg<Byte>().Arg<Int>().Arg<Int>().Arg<Int>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Float>()
-     .Attrs<FollowingRules>().Ret<Float>().Ret<Float>().Ret<Float>())
+BIND(look_ahead, .Attrs<FollowingRules>())
 
 }  // namespace drivax
 

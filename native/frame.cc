@@ -14,7 +14,7 @@ struct Frames {
   const int32_t* slot;        // [batch]: the driven agent
   const float* motion;        // [batch, 4]: its x, y, heading and speed
   const float* direction;     // [batch, 2]: cosine and sine of its heading
-  int64_t batch, scenarios, steps, moving, slots, words, lights;
+  int64_t scenarios = -1, steps = -1, moving = -1, slots = -1, words = -1, lights = -1;
   float* box;                 // [batch, slots, 6]
   float* velocity;            // [batch, slots, 2]
   float* z;                   // [batch, slots]: that of the log for the driven agent
@@ -80,7 +80,8 @@ void read_frames(const Frames& a, int64_t first, int64_t last) {
       velocity[2 * slot + 1] = row[kAgentVy];
       z[slot] = row[kAgentZ];
       valid[slot] = row[kAgentValid] > 0 && has_started;
-      kind[slot] = (int32_t)size[slot * kSizeColumns + kSizeKind];
+      const float number = size[slot * kSizeColumns + kSizeKind];
+      kind[slot] = absolute(number) < 1e9f ? (int32_t)number : 0;  // Others have no integer.
     }
     const int64_t own = a.slot[sample];
     if (own >= 0 && own < a.moving && !((when[own] >> (step % kWord) & 1) && has_started)) {
@@ -106,42 +107,31 @@ void read_frames(const Frames& a, int64_t first, int64_t last) {
 
 namespace drivax {
 
-static ffi::Error read_frames(ffi::ThreadPool pool, Float agents, Float size, Float parked, Word when,
-                              Byte light_state, Int index, Int step, Int slot, Float motion, Float direction,
-                              Result<Float> box, Result<Float> velocity, Result<Float> z, Result<Bool> valid,
-                              Result<Int> kind, Result<Byte> lights_now) {
+static ffi::Error read_frames(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Arrays arrays(pool, arguments, results);
   Frames a;
-  a.agents = agents.typed_data();
-  a.size = size.typed_data();
-  a.parked = parked.typed_data();
-  a.when = when.typed_data();
-  a.light_state = light_state.typed_data();
-  a.index = index.typed_data();
-  a.step = step.typed_data();
-  a.slot = slot.typed_data();
-  a.motion = motion.typed_data();
-  a.direction = direction.typed_data();
-  a.batch = index.element_count();
-  a.scenarios = axis_from_last(agents, 4);
-  a.steps = axis_from_last(agents, 3);
-  a.moving = axis_from_last(agents, 2);
-  a.slots = axis_from_last(when, 1);
-  a.words = axis_from_last(when, 2);
-  a.lights = axis_from_last(light_state, 1);
-  a.box = box->typed_data();
-  a.velocity = velocity->typed_data();
-  a.z = z->typed_data();
-  a.valid = valid->typed_data();
-  a.kind = kind->typed_data();
-  a.lights_now = lights_now->typed_data();
-  divide(pool, a.batch, 32, [&](int64_t first, int64_t last) { CALL(read_frames, a, first, last); });
-  return ffi::Error::Success();
+  arrays.common(a.agents, {a.scenarios, a.steps, a.moving, 8});
+  arrays.common(a.size, {a.scenarios, a.slots, 4});
+  arrays.common(a.parked, {a.scenarios, a.slots, 8});
+  arrays.common(a.when, {a.scenarios, a.words, a.slots});
+  arrays.common(a.light_state, {a.scenarios, a.steps, a.lights});
+  arrays.batched(a.index, {});
+  arrays.batched(a.step, {});
+  arrays.batched(a.slot, {});
+  arrays.batched(a.motion, {4});
+  arrays.batched(a.direction, {2});
+  arrays.batched(a.box, {a.slots, 6});
+  arrays.batched(a.velocity, {a.slots, 2});
+  arrays.batched(a.z, {a.slots});
+  arrays.batched(a.valid, {a.slots});
+  arrays.batched(a.kind, {a.slots});
+  arrays.batched(a.lights_now, {a.lights});
+  arrays.nonempty({a.scenarios, a.steps});
+  arrays.require(a.moving <= a.slots && a.steps <= 32 * a.words, "moving agents or steps without a place");
+  return arrays.run(32, [&](int64_t first, int64_t last) { CALL(read_frames, a, first, last); });
 }
 
-BIND(read_frames, read_frames,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Word>().Arg<Byte>().Arg<Int>().Arg<Int>()
-     .Arg<Int>().Arg<Float>().Arg<Float>().Ret<Float>().Ret<Float>().Ret<Float>().Ret<Bool>().Ret<Int>()
-     .Ret<Byte>())
+BIND(read_frames)
 
 }  // namespace drivax
 

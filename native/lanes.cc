@@ -15,7 +15,7 @@ struct LaneQuery {
   const float* heading;      // [batch, 2]: cosine and sine
   const float* corners;      // [batch, 4, 2]
   const float* ground;       // [batch]: height
-  const bool* routed;        // [batch]: whether lanes of the corridor are driven before others
+  Mask routed;               // [batch]: whether lanes of the corridor are driven before others
   float cutoff_m, level_m, margin_m, goes_on_m, joint_m, parallel_cos;
   bool long_ego;             // corners are outside of the cells around the centre: read those around each
   // Results; see queries.LaneHits.
@@ -68,7 +68,8 @@ INLINE Lane lane_of(const LaneQuery& q, const Runs& runs, float key, int64_t str
   Lane lane = {};
   lane.exists = key < kFar / 2;
   if (!lane.exists) return lane;
-  const int64_t number = number_of(key, bits), run = number / stride;
+  const int64_t last = (q.grid.side == 1 ? stride : kRuns * stride) - 1;
+  const int64_t number = clamp_index(number_of(key, bits), 0, last), run = number / stride;
   const float* features = runs.segments + runs.begin[run] + number - run * stride;
   const int64_t size = q.grid.size;
   lane.segment = segments_between(features[0], features[size], features[2 * size], features[3 * size]);
@@ -93,7 +94,7 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
   const float cosine = q.heading[2 * sample], sine = q.heading[2 * sample + 1], ground = q.ground[sample];
   const float* corner = q.corners + 2 * kCorners * sample;
   const Ints routed = splat(-(int32_t)q.routed[sample]);
-  const float corridor_scale = (float)(1 << q.ego[sample]);
+  const float corridor_scale = (float)(1 << clamp_index(q.ego[sample], 0, 30));
   // Lanes further away than the farthest corner and all that counts there have no effect.
   float corner_m = 0;
   for (int c = 0; c < kCorners; ++c)
@@ -216,23 +217,28 @@ void query_lanes(const LaneQuery& q, int64_t first, int64_t last) {
 
 namespace drivax {
 
-static ffi::Error query_lanes(ffi::ThreadPool pool, Float lanes, Short start, Float origin, Float map_box,
-                              Int scenario, Int ego, Float centre, Float heading, Float corners, Float ground,
-                              Bool routed, float cell_m, int32_t longest_run, bool long_ego, float cutoff_m,
-                              float level_m, float margin_m, float goes_on_m, float joint_m, float parallel_cos,
-                              Result<Bool> near, Result<Bool> corners_near, Result<Bool> on_corridor,
-                              Result<Bool> wrong_way, Result<Bool> straddling, Result<Bool> leaving_lane,
-                              Result<Float> limit, Result<Float> nearest_z) {
+static ffi::Error query_lanes(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                              float cell_m, int32_t longest_run, bool long_ego, float cutoff_m, float level_m,
+                              float margin_m, float goes_on_m, float joint_m, float parallel_cos) {
+  Arrays arrays(pool, arguments, results);
   LaneQuery q;
-  q.grid = segment_grid(lanes, start, origin, cell_m, longest_run);
-  q.map_box = map_box.typed_data();
-  q.scenario = scenario.typed_data();
-  q.ego = ego.typed_data();
-  q.centre = centre.typed_data();
-  q.heading = heading.typed_data();
-  q.corners = corners.typed_data();
-  q.ground = ground.typed_data();
-  q.routed = routed.typed_data();
+  take_grid(arrays, q.grid, 8, cell_m, longest_run);
+  arrays.common(q.map_box, {q.grid.scenarios, 4});
+  arrays.batched(q.scenario, {});
+  arrays.batched(q.ego, {});
+  arrays.batched(q.centre, {2});
+  arrays.batched(q.heading, {2});
+  arrays.batched(q.corners, {4, 2});
+  arrays.batched(q.ground, {});
+  arrays.batched(q.routed, {});
+  arrays.batched(q.near, {});
+  arrays.batched(q.corners_near, {4});
+  arrays.batched(q.on_corridor, {});
+  arrays.batched(q.wrong_way, {});
+  arrays.batched(q.straddling, {});
+  arrays.batched(q.leaving_lane, {});
+  arrays.batched(q.limit, {});
+  arrays.batched(q.nearest_z, {});
   q.cutoff_m = cutoff_m;
   q.level_m = level_m;
   q.margin_m = margin_m;
@@ -240,25 +246,13 @@ static ffi::Error query_lanes(ffi::ThreadPool pool, Float lanes, Short start, Fl
   q.joint_m = joint_m;
   q.parallel_cos = parallel_cos;
   q.long_ego = long_ego;
-  q.near = near->typed_data();
-  q.corners_near = corners_near->typed_data();
-  q.on_corridor = on_corridor->typed_data();
-  q.wrong_way = wrong_way->typed_data();
-  q.straddling = straddling->typed_data();
-  q.leaving_lane = leaving_lane->typed_data();
-  q.limit = limit->typed_data();
-  q.nearest_z = nearest_z->typed_data();
-  divide(pool, scenario.element_count(), 64, [&](int64_t first, int64_t last) { CALL(query_lanes, q, first, last); });
-  return ffi::Error::Success();
+  return arrays.run(64, [&](int64_t first, int64_t last) { CALL(query_lanes, q, first, last); });
 }
 
-BIND(query_lanes, query_lanes,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Short>().Arg<Float>().Arg<Float>()
-     .Arg<Int>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>()
+BIND(query_lanes,
      .Attr<float>("cell_m").Attr<int32_t>("longest_run").Attr<bool>("long_ego").Attr<float>("cutoff_m")
      .Attr<float>("level_m").Attr<float>("margin_m").Attr<float>("goes_on_m").Attr<float>("joint_m")
-     .Attr<float>("parallel_cos")
-     .Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Bool>().Ret<Float>().Ret<Float>())
+     .Attr<float>("parallel_cos"))
 
 }  // namespace drivax
 

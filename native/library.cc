@@ -3,7 +3,7 @@
 #include <cstring>
 #include <string>
 
-#include "binding.h"
+#include "kernel.h"
 
 namespace drivax {
 namespace {

@@ -12,9 +12,9 @@ INLINE int bits_for(int64_t count) {
   return bits;
 }
 
-// Values as first_smallest compares them: larger than zero, and finite.
-INLINE Floats comparable(Floats value) { return clamp(value, Floats{}, splat(1e30f)) + 1e-6f; }
-INLINE float comparable(float value) { return (value < 0 ? 0 : value > 1e30f ? 1e30f : value) + 1e-6f; }
+// Values as first_smallest compares them: larger than zero, and finite; NaN counts as zero.
+INLINE Floats comparable(Floats value) { return smaller(larger(value, Floats{}), splat(1e30f)) + 1e-6f; }
+INLINE float comparable(float value) { return smaller(larger(value, 0.0f), 1e30f) + 1e-6f; }
 
 INLINE Ints pattern(Floats value) {
   Ints result;
@@ -40,7 +40,7 @@ INLINE int32_t number_of(float key, int bits) { return pattern(key) & ((1 << bit
 
 // The same order of single values, for any number.
 INLINE int64_t order_of(float value, int64_t number, int bits) {
-  return ((int64_t)(pattern(value) >> bits) << 32) | number;
+  return (int64_t)(pattern(value) >> bits) * (INT64_C(1) << 32) | number;
 }
 
 }  // namespace drivax::TARGET

@@ -12,14 +12,14 @@ struct RoadRows {
   const int32_t* index;    // [batch]: scenario
   const float* motion;     // [batch, 4]: ego's x, y, heading, speed
   const float* direction;  // [batch, 2]: ego's cos, sin
-  int64_t scenarios, pieces, batch;
+  int64_t scenarios = -1, pieces = -1;
   float ahead_m, behind_m, side_m;
   const int32_t* layers;  // [layer_count]: those that are observed
   int64_t layer_count;
   float position_m, piece_m, speed_mps, curvature_pm, max_curvature;  // units, and the largest curvature in its unit
   const int32_t* columns;  // [column_count]: RoadRowColumn
   int64_t column_count;
-  int64_t count;
+  int64_t count = -1;
   float* rows;  // [batch, count, column_count]
   bool* mask;   // [batch, count]
 };
@@ -116,8 +116,7 @@ INLINE void write_columns(const RoadUnits& units, const View& view, const float*
 }
 
 INLINE float scale_curvature(const RoadRows& a, float curvature) {
-  const float scaled = curvature / a.curvature_pm;
-  return scaled < -a.max_curvature ? -a.max_curvature : scaled < a.max_curvature ? scaled : a.max_curvature;
+  return clamp(curvature / a.curvature_pm, -a.max_curvature, a.max_curvature);
 }
 
 void observe_road(const RoadRows& a, int64_t first, int64_t last, int32_t* found) {
@@ -151,49 +150,45 @@ void observe_road(const RoadRows& a, int64_t first, int64_t last, int32_t* found
 
 namespace drivax {
 
-static ffi::Error observe_road(ffi::ThreadPool pool, Float at, Float road, Float curvature, Int index, Float motion,
-                               Float direction, float ahead_m, float behind_m, float side_m, Numbers layers,
-                               Numbers columns, float position_m, float piece_m, float speed_mps, float curvature_pm,
-                               float max_curvature, Result<Float> rows, Result<Bool> mask) {
+static ffi::Error observe_road(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                               float ahead_m, float behind_m, float side_m, Numbers layers, Numbers columns,
+                               float position_m, float piece_m, float speed_mps, float curvature_pm,
+                               float max_curvature) {
+  Arrays arrays(pool, arguments, results);
   RoadRows a;
-  a.at = at.typed_data();
-  a.road = road.typed_data();
-  a.curvature = curvature.typed_data();
-  a.index = index.typed_data();
-  a.motion = motion.typed_data();
-  a.direction = direction.typed_data();
-  a.scenarios = axis_from_last(curvature, 2);
-  a.pieces = axis_from_last(curvature, 1);
-  a.batch = index.element_count();
+  a.layers = layers.begin();
+  a.layer_count = layers.size();
+  a.columns = columns.begin();
+  a.column_count = columns.size();
+  arrays.common(a.at, {a.scenarios, 3, a.pieces});
+  arrays.common(a.road, {a.scenarios, a.pieces, 7});
+  arrays.common(a.curvature, {a.scenarios, a.pieces});
+  arrays.batched(a.index, {});
+  arrays.batched(a.motion, {4});
+  arrays.batched(a.direction, {2});
+  arrays.batched(a.rows, {a.count, a.column_count});
+  arrays.batched(a.mask, {a.count});
+  arrays.nonempty({a.scenarios});
+  arrays.columns(columns, kRoadRowColumns);
   a.ahead_m = ahead_m;
   a.behind_m = behind_m;
   a.side_m = side_m;
-  a.layers = layers.begin();
-  a.layer_count = layers.size();
   a.position_m = position_m;
   a.piece_m = piece_m;
   a.speed_mps = speed_mps;
   a.curvature_pm = curvature_pm;
   a.max_curvature = max_curvature;
-  a.columns = columns.begin();
-  a.column_count = columns.size();
-  a.count = axis_from_last(*mask, 1);
-  a.rows = rows->typed_data();
-  a.mask = mask->typed_data();
-  divide(pool, a.batch, 32, [&](int64_t first, int64_t last) {
+  return arrays.run(32, [&](int64_t first, int64_t last) {
     thread_local std::vector<int32_t> found;
     if ((int64_t)found.size() < a.count + 32) found.resize(a.count + 32);
     CALL(observe_road, a, first, last, found.data());
   });
-  return ffi::Error::Success();
 }
 
-BIND(observe_road, observe_road,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Int>().Arg<Float>().Arg<Float>()
+BIND(observe_road,
      .Attr<float>("ahead_m").Attr<float>("behind_m").Attr<float>("side_m").Attr<Numbers>("layers")
      .Attr<Numbers>("columns").Attr<float>("position_m").Attr<float>("piece_m").Attr<float>("speed_mps")
-     .Attr<float>("curvature_pm").Attr<float>("max_curvature")
-     .Ret<Float>().Ret<Bool>())
+     .Attr<float>("curvature_pm").Attr<float>("max_curvature"))
 
 }  // namespace drivax
 

@@ -10,6 +10,9 @@ enum RouteColumn { kRouteX, kRouteY, kRouteZ, kRouteCos, kRouteSin, kRouteLimit,
 // A row index that is inside of its array, whatever the caller passed, as in XLA.
 INLINE int64_t clamp_row(int64_t row, int64_t count) { return row < 0 ? 0 : row < count ? row : count - 1; }
 
+// Arc length of the last of `points` points; negative for a route without two points, whatever a file says.
+INLINE float end_of_route(int32_t points) { return points > 1 ? (float)(points - 1) : -1.0f; }
+
 // A place between two points of a route.
 struct RoutePlace {
   const float* row;

@@ -10,10 +10,10 @@ struct RouteRows {
   const float* offsets_m;     // [count]
   const int32_t* row;         // [batch]: route
   const float* route_m;       // [batch]: arc length of ego
-  const bool* has_route;      // [batch]
+  Mask has_route;             // [batch]
   const float* motion;        // [batch, 4]: ego's x, y, heading, speed
   const float* direction;     // [batch, 2]: ego's cos, sin
-  int64_t routes_count, points, batch, count;
+  int64_t routes_count = -1, points = -1, count = -1;
   float half_window_m;  // of the curvature
   float position_m, speed_mps, curvature_pm, max_curvature, max_goal;  // units, and largest values in their units
   const int32_t* columns;  // [column_count]: RouteRowColumn
@@ -94,8 +94,7 @@ void observe_route(const RouteRows& a, int64_t first, int64_t last) {
   for (int64_t sample = first; sample < last; ++sample) {
     const int64_t number = clamp_row(a.row[sample], a.routes_count);
     const float* route = a.routes + number * a.points * kRouteColumns;
-    const int32_t points = a.route_points[number];
-    const float end_m = (float)(points - 1), route_m = a.route_m[sample];
+    const float end_m = end_of_route(a.route_points[number]), route_m = a.route_m[sample];
     if (sample + 1 < last) {
       const float* next = a.routes + clamp_row(a.row[sample + 1], a.routes_count) * a.points * kRouteColumns;
       for (int64_t i = 0; i < a.count; ++i)
@@ -104,7 +103,7 @@ void observe_route(const RouteRows& a, int64_t first, int64_t last) {
     const View view = view_of(a.motion + 4 * sample, a.direction + 2 * sample);
     float* row = a.rows + sample * a.count * a.column_count;
     bool* mask = a.mask + sample * a.count;
-    if (!a.has_route[sample] || points < 2) {
+    if (!a.has_route[sample] || end_m < 0) {
       __builtin_memset(row, 0, sizeof(float) * a.count * a.column_count);
       __builtin_memset(mask, false, a.count);
       continue;
@@ -131,43 +130,38 @@ void observe_route(const RouteRows& a, int64_t first, int64_t last) {
 
 namespace drivax {
 
-static ffi::Error observe_route(ffi::ThreadPool pool, Float routes, Int route_points, Float goal, Float offsets_m,
-                                Int row, Float route_m, Bool has_route, Float motion, Float direction, Numbers columns,
-                                float half_window_m, float position_m, float speed_mps, float curvature_pm,
-                                float max_curvature, float max_goal, Result<Float> rows, Result<Bool> mask) {
+static ffi::Error observe_route(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results,
+                                Numbers columns, float half_window_m, float position_m, float speed_mps,
+                                float curvature_pm, float max_curvature, float max_goal) {
+  Arrays arrays(pool, arguments, results);
   RouteRows a;
-  a.routes = routes.typed_data();
-  a.route_points = route_points.typed_data();
-  a.goal = goal.typed_data();
-  a.offsets_m = offsets_m.typed_data();
-  a.row = row.typed_data();
-  a.route_m = route_m.typed_data();
-  a.has_route = has_route.typed_data();
-  a.motion = motion.typed_data();
-  a.direction = direction.typed_data();
-  a.routes_count = axis_from_last(routes, 3);
-  a.points = axis_from_last(routes, 2);
-  a.batch = row.element_count();
-  a.count = offsets_m.element_count();
+  a.columns = columns.begin();
+  a.column_count = columns.size();
+  arrays.common(a.routes, {a.routes_count, a.points, 7});
+  arrays.common(a.route_points, {a.routes_count});
+  arrays.common(a.goal, {a.routes_count, 2});
+  arrays.common(a.offsets_m, {a.count});
+  arrays.batched(a.row, {});
+  arrays.batched(a.route_m, {});
+  arrays.batched(a.has_route, {});
+  arrays.batched(a.motion, {4});
+  arrays.batched(a.direction, {2});
+  arrays.batched(a.rows, {a.count, a.column_count});
+  arrays.batched(a.mask, {a.count});
+  arrays.nonempty({a.routes_count, a.points});
+  arrays.columns(columns, kRouteRowColumns);
   a.half_window_m = half_window_m;
   a.position_m = position_m;
   a.speed_mps = speed_mps;
   a.curvature_pm = curvature_pm;
   a.max_curvature = max_curvature;
   a.max_goal = max_goal;
-  a.columns = columns.begin();
-  a.column_count = columns.size();
-  a.rows = rows->typed_data();
-  a.mask = mask->typed_data();
-  divide(pool, a.batch, 64, [&](int64_t first, int64_t last) { CALL(observe_route, a, first, last); });
-  return ffi::Error::Success();
+  return arrays.run(64, [&](int64_t first, int64_t last) { CALL(observe_route, a, first, last); });
 }
 
-BIND(observe_route, observe_route,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Int>().Arg<Float>().Arg<Float>().Arg<Int>().Arg<Float>().Arg<Bool>()
-     .Arg<Float>().Arg<Float>().Attr<Numbers>("columns").Attr<float>("half_window_m").Attr<float>("position_m")
-     .Attr<float>("speed_mps").Attr<float>("curvature_pm").Attr<float>("max_curvature").Attr<float>("max_goal")
-     .Ret<Float>().Ret<Bool>())
+BIND(observe_route,
+     .Attr<Numbers>("columns").Attr<float>("half_window_m").Attr<float>("position_m").Attr<float>("speed_mps")
+     .Attr<float>("curvature_pm").Attr<float>("max_curvature").Attr<float>("max_goal"))
 
 }  // namespace drivax
 

@@ -15,7 +15,7 @@ struct SegmentGrid {
   const float* segments;  // [scenarios, features, size]: x and y of both ends, height, and other features
   const int16_t* start;   // [scenarios, cells + 1]: first segment of each cell, and the end
   const float* origin;    // [scenarios, 2]
-  int64_t scenarios, features, size, cells, side;
+  int64_t scenarios = -1, features, size = -1, cells, side;
   int64_t longest_run;  // of three neighbouring cells in a row
   float cell_m;
 };
@@ -64,9 +64,10 @@ INLINE Runs runs_around(const SegmentGrid& grid, int64_t scenario, const float* 
     return runs;
   }
   const int16_t* cell = first_cell(grid, scenario, point);
+  // As in XLA, which reads runs of the longest length: files are not trusted.
   for (int run = 0; run < kRuns; ++run, cell += grid.side) {
-    runs.begin[run] = clamp_index(cell[0], 0, grid.size);
-    runs.end[run] = clamp_index(cell[3], 0, grid.size);
+    runs.begin[run] = clamp_index(cell[0], 0, grid.size - grid.longest_run);
+    runs.end[run] = runs.begin[run] + clamp_index(cell[3] - cell[0], 0, grid.longest_run);
   }
   return runs;
 }
@@ -143,23 +144,22 @@ INLINE Distances<Value> distances(const Segments<Value>& s, float x, float y) {
 }  // namespace TARGET
 #else
 
-inline int64_t side_of_square(int64_t cells) { return std::lround(std::sqrt((double)cells)); }
+inline int64_t side_of_square(int64_t cells) { return cells > 0 ? std::lround(std::sqrt((double)cells)) : 0; }
 
-// Reads shapes of a bank's arrays.
-inline SegmentGrid segment_grid(const Float& segments, const Short& start, const Float& origin, float cell_m,
-                                int32_t longest_run) {
-  SegmentGrid grid;
-  grid.segments = segments.typed_data();
-  grid.start = start.typed_data();
-  grid.origin = origin.typed_data();
-  grid.size = axis_from_last(segments, 1);
-  grid.features = axis_from_last(segments, 2);
-  grid.scenarios = axis_from_last(segments, 3);
-  grid.cells = axis_from_last(start, 1) - 1;
+// Takes a bank's arrays of segments.
+inline void take_grid(Arrays& arrays, SegmentGrid& grid, int features, float cell_m, int32_t longest_run) {
+  int64_t starts = -1;
+  arrays.common(grid.segments, {grid.scenarios, features, grid.size});
+  arrays.common(grid.start, {grid.scenarios, starts});
+  arrays.common(grid.origin, {grid.scenarios, 2});
+  arrays.nonempty({grid.scenarios});
+  grid.features = features;
+  grid.cells = starts - 1;
   grid.side = side_of_square(grid.cells);
   grid.longest_run = longest_run;
   grid.cell_m = cell_m;
-  return grid;
+  arrays.require(grid.side * grid.side == grid.cells && grid.side > 0 && grid.side != 2, "no grid has this many cells");
+  arrays.require(grid.side == 1 || (0 <= longest_run && longest_run <= grid.size), "runs are longer than their array");
 }
 
 #endif

@@ -12,13 +12,13 @@ struct SetEncoder {
   const float* bias1;    // [width]
   const float* kernel2;  // [width, width]
   const float* bias2;    // [width]
-  int64_t batch, count, inputs, width;
+  int64_t count = -1, inputs = -1, width = -1;
 };
 
 struct SetEncoderForward : SetEncoder {
-  const bool* valid;  // [batch, count]
+  Mask valid;         // [batch, count]
   float* output;      // [batch, width]
-  int32_t* winner;    // [batch, width]: row of the maximum; -1 if the output is 0
+  int32_t* winner;    // [batch, width]: row of the maximum; -1 if the output is 0; -2 - row if it is NaN
 };
 
 struct SetEncoderBackward : SetEncoder {
@@ -68,6 +68,9 @@ INLINE void multiply(const float* const* input, int64_t inputs, const float* ker
   }
 }
 
+// NaN stays NaN, since comparisons with it are false.
+INLINE Floats relu(Floats value) { return larger(Floats{}, value); }
+
 template <int kWidth>
 INLINE void hidden_layer(const float* const* rows, const SetEncoder& a, float (*hidden)[kWidth]) {
   for (int column = 0; column < kWidth; column += 2 * LANES) {
@@ -75,13 +78,13 @@ INLINE void hidden_layer(const float* const* rows, const SetEncoder& a, float (*
     multiply<kWidth>(rows, a.inputs, a.kernel1, a.bias1, column, sums);
 #pragma GCC unroll 8
     for (int row = 0; row < kBlock; ++row) {
-      store(hidden[row] + column, larger(sums[row][0], Floats{}));
-      store(hidden[row] + column + LANES, larger(sums[row][1], Floats{}));
+      store(hidden[row] + column, relu(sums[row][0]));
+      store(hidden[row] + column + LANES, relu(sums[row][1]));
     }
   }
 }
 
-// The largest product of a set so far, in each column, and its row.
+// The largest product of a set so far, in each column, and its row; NaN is larger than all.
 template <int kWidth>
 struct Maximum {
   static constexpr int kVectors = kWidth / LANES;
@@ -98,7 +101,7 @@ struct Maximum {
   __attribute__((always_inline)) void include(const float* products, int32_t number) {
     for (int i = 0; i < kVectors; ++i) {
       const Floats product = load(products + i * LANES);
-      const Ints is_larger = product > value[i];
+      const Ints is_larger = (product > value[i]) | (product != product);
       value[i] = select(is_larger, product, value[i]);
       row[i] = select(is_larger, splat(number), row[i]);
     }
@@ -107,9 +110,9 @@ struct Maximum {
   __attribute__((always_inline)) void write(const float* bias, float* output, int32_t* winner) const {
     for (int i = 0; i < kVectors; ++i) {
       const Floats sum = value[i] + load(bias + i * LANES);
-      const Ints is_positive = sum > Floats{};
-      store(output + i * LANES, select(is_positive, sum, Floats{}));
-      store(winner + i * LANES, select(is_positive, row[i], splat(int32_t{-1})));
+      const Ints is_positive = sum > Floats{}, is_nan = sum != sum;
+      store(output + i * LANES, relu(sum));
+      store(winner + i * LANES, select(is_positive, row[i], select(is_nan, -2 - row[i], splat(int32_t{-1}))));
     }
   }
 };
@@ -170,8 +173,9 @@ static void differentiate(const SetEncoderBackward& a, int64_t first, int64_t la
   constexpr int kVectors = kWidth / LANES;
   alignas(64) float transposed[kWidth][kWidth], kernel2_gradient[kWidth][kWidth] = {};
   alignas(64) float hidden[kWidth + kBlock][kWidth], hidden_gradient[kWidth][kWidth];
-  // Rows that won a maximum of the set, and for each column the place of its winner among them.
+  // Rows that won a maximum of the set, and for each column the place of its winner among them and its gradient.
   int32_t winners[kWidth], winner_of[kWidth];
+  float gradient[kWidth];
   for (int k = 0; k < kWidth; ++k)
     for (int column = 0; column < kWidth; ++column) transposed[column][k] = a.kernel2[k * kWidth + column];
   for (int64_t i = 0; i < a.count; ++i) a.place[i] = -1;
@@ -180,15 +184,18 @@ static void differentiate(const SetEncoderBackward& a, int64_t first, int64_t la
 
   for (int64_t set = first; set < last; ++set) {
     const float* rows = a.rows + set * a.count * a.inputs;
-    const float* gradient = a.gradient + set * kWidth;
     int size = 0;
     for (int column = 0; column < kWidth; ++column) {
-      const int32_t row = a.winner[set * kWidth + column];
-      if (row >= 0 && a.place[row] < 0) {
+      const int32_t winner = a.winner[set * kWidth + column], row = winner < -1 ? -2 - winner : winner;
+      winner_of[column] = -1;
+      if (row < 0 || row >= a.count) continue;
+      if (a.place[row] < 0) {
         a.place[row] = size;
         winners[size++] = row;
       }
-      winner_of[column] = row < 0 ? -1 : a.place[row];
+      winner_of[column] = a.place[row];
+      // As in XLA, NaN has no gradient, but products with zero show which weights and rows hold NaN.
+      gradient[column] = winner < 0 ? 0 : a.gradient[set * kWidth + column];
     }
     if (!size) continue;
 
@@ -256,56 +263,47 @@ void differentiate_sets(const SetEncoderBackward& arguments, int64_t first, int6
 
 namespace drivax {
 
-template <typename Arguments>
-static void set_encoder(Arguments& a, const Float& rows, const Float& kernel1, const Float& bias1, const Float& kernel2,
-                 const Float& bias2) {
-  const auto shape = rows.dimensions();
-  a.rows = rows.typed_data();
-  a.kernel1 = kernel1.typed_data();
-  a.bias1 = bias1.typed_data();
-  a.kernel2 = kernel2.typed_data();
-  a.bias2 = bias2.typed_data();
-  a.inputs = shape[shape.size() - 1];
-  a.count = shape[shape.size() - 2];
-  a.batch = rows.element_count() / (a.inputs * a.count);
-  a.width = bias1.element_count();
+// Takes the layers and the rows; the width is one of those that are compiled.
+static void take_layers(Arrays& arrays, SetEncoder& a) {
+  arrays.common(a.kernel1, {a.inputs, a.width});
+  arrays.common(a.bias1, {a.width});
+  arrays.common(a.kernel2, {a.width, a.width});
+  arrays.common(a.bias2, {a.width});
+  arrays.batched(a.rows, {a.count, a.inputs});
+  arrays.require(a.width == 32 || a.width == 64, "compiled for layers of width 32 or 64");
 }
 
-static ffi::Error encode_sets(ffi::ThreadPool pool, Float kernel1, Float bias1, Float kernel2, Float bias2, Float rows,
-                       Bool valid, Result<Float> output, Result<Int> winner) {
+static ffi::Error encode_sets(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Arrays arrays(pool, arguments, results);
   SetEncoderForward a;
-  set_encoder(a, rows, kernel1, bias1, kernel2, bias2);
-  a.valid = valid.typed_data();
-  a.output = output->typed_data();
-  a.winner = winner->typed_data();
-  divide(pool, a.batch, 32, [&](int64_t first, int64_t last) { CALL(encode_sets, a, first, last); });
-  return ffi::Error::Success();
+  take_layers(arrays, a);
+  arrays.batched(a.valid, {a.count});
+  arrays.batched(a.output, {a.width});
+  arrays.batched(a.winner, {a.width});
+  return arrays.run(32, [&](int64_t first, int64_t last) { CALL(encode_sets, a, first, last); });
 }
 
-static ffi::Error differentiate_sets(Float kernel1, Float bias1, Float kernel2, Float bias2, Float rows, Int winner,
-                              Float gradient, Result<Float> kernel1_gradient, Result<Float> bias1_gradient,
-                              Result<Float> kernel2_gradient, Result<Float> bias2_gradient) {
+static ffi::Error differentiate_sets(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Arrays arrays(pool, arguments, results);
   SetEncoderBackward a;
-  set_encoder(a, rows, kernel1, bias1, kernel2, bias2);
-  a.winner = winner.typed_data();
-  a.gradient = gradient.typed_data();
-  a.kernel1_gradient = kernel1_gradient->typed_data();
-  a.bias1_gradient = bias1_gradient->typed_data();
-  a.kernel2_gradient = kernel2_gradient->typed_data();
-  a.bias2_gradient = bias2_gradient->typed_data();
-  thread_local std::vector<int32_t> place;
-  if ((int64_t)place.size() < a.count) place.resize(a.count);
-  a.place = place.data();
-  CALL(differentiate_sets, a, 0, a.batch);
-  return ffi::Error::Success();
+  take_layers(arrays, a);
+  arrays.batched(a.winner, {a.width});
+  arrays.batched(a.gradient, {a.width});
+  arrays.common(a.kernel1_gradient, {a.inputs, a.width});
+  arrays.common(a.bias1_gradient, {a.width});
+  arrays.common(a.kernel2_gradient, {a.width, a.width});
+  arrays.common(a.bias2_gradient, {a.width});
+  // Sums over the batch, so in one part.
+  return arrays.run(INT64_MAX, [&](int64_t first, int64_t last) {
+    thread_local std::vector<int32_t> place;
+    if ((int64_t)place.size() < a.count) place.resize(a.count);
+    a.place = place.data();
+    CALL(differentiate_sets, a, first, last);
+  });
 }
 
-BIND(encode_sets, encode_sets,
-     .Ctx<ffi::ThreadPool>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Bool>()
-     .Ret<Float>().Ret<Int>())
-BIND(differentiate_sets, differentiate_sets,
-     .Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Float>().Arg<Int>().Arg<Float>()
-     .Ret<Float>().Ret<Float>().Ret<Float>().Ret<Float>())
+BIND(encode_sets)
+BIND(differentiate_sets)
 
 }  // namespace drivax
 

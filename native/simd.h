@@ -58,7 +58,8 @@ INLINE Floats select(Ints condition, Floats yes, Floats no) { return condition ?
 INLINE Ints select(Ints condition, Ints yes, Ints no) { return condition ? yes : no; }
 INLINE Floats larger(Floats a, Floats b) { return a > b ? a : b; }
 INLINE Floats smaller(Floats a, Floats b) { return a < b ? a : b; }
-INLINE Floats clamp(Floats value, Floats low, Floats high) { return smaller(larger(value, low), high); }
+// NaN stays NaN, since comparisons with it are false.
+INLINE Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
 INLINE Floats absolute(Floats value) { return value < 0 ? -value : value; }
 INLINE Floats as_floats(Ints values) { return __builtin_convertvector(values, Floats); }
 INLINE Ints as_ints(Floats values) { return __builtin_convertvector(values, Ints); }
@@ -88,7 +89,7 @@ INLINE float smallest(Floats values) {
 INLINE float square_root(float value) { return __builtin_sqrtf(value); }
 INLINE float larger(float a, float b) { return a > b ? a : b; }
 INLINE float smaller(float a, float b) { return a < b ? a : b; }
-INLINE float clamp(float value, float low, float high) { return smaller(larger(value, low), high); }
+INLINE float clamp(float value, float low, float high) { return smaller(high, larger(low, value)); }
 INLINE float absolute(float value) { return __builtin_fabsf(value); }
 
 INLINE float largest(Floats values) { return -smallest(-values); }

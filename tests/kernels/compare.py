@@ -23,8 +23,11 @@ def run_on_target(target, test_file):
     run_tests(test_file, DRIVAX_NATIVE=target)
 
 
-def run_tests(path, **variables):
-    """Run the fast tests of a file or folder in a process of its own, with variables of the environment."""
+def run_tests(path, select="not slow", **variables):
+    """Run tests of a file or folder in a process of its own, by default fast ones, with variables of the environment.
+
+    Tests that run others are left out.
+    """
     options = (
         "-q",
         "-x",
@@ -33,9 +36,9 @@ def run_tests(path, **variables):
         "-p",
         "no:cacheprovider",
         "-m",
-        "not slow",
+        select,
         "-k",
-        "not older_instruction_sets",
+        "not older_instruction_sets and not sanitizers",
     )
     command = [sys.executable, "-m", "pytest", *options, str(path)]
     environment = os.environ | variables

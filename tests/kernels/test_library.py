@@ -14,7 +14,7 @@ from drivax import kernels
 from drivax.kernels import library
 from drivax.kernels.stamp import append_stamp, stamp
 from drivax.networks.encoders import max_pool
-from kernels.compare import COMPILER, needs_compiler, needs_kernels, run_tests
+from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -240,14 +240,26 @@ def test_compiled_programs_name_the_build():
     assert f"drivax_encode_sets_{digest}" in text
 
 
-@pytest.mark.slow
-@needs_compiler
-def test_sanitizers_find_no_error_in_the_kernels(repository, tmp_path):
-    """AddressSanitizer and UndefinedBehaviorSanitizer, over the tests of all kernels, with a copy of the package."""
+@pytest.fixture(scope="module")
+def sanitized(repository, tmp_path_factory):
+    """The environment of a copy of the package whose kernels have AddressSanitizer and UndefinedBehaviorSanitizer."""
+    copy = tmp_path_factory.mktemp("sanitized")
     for folder in ("src", "native", "configs"):
-        shutil.copytree(repository / folder, tmp_path / folder)
-    subprocess.run([sys.executable, str(tmp_path / "native" / "build.py"), "--sanitize"], check=True)
+        shutil.copytree(repository / folder, copy / folder)
+    build = [sys.executable, str(copy / "native" / "build.py"), "--strict", "--sanitize"]
+    subprocess.run(build, check=True)
     paths = [f"-print-file-name={name}.so" for name in ("libasan", "libubsan", "libstdc++")]
     runtimes = [subprocess.check_output([COMPILER, path], text=True).strip() for path in paths]
-    variables = {"LD_PRELOAD": ":".join(runtimes), "ASAN_OPTIONS": "detect_leaks=0"}
-    run_tests(repository / "tests" / "kernels", PYTHONPATH=str(tmp_path / "src"), **variables)
+    return {
+        "PYTHONPATH": str(copy / "src"),
+        "LD_PRELOAD": ":".join(runtimes),
+        "ASAN_OPTIONS": "detect_leaks=0",
+    }
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("target", [*TARGETS, "best"])
+def test_sanitizers_find_no_error_in_the_kernels(repository, sanitized, target):
+    """Over the tests of all kernels, with 10,000 random maps and 10,000 calls with any numbers."""
+    run_tests(repository / "tests" / "kernels", "slow or not slow", DRIVAX_NATIVE=target, **sanitized)

@@ -64,6 +64,52 @@ def test_masked_rows_have_no_effect_whatever_they_hold():
         jax.tree.map(np.testing.assert_array_equal, actual, expected)
 
 
+def with_nan(array, rng):
+    """Replace one number."""
+    place = tuple(rng.integers(0, size) for size in array.shape)
+    return array.at[place].set(np.nan)
+
+
+@pytest.mark.parametrize("where", ["rows", "kernel1", "bias1", "kernel2", "bias2", "gradient"])
+@pytest.mark.parametrize("shape", [(17, 31, 6, 32), (40, 3, 21, 64)], ids=str)
+def test_no_nan_is_lost(shape, where):
+    """Training stops when it sees NaN: that of a valid row, a weight or a gradient must come out.
+
+    Outputs are those of NumPy, since maxima of XLA may drop NaN on CPUs; gradients have NaN where those of XLA have it.
+    """
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        layers, rows, valid = problem(shape, seed)
+        gradient = jnp.asarray(rng.normal(size=(shape[0], shape[3])), jnp.float32)
+        weights = dict(zip(("kernel1", "bias1", "kernel2", "bias2"), jax.tree.leaves(layers), strict=True))
+        if where == "rows":
+            rows = rows.at[(*rng.choice(np.argwhere(valid)), rng.integers(shape[2]))].set(np.nan)
+        elif where == "gradient":
+            gradient = gradient.at[tuple(rng.choice(np.argwhere(pool(layers, rows, valid) > 0)))].set(np.nan)
+        else:
+            weights[where] = with_nan(weights[where], rng)
+        layers = jax.tree.unflatten(jax.tree.structure(layers), weights.values())
+
+        def derive(layers, rows=rows, valid=valid, gradient=gradient):
+            output, pull = jax.vjp(lambda layers: max_pool("relu", layers, rows, valid), layers)
+            return output, pull(gradient)
+
+        output, actual = jax.jit(lambda layers, derive=derive: derive(layers))(layers)
+        with kernels.without_kernels():
+            _, expected = jax.jit(lambda layers, derive=derive: derive(layers))(layers)
+        np.testing.assert_array_equal(np.isnan(output), np.isnan(pool(layers, rows, valid)))
+        jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.isnan(a), np.isnan(b)), actual, expected)
+        assert any(np.isnan(leaf).any() for leaf in jax.tree.leaves((output, actual)))
+
+
+def pool(layers, rows, valid):
+    """The definition, by NumPy."""
+    (kernel1, bias1), (kernel2, bias2) = jax.device_get(layers)
+    products = np.maximum(np.asarray(rows) @ kernel1 + bias1, 0.0) @ kernel2
+    largest = np.where(np.asarray(valid)[..., None], products, -np.inf).max(axis=1)
+    return np.maximum(largest + bias2, 0.0)
+
+
 def test_equal_rows_have_the_gradient_of_one():
     layers, rows, valid = problem((4, 6, 5, 32), 1, share=1.0)
     twice, both = jnp.concatenate([rows, rows], axis=1), jnp.concatenate([valid, valid], axis=1)

@@ -86,6 +86,10 @@ def test_contacts_equal_those_of_xla(slots):
 
 @pytest.fixture(scope="module")
 def bank():
+    return hand_made_bank()
+
+
+def hand_made_bank():
     """Scenarios of a hand-made road with five lights, whose arrays tests replace."""
     recordings = [straight_road([car()], light=RED) for _ in range(8)]
     scenarios = [assemble(recording, replace(SMALL, lights=5)) for recording in recordings]
