@@ -12,6 +12,7 @@ from drivax.synthetic.roads.curves import (
     connect_poses,
     draw_winding_curve,
     from_curvature,
+    gradient,
     join_curves,
     quintic,
     resample,
@@ -143,3 +144,11 @@ def test_poses_move_ahead_and_aside_and_turn():
     assert pose.aside(3.0).x == pytest.approx(-2.0) and pose.aside(3.0).y == pytest.approx(2.0)
     back = pose.turned()
     assert (back.x, back.y) == (1.0, 2.0) and math.cos(back.heading - pose.heading) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_gradient_has_the_bits_of_numpy(count):
+    rng = np.random.default_rng(count)
+    values, steps = rng.normal(size=count), rng.uniform(0.1, 1.0, count)
+    for position in (np.cumsum(steps), 0.5 * np.arange(count)):
+        assert np.array_equal(gradient(values, position), np.gradient(values, position))

@@ -111,8 +111,8 @@ def arc_lengths(
     """
     if len(points) == 0:
         return np.zeros(0)
-    step = points[1:, :2] - points[:-1, :2]
-    total = np.concatenate(([0.0], np.hypot(step[:, 0], step[:, 1]).cumsum()))
+    step, total = points[1:, :2] - points[:-1, :2], np.zeros(len(points))
+    np.hypot(step[:, 0], step[:, 1]).cumsum(out=total[1:])
     if start is None:
         return total
     counts = np.diff(start)
@@ -213,7 +213,10 @@ def resample(
 
 def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
     """Unit vectors to the left of headings."""
-    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)
+    cos, sin = np.cos(heading), np.sin(heading)
+    normal = np.empty((*cos.shape, 2), cos.dtype)
+    normal[..., 0], normal[..., 1] = -sin, cos
+    return normal
 
 
 def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:

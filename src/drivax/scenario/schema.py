@@ -272,6 +272,7 @@ def stored_name(text: str, size: int) -> bytes:
     return begin + b"~" + hashlib.sha256(name).hexdigest()[:_DIGEST].encode()
 
 
+@cache
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
     fields = scenario_fields(capacity)

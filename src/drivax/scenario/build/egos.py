@@ -36,6 +36,8 @@ def further_egos(
     From the current step on, their log lasts 2 s or more and leads more than 2 m away. It ends at the first gap, or
     where it leaves the box of :data:`KNOWN_M`. ``moving`` holds the track of every slot, ``log`` is the recorded ego's.
     """
+    if most < 1:
+        return []
     now, path = log.current, log.positions[:, :2]
     xy, valid = tracks.xyz[moving, now:, :2], tracks.valid[moving, now:]
     low, high = path.min(axis=0) - KNOWN_M, path.max(axis=0) + KNOWN_M

@@ -307,8 +307,10 @@ def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tu
     """Masks of segments that begin at an open end, and that end at one."""
     ends = (np.round(end / _VERTEX_M).astype(np.int64) for end in (a, b))
     # One integer per vertex.
-    first, last = (end[:, 0] * 2**32 + end[:, 1] for end in ends)
-    return ~np.isin(first, last), ~np.isin(last, first)
+    first, last = ((end[:, 0] * 2**32 + end[:, 1]).tolist() for end in ends)
+    # Sets are several times as fast as np.isin.
+    firsts, lasts = set(first), set(last)
+    return np.array([vertex not in lasts for vertex in first]), np.array([v not in firsts for v in last])
 
 
 def _sides_within_rings(

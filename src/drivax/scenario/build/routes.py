@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal
@@ -250,6 +250,7 @@ class _Drawer:
     ego: EgoLog
     most: int
     plain: bool = False
+    drawn: dict[tuple[Any, ...], Route] = field(default_factory=dict)
 
     def variants(self, lane_paths: Sequence[LanePath]) -> list[Route]:
         """Routes along lane paths; those with lane changes are drawn with early to late changes."""
@@ -270,13 +271,20 @@ class _Drawer:
         lanes = (*prefix, *follow(graph, lane_path.lanes, ahead_m, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
         change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.goal_m)
+        # An alternative often has the lanes of the intended route; without lane changes the goal does not matter.
+        changes = any(is_change(graph, a, b) for a, b in pairwise(lanes))
+        key = lanes, begin, length, (lane_path.goal_m, place) if changes else None
+        if key in self.drawn:
+            return self.drawn[key]
         line = trace(graph, lanes, max(begin, 0.0), -lane_path.s - length, window_m, place, change_m)
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.positions[-1:, :2])
         missing_m = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
         xyz, label = continue_straight(line, 0.0, missing_m)
         points, index = resample(xyz, SPACING_M, self.most)
-        return Route.along(points if self.plain else join(points, history, change_m), label[index], self.most)
+        bent = points if self.plain else join(points, history, change_m)
+        self.drawn[key] = Route.along(bent, label[index], self.most)
+        return self.drawn[key]
 
 
 def join(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -166,9 +167,10 @@ def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array
 
 def space_out(xy: Float[Array, "step 2"], least_m: float) -> list[int]:
     """Return the indices of the first position and of those at least ``least_m`` from the previous one."""
-    keep = [0]
+    keep, step_m = [0], np.hypot(*(xy[1:] - xy[:-1]).T).tolist()
     for i in range(1, len(xy)):
-        if np.hypot(*(xy[i] - xy[keep[-1]])) >= least_m:
+        distance = step_m[i - 1] if keep[-1] == i - 1 else np.hypot(*(xy[i] - xy[keep[-1]]))
+        if distance >= least_m:
             keep.append(i)
     return keep
 
@@ -178,7 +180,9 @@ def inside_box(
 ) -> Bool[Array, " point"]:
     """Return whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
     low, high = path.min(axis=0) - margin_m, path.max(axis=0) + margin_m
-    return np.all((xy >= low) & (xy <= high), axis=1)
+    # Reducing so short an axis would take several times as long.
+    x_inside, y_inside = ((low[k] <= xy[:, k]) & (xy[:, k] <= high[k]) for k in (0, 1))
+    return x_inside & y_inside
 
 
 def plausible_limit(feature: MapFeature) -> float:
@@ -264,6 +268,7 @@ def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array
     return np.lexsort((np.arange(len(group)), place, ring))
 
 
+@lru_cache(maxsize=256)
 def _bit_reversed_place(count: int) -> Int[Array, " count"]:
     """Rank of each of ``count`` items in the order of their bit-reversed indices."""
     bits = max(int(count - 1).bit_length(), 1)

@@ -87,7 +87,7 @@ def find_violation(
         return Violation("ego_hardly_moves")
     if not motion.valid[0, window].all():
         return Violation("ego_leaves_map")
-    box = user_boxes(motion)[:, window]
+    box = user_boxes(motion.from_step(first_step))
     pairs = first_overlap_step(box, motion.valid[:, window], _tested_pairs(motion))
     touched = np.flatnonzero(pairs[0] < box.shape[1])
     if len(touched):
@@ -99,8 +99,8 @@ def find_violation(
     cause = _find_rule_violation(roles, motion, times_s, first_step)
     if cause:
         return Violation(cause)
-    against = goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, window])
-    if against and not roles.parked and not is_staged(staging):
+    may_pass = roles.parked or is_staged(staging)
+    if not may_pass and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, window]):
         return Violation("ego_wrong_way")
     return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
 

@@ -67,7 +67,7 @@ class Curve:
     def bend(self) -> Float64[np.ndarray, " point"]:
         """Curvature: change of the heading per metre of arc."""
         # The bound moves the first sample by a nanometre and has no use, but the bits of stored sets depend on it.
-        return np.gradient(self.heading, np.maximum(self.arc_m, 1e-9))
+        return gradient(self.heading, np.maximum(self.arc_m, 1e-9))
 
     @property
     def start(self) -> Pose:
@@ -98,8 +98,8 @@ class Curve:
 
         With arc length s, curvature k and displacement d the tangent turns by ``atan2(dd/ds, 1 - d k)``.
         """
-        stretch = 1.0 - left_m * np.gradient(self.heading, self.arc_m)
-        slope = np.gradient(left_m, self.arc_m)
+        stretch = 1.0 - left_m * gradient(self.heading, self.arc_m)
+        slope = gradient(left_m, self.arc_m)
         xy = self.xy + left_m[:, None] * self.normal
         return Curve(xy, self.heading + np.arctan2(slope, stretch))
 
@@ -121,6 +121,23 @@ def interpolate(
     result = np.empty((len(along_m), 2))
     for k in (0, 1):
         result[:, k] = np.interp(along_m, arc_m, xy[:, k])
+    return result
+
+
+def gradient(
+    values: Float64[np.ndarray, " point"], at_m: Float64[np.ndarray, " point"]
+) -> Float64[np.ndarray, " point"]:
+    """Derivative of values at positions by central differences: ``np.gradient`` without its checks."""
+    steps, result = at_m[1:] - at_m[:-1], np.empty_like(values)
+    before, after, change = steps[:-1], steps[1:], values[1:] - values[:-1]
+    if (steps == steps[0]).all():
+        result[1:-1] = (values[2:] - values[:-2]) / (2.0 * steps[0])
+    else:
+        both = before + after
+        result[1:-1] = -after / (before * both) * values[:-2]
+        result[1:-1] += (after - before) / (before * after) * values[1:-1]
+        result[1:-1] += before / (after * both) * values[2:]
+    result[0], result[-1] = change[0] / steps[0], change[-1] / steps[-1]
     return result
 
 
@@ -163,8 +180,11 @@ def join_curves(*curves: Curve) -> Curve:
 
 def resample(curve: Curve, step_m: float) -> Curve:
     """Resample a curve at equal distances of about ``step_m`` along its chords; both ends are kept."""
-    length = curve.arc_m[-1]
-    return Curve(*curve.at(np.linspace(0.0, length, max(2, round(float(length) / step_m) + 1))))
+    length = float(curve.arc_m[-1])
+    last = max(1, round(length / step_m))
+    position = np.arange(last + 1) * (length / last)
+    position[-1] = length
+    return Curve(*curve.at(position))
 
 
 def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Curve:

@@ -269,6 +269,7 @@ def feature_id(lane: int) -> int:
     return lane + 1
 
 
+@per_roads
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
     """Convert a network to map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]

@@ -39,7 +39,7 @@ class Leaders:
 
         A world without a vehicle on a lane keeps its last result.
         """
-        own_m, world = at_m[:, None], self._worlds.world
+        world = self._worlds.world
         lane, along = tables.lanes_at(at_m)
         lane[~active] = -1
         # Occupied (vehicle, lane) of each world, padded with -1, and their positions on the path of each vehicle.
@@ -51,22 +51,23 @@ class Leaders:
         lanes = np.where(entry < 0, self._worlds.first_lane[:-1, None], lane[entry])
         index = lanes.take(world, axis=0)
         index += tables.column[:, None]
-        position = tables.scale.take(index)
-        position *= along.ravel().take(slots)[entry].take(world, axis=0)
-        # nan where the lane is not on the path, or not relevant at this position: comparisons are false.
-        position += tables.present_begin(at_m).take(index)
-        vehicle_ahead = vehicle[entry]
-        is_ahead = (position > own_m) & (vehicle_ahead.take(world, axis=0) != self._rows[:, None])
+        # nan where the lane is not on the path, or not relevant at this position.
+        begin = tables.present_begin(at_m).take(index)
+        pair = (begin == begin).ravel().nonzero()[0]
+        row = pair // entry.shape[1]
+        slot = entry.ravel().take(pair - (row - world[row]) * entry.shape[1])
+        ahead, own_m = vehicle[slot], at_m[row]
+        position = tables.scale.take(index.ravel()[pair]) * along.ravel().take(slots)[slot]
+        position += begin.ravel()[pair]
+        is_ahead = (position > own_m) & (ahead != row) & (slot >= 0)
         if self._any_cyclist:
             # Cyclists are overtaken within lanes that are wide enough.
-            limit_m = np.where(self._cyclist[vehicle_ahead], self._passing_half_m[lanes], -np.inf)
-            is_ahead &= limit_m.take(world, axis=0) < self._half_width_m[:, None]
-        position -= np.where(entry < 0, -np.inf, self._half_m[vehicle_ahead]).take(world, axis=0)
-        gap = np.where(is_ahead, position, np.inf)
-        gap -= own_m
-        gap -= self._half_m[:, None]
+            is_ahead &= ~self._cyclist[ahead] | (self._passing_half_m[lane[slot]] < self._half_width_m[row])
+        gap = np.full(index.shape, np.inf)
+        gap_m = position - self._half_m[ahead] - own_m - self._half_m[row]
+        gap.put(pair[is_ahead], gap_m[is_ahead])
         nearest = gap.argmin(axis=1)
-        result = gap[self._rows, nearest], vehicle_ahead[world, nearest]
+        result = gap[self._rows, nearest], vehicle[entry][world, nearest]
         empty = (entry[:, 0] < 0)[world]
         for values, last in zip(result, self._nearest, strict=True):
             values[empty] = last[empty]

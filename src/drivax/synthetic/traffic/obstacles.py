@@ -86,7 +86,8 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
         best = gap.argmin(axis=1)
         close = gap[np.arange(len(batch)), best] < within_m**2
         near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
-    window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
+    window = rough[:, None] + np.arange(-8, 9)
+    window = np.minimum(np.maximum(window, 0), len(path.curve.xy) - 1)
     fine = _squared_distance(boxes.xy[near, None], path.curve.xy[window])
     index = window[np.arange(len(near)), fine.argmin(axis=1)]
     position, lateral, angle = _relative_poses(boxes, near, path.curve.xy[index], path.curve.heading[index])
@@ -231,22 +232,20 @@ def _nearby_pairs(
     dx, dy = xy.take(columns, axis=1).take(worlds.world, axis=1)
     dx -= vehicles.xy[:, 0, None]
     dy -= vehicles.xy[:, 1, None]
-    cos, sin = (component[:, None] for component in vehicles.direction)
-    ahead = dx * cos
-    ahead += dy * sin
-    dy *= cos
-    dx *= sin
-    dy -= dx
+    cos, sin = vehicles.direction
+    ahead = dx * cos[:, None]
+    ahead += dy * sin[:, None]
     # Below 13 m/s it exceeds the comfortable stopping distance; less for vehicles, which follow others and the rules.
     reach = np.where(active, np.minimum(_RANGE_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
     is_near = ahead > 0.5
     is_near[:, :count] &= ahead[:, :count] < np.minimum(reach, _VEHICLE_RANGE_M)
     is_near[:, count:] &= ahead[:, count:] < reach
-    ahead *= 0.5
-    ahead += 3.0
-    is_near &= np.abs(dy, out=dy) < np.minimum(ahead, _MAX_LATERAL_M, out=ahead)
-    viewer, column = np.divmod(is_near.ravel().nonzero()[0], is_near.shape[1])
-    return viewer, columns[worlds.world[viewer], column]
+    pair = is_near.ravel().nonzero()[0]
+    viewer = pair // is_near.shape[1]
+    lateral = np.abs(dy.ravel()[pair] * cos[viewer] - dx.ravel()[pair] * sin[viewer])
+    is_inside = lateral < np.minimum(0.5 * ahead.ravel()[pair] + 3.0, _MAX_LATERAL_M)
+    pair, viewer = pair[is_inside], viewer[is_inside]
+    return viewer, columns.ravel()[pair - (viewer - worlds.world[viewer]) * is_near.shape[1]]
 
 
 def _nearest_samples(

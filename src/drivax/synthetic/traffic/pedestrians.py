@@ -137,11 +137,11 @@ class Pedestrians:
         ]
         self._remaining_red = np.concatenate(pad_steps(red_s), axis=1)
         curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
-        self._table = np.concatenate(
-            [np.zeros((0, 3)), *(np.column_stack([curve.xy, curve.heading]) for curve in curves)]
-        )
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
-        self._begin = np.concatenate(([0], np.cumsum(self._last + 1)))[:-1]
+        ends = np.cumsum(self._last + 1)
+        self._begin, self._table = ends - self._last - 1, np.empty((ends[-1] if curves else 0, 3))
+        for curve, begin, end in zip(curves, self._begin.tolist(), ends.tolist(), strict=True):
+            self._table[begin:end, :2], self._table[begin:end, 2] = curve.xy, curve.heading
         self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
         numbers = [[w.start_m, w.speed_mps, w.kerb_m, w.across_m] for w in pedestrians]
         self._position_m, self._free_speed, self._kerb, self._across = (
@@ -192,14 +192,29 @@ class Pedestrians:
     ) -> _Mask:
         """Mask of pedestrians that would come too close to a vehicle and are not close to a vehicle yet."""
         x, y, angle = pose.T
-        half = vehicles.size_m / 2 + _CLEARANCE_M
-        half[~active] = -1.0
-        columns = np.stack([*vehicles.xy.T, *vehicles.direction, *half.T])
-        near = pad_last(columns, -1.0).take(self._worlds.rows, axis=1).take(self.world, axis=1)
-        blocked = _is_in_box(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), near)
-        if np.count_nonzero(blocked):
-            blocked &= ~_is_in_box(x, y, near)
+        blocked = self._is_near_vehicle(
+            x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), self.world, vehicles, active
+        )
+        rows = blocked.nonzero()[0]
+        blocked[rows] = ~self._is_near_vehicle(x[rows], y[rows], self.world[rows], vehicles, active)
         return blocked
+
+    def _is_near_vehicle(
+        self, x: _Values, y: _Values, world: _Indices, vehicles: Boxes, active: VehicleMask
+    ) -> _Mask:
+        """Mask of points too close to an active vehicle of their world."""
+        is_near, half = np.zeros(len(x), bool), vehicles.size_m / 2 + _CLEARANCE_M
+        # Most pairs are further apart along an axis than the largest box reaches.
+        centre = np.where(active[:, None], vehicles.xy, np.inf)
+        near_x, near_y = pad_last(centre.T, np.inf).take(self._worlds.rows, axis=1).take(world, axis=1)
+        dx, dy, reach = x[:, None] - near_x, y[:, None] - near_y, half.sum(axis=1).max(initial=0.0) + 0.1
+        point, column = np.nonzero((np.abs(dx) < reach) & (np.abs(dy) < reach))
+        if len(point):
+            row, dx, dy = self._worlds.rows[world[point], column], dx[point, column], dy[point, column]
+            cos, sin = (component[row] for component in vehicles.direction)
+            along, lateral = dx * cos + dy * sin, dy * cos - dx * sin
+            is_near[point[(np.abs(along) < half[row, 0]) & (np.abs(lateral) < half[row, 1])]] = True
+        return is_near
 
     def _release(self, t: int, vehicles: Boxes, active: VehicleMask) -> None:
         """Release pedestrians at the kerb if the crossing stays safe for long enough."""
@@ -214,23 +229,28 @@ class Pedestrians:
         # Those whose conflicting lights do not stay red for long enough keep waiting.
         stays_red = self._remaining_red[t, self._crossing[waiting]] >= crossing_s
         waiting, crossing_s = waiting[stays_red], crossing_s[stays_red]
-        for world in np.unique(self.world[waiting]).tolist():
-            is_local = self.world[waiting] == world
-            rows = self._worlds.vehicles(world)
-            rows = np.flatnonzero(active[rows]) + rows.start
-            self._release_in(world, waiting[is_local], crossing_s[is_local], vehicles.select(rows))
-
-    def _release_in(self, world: int, waiting: _Indices, crossing_s: _Values, vehicles: Boxes) -> None:
-        """Release pedestrians of a world if its active vehicles leave them a gap."""
-        conflicts, crossing = self._conflicts[world], self._crossing[waiting]
-        local, inverse = np.unique(crossing - self._worlds.first_crossing[world], return_inverse=True)
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])
-        any_s, hard_s = (s[inverse] for s in _arrivals(conflicts, local, boxes, vehicles.speed))
+        world_of = self.world[waiting]
+        for world in sorted(set(world_of.tolist())):
+            is_local, rows = world_of == world, self._worlds.vehicles(world)
+            rows = np.flatnonzero(active[rows]) + rows.start
+            self._release_in(
+                world, waiting[is_local], crossing_s[is_local], boxes[rows], vehicles.speed[rows]
+            )
+
+    def _release_in(
+        self, world: int, waiting: _Indices, crossing_s: _Values, boxes: Float64[np.ndarray, "v 6"],
+        speed: PerVehicle,
+    ) -> None:  # fmt: skip
+        """Release pedestrians of a world if its active vehicles, with these boxes and speeds, leave them a gap."""
+        conflicts, crossing = self._conflicts[world], self._crossing[waiting]
+        number = crossing - self._worlds.first_crossing[world]
+        any_s, hard_s = (s[number] for s in _arrivals(conflicts, number, boxes, speed))
         has_gap_if_yielding, has_gap = hard_s > crossing_s + _MARGIN_S, any_s > crossing_s + _GAP_MARGIN_S
         safe = np.where(self._has_yielding_drivers[crossing], has_gap_if_yielding, has_gap).nonzero()[0]
         # A standing queue blocks the crossing.
         if len(safe):
-            is_blocked = overlap(conflicts.strip[local[inverse[safe]], None], boxes[None]).any(axis=1)
+            is_blocked = overlap(conflicts.strip[number[safe], None], boxes[None]).any(axis=1)
             self._is_released[waiting[safe]] = ~is_blocked
 
     def _advance(self) -> None:
@@ -270,12 +290,17 @@ def _remaining_red_s(
 
 def _arrivals(
     conflicts: _CrossingConflicts, crossings: _Indices, boxes: Float64[np.ndarray, "v 6"], speed: PerVehicle
-) -> tuple[_Values, _Values]:
-    """Return the time until the next vehicle, and the next that cannot yield, arrives at each crossing, s."""
-    any_s, hard_s = np.full((2, len(crossings)), math.inf)
+) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
+    """Return the time until the next vehicle, and the next that cannot yield, arrives at each crossing, s.
+
+    It is infinite at crossings other than ``crossings``.
+    """
+    any_s, hard_s = np.full((2, len(conflicts.marked)), math.inf)
     if not len(boxes):
         return any_s, hard_s
-    at = np.isin(conflicts.crossing, crossings).nonzero()[0]
+    is_requested = np.zeros(len(conflicts.marked), bool)
+    is_requested[crossings] = True
+    at = is_requested[conflicts.crossing].nonzero()[0]
     offset = conflicts.xy[at, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = offset[..., 0] * cos + offset[..., 1] * sin
@@ -288,22 +313,10 @@ def _arrivals(
     distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
     time = np.where(approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
-    of_crossing = np.searchsorted(crossings, conflicts.crossing[at])
+    of_crossing = conflicts.crossing[at]
     np.minimum.at(any_s, of_crossing, time.min(axis=1))
     np.minimum.at(hard_s, of_crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s
-
-
-def _is_in_box(x: _Values, y: _Values, boxes: Float64[np.ndarray, "6 w v"]) -> _Mask:
-    """Mask of points in one of their boxes: x, y, cosine and sine of the heading, half the length, half the width."""
-    box_x, box_y, cos, sin, half_length, half_width = boxes
-    dx, dy = x[:, None] - box_x, y[:, None] - box_y
-    along = np.abs(dx * cos + dy * sin)
-    dy *= cos
-    dx *= sin
-    dy -= dx
-    is_inside = (along < half_length) & (np.abs(dy, out=dy) < half_width)
-    return np.logical_or.reduce(is_inside, axis=1)
 
 
 def place_pedestrians(
@@ -316,9 +329,9 @@ def place_pedestrians(
     """
     pedestrians = []
     for sidewalk in network.sidewalks:
-        length = float(sidewalk.arc_m[-1])
+        length, reverse = float(sidewalk.arc_m[-1]), sidewalk.reversed()
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
-            curve = sidewalk if rng.random() < 0.5 else sidewalk.reversed()
+            curve = sidewalk if rng.random() < 0.5 else reverse
             # Pedestrians keep to the right.
             curve = curve.parallel(-float(rng.uniform(0.1, 0.6)))
             pedestrians.append(Pedestrian(curve, float(rng.uniform(0.0, length)), _draw_speed(rng)))
@@ -330,7 +343,7 @@ def place_pedestrians(
 
 def _draw_speed(rng: np.random.Generator) -> float:
     """Draw a free walking speed, 1.34 m/s with a standard deviation of 0.26 m/s (Weidmann 1993)."""
-    return float(np.clip(rng.normal(1.34, 0.26), 0.7, 2.0))
+    return min(max(rng.normal(1.34, 0.26), 0.7), 2.0)
 
 
 def _draw_crossing_pedestrian(

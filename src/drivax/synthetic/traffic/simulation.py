@@ -83,7 +83,7 @@ _MAX_REACTION_STEPS = 6
 #: Steps ahead for which a planned ego reserves connectors.
 _LOOKAHEAD_STEPS = 25
 #: Runs that are simulated together.
-_BATCH_RUNS = 6
+_BATCH_RUNS = 16
 
 _T = TypeVar("_T")
 
@@ -200,7 +200,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     """Run tasks and yield their results in order.
 
-    Each task yields runs and receives their motion. Up to six runs of different tasks are simulated together.
+    Each task yields runs and receives their motion. Up to 16 runs of different tasks are simulated together.
     """
     remaining = iter(enumerate(tasks))
     results: dict[int, _T] = {}
@@ -478,7 +478,7 @@ class _Simulation:
         """Advance by one step and return the accelerations (until the stop, where a vehicle stops)."""
         last, jerk = self._last_acceleration, self._drivers.jerk_mps3 * DT_S
         braking_jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
-        a = np.clip(preferred, last - braking_jerk, last + jerk)
+        a = np.minimum(np.maximum(preferred, last - braking_jerk), last + jerk)
         after = self._speed + a * DT_S
         stops = after <= 0.0
         stopping_m = self._speed**2 / (2 * np.maximum(-a, 1e-9))
