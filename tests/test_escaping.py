@@ -63,7 +63,7 @@ def test_any_cells_are_read_back_and_none_begins_a_formula():
 def test_formulas_after_separators_become_text(text):
     """With other separators, spreadsheets split cells in which drivax sees no separator."""
     written = csv_text([["x", text]])
-    assert csv_rows(written) == [["x", text]]
+    assert rows_of(written) == [["x", text]]
     for separator in ";,|\t":
         for row in csv.reader(io.StringIO(written, newline=""), delimiter=separator):
             assert all(cell[:1] not in tuple("=+-@") for cell in row if cell), row
