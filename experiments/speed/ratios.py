@@ -168,9 +168,9 @@ from drivax.synthetic.generate import generate
 seed = [0]
 def call():
     with tempfile.TemporaryDirectory() as folder:
-        generate(folder + "/set", 32, seed[0])
+        generate(folder + "/set", 128, seed[0])
     seed[0] += 1
-    return 32
+    return 128
 """,
         "2 x (4 x)",
     ),
