@@ -7,11 +7,11 @@
 With ``--kernels``, this tree is timed without native kernels against itself with them; with ``--against``, both trees
 run without. Both sides train the presets of the first.
 
-SET has at least 1,024 scenarios. Each tree runs in processes of its own. A repeated measurement keeps one process per
-tree alive, runs both by turns, and quotes the median of the ratios of neighbouring runs; the first runs of each, which
-compile, do not count. A command starts in a new process, with an empty compilation cache (``first``) or with that
-of an earlier run (``again``). Nothing else may run on the machine. Each row has the time of a fixed program and the
-load before and after it.
+SET has at least 1,024 scenarios, and both trees can open it. Each tree runs in processes of its own. A repeated
+measurement keeps one process per tree alive, runs both by turns, and quotes the median of the ratios of neighbouring
+runs; the first runs of each, which compile, do not count. A command starts in a new process, with an empty compilation
+cache (``first``) or with that of an earlier run (``again``). Nothing else may run on the machine. Each row has the time
+of a fixed program and the load before and after it.
 """
 
 from __future__ import annotations
@@ -59,11 +59,12 @@ from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.learning.program import Program, Seeds
 from drivax.simulator.traffic.log import LogTraffic
-def trainer(preset, *overrides):
+def trainer(preset, *overrides, prepare=lambda algorithm, environment, bank: bank):
     config = settings.load(TrainConfig, f"{PRESETS}/{preset}.yaml", list(overrides))
     bank = ScenarioBank.from_scenarios(first(1024))
-    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
-    program = Program(Seeds(learner, (0,)), bank, config.devices)
+    environment = config.environment(LogTraffic())
+    learner = config.algorithm.build(environment, bank, config.iterations)
+    program = Program(Seeds(learner, (0,)), prepare(config.algorithm, environment, bank), config.devices)
     state = [program.initial_state()]
     def call():
         state[0], logs = program.step(state[0])
@@ -127,7 +128,14 @@ MEASUREMENTS: dict[str, Repeated | Command] = {
         kernels_goal="2.0 x (3 x)",
     ),
     "offline training (CQL)": Repeated(
-        "steps/s", _TRAINING + "call = trainer('offline/cql')", "", kernels_goal="2.0 x (3 x)"
+        "steps/s",
+        _TRAINING
+        + """
+from drivax.learning.algorithm import training_data
+call = trainer('offline/cql', prepare=training_data)
+""",
+        "",
+        kernels_goal="2.0 x (3 x)",
     ),
     "simulator, full, log": Repeated(
         "steps/s",
