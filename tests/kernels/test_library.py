@@ -100,7 +100,7 @@ def test_any_change_of_a_source_makes_a_library_stale(repository, tmp_path):
         before, after = stamp(sources)["sources"], before
         assert before != after
     for name in ("lanes.cc~", ".lanes.cc.swp", ".#lanes.cc", "lanes.cc.orig"):  # of editors
-        (sources / name).touch()
+        (sources / name).write_text("draft")
     (sources / ".cache").mkdir()
     assert stamp(sources)["sources"] == before
     shutil.rmtree(sources)
