@@ -89,7 +89,7 @@ constexpr ffi::DataType kType = std::is_same_v<Value, float>      ? ffi::F32
                                                                   : ffi::PRED;
 
 // Arguments (pointers to constants) and results of a call, in order, with types and shapes checked: what kernels read
-// and write lies inside of the arrays. The first thing that is wrong is returned by `run`.
+// and write lies inside of the arrays. `run` returns the first error.
 class Arrays {
  public:
   Arrays(ffi::ThreadPool pool, ffi::RemainingArgs arguments, ffi::RemainingRets results)

@@ -59,11 +59,11 @@ def compiler() -> str:
     return name
 
 
-def commands(build: Path, options: tuple[str, ...]) -> list[list[str]]:
-    """Return the command of each object file; objects are named after source and target."""
+def commands(build: Path, options: tuple[str, ...], sources: str) -> list[list[str]]:
+    """Return the command of each object file, named after source and target; ``sources`` is the sources' hash."""
     flags = [*FLAGS, *options]
     start = [compiler(), *flags, "-c", f"-I{SOURCES}"]
-    binding = ("-isystem", jax.ffi.include_dir(), f'-DBUILD_HASH="{build_hash(flags)}"')
+    binding = ("-isystem", jax.ffi.include_dir(), f'-DBUILD_HASH="{build_hash(flags, sources)}"')
     result = []
     for source in sorted(SOURCES.glob("*.cc")):
         targets = {} if source.name == "library.cc" else TARGETS
@@ -75,19 +75,17 @@ def commands(build: Path, options: tuple[str, ...]) -> list[list[str]]:
     return result
 
 
-def build_hash(flags: list[str]) -> str:
+def build_hash(flags: list[str], sources: str) -> str:
     """Return a hash of sources, compiler and flags: compiled programs that are cached name the kernels by it."""
     version = subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True).stdout
-    digest = hashlib.sha256(repr((version, flags, TARGETS)).encode())
-    for path in sorted(SOURCES.glob("*.[ch]*")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
+    return hashlib.sha256(repr((version, flags, sources)).encode()).hexdigest()[:12]
 
 
 def build(options: tuple[str, ...] = ()) -> None:
     """Compile all sources and link them; the library appears under its name when it is complete."""
+    stamp = _stamp["stamp"](SOURCES)
     with tempfile.TemporaryDirectory(dir=LIBRARY.parent) as folder:
-        steps = commands(Path(folder), options)
+        steps = commands(Path(folder), options, stamp["sources"])
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             if any(pool.map(lambda step: subprocess.run(step, check=False).returncode, steps)):
                 sys.exit("make native: the compiler failed; its message is above")
@@ -103,7 +101,12 @@ def build(options: tuple[str, ...] = ()) -> None:
             str(library),
         ]
         subprocess.run(link, check=True)
-        library.write_bytes(_stamp["append_stamp"](library.read_bytes(), _stamp["stamp"](SOURCES)))
+        if _stamp["stamp"](SOURCES) != stamp:
+            sys.exit("make native: sources changed during the build; run it again")
+        stamp["options"] = " ".join(options)
+        library.write_bytes(_stamp["append_stamp"](library.read_bytes(), stamp))
+        # Whatever the umask: drivax loads no library that other users can write.
+        library.chmod(library.stat().st_mode & ~0o022)
         library.replace(LIBRARY)
     print(f"wrote {LIBRARY}")
 

@@ -7,7 +7,7 @@ namespace drivax::TARGET {
 
 enum RouteColumn { kRouteX, kRouteY, kRouteZ, kRouteCos, kRouteSin, kRouteLimit, kRouteLane, kRouteColumns };
 
-// A row index that is inside of its array, whatever the caller passed, as in XLA.
+// A row index that is inside of its array, whatever the caller passed; XLA counts negative ones from the end.
 INLINE int64_t clamp_row(int64_t row, int64_t count) { return row < 0 ? 0 : row < count ? row : count - 1; }
 
 // Arc length of the last of `points` points; negative for a route without two points, whatever a file says.

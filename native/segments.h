@@ -64,7 +64,7 @@ INLINE Runs runs_around(const SegmentGrid& grid, int64_t scenario, const float* 
     return runs;
   }
   const int16_t* cell = first_cell(grid, scenario, point);
-  // As in XLA, which reads runs of the longest length: files are not trusted.
+  // Files are not trusted. As in XLA, runs are cut at the longest length; it counts negative starts from the end.
   for (int run = 0; run < kRuns; ++run, cell += grid.side) {
     runs.begin[run] = clamp_index(cell[0], 0, grid.size - grid.longest_run);
     runs.end[run] = runs.begin[run] + clamp_index(cell[3] - cell[0], 0, grid.longest_run);

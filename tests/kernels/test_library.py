@@ -12,9 +12,9 @@ import pytest
 
 from drivax import kernels
 from drivax.kernels import library
-from drivax.kernels.stamp import append_stamp, stamp
+from drivax.kernels.stamp import append_stamp, read_stamp, stamp
 from drivax.networks.encoders import max_pool
-from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_kernels, run_tests
+from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_gcc, needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -71,7 +71,7 @@ def test_a_damaged_library_is_not_loaded(installed):
     complete = append_stamp(CODE, stamp(library.SOURCES))
     assert "does not load here" in installed.install(complete)  # the loader's word: only the code is missing
     flipped = complete.replace(b"library", b"librarY", 1)
-    problem = f"none: {installed.path} is incomplete, damaged or not of drivax: make native"
+    problem = f"none: {installed.path} is incomplete, damaged or not a drivax library: make native"
     for content in (b"", CODE, complete[:200], complete[:-1], complete[:-80], complete + b"x", flipped):
         assert installed.install(content) == problem
     stampless = CODE + b"\nnot JSON"
@@ -80,7 +80,7 @@ def test_a_damaged_library_is_not_loaded(installed):
 
 
 @pytest.mark.parametrize(
-    ("name", "other"), [("platform", "linux-aarch64"), ("XLA FFI", "0.1"), ("sources", "0123")]
+    ("name", "other"), [("platform", "linux-aarch64"), ("XLA FFI", "7"), ("sources", "0123")]
 )
 def test_a_library_for_another_machine_or_version_is_not_loaded(installed, name, other):
     values = stamp(library.SOURCES)
@@ -99,29 +99,69 @@ def test_any_change_of_a_source_makes_a_library_stale(repository, tmp_path):
             file.write("\n")
         before, after = stamp(sources)["sources"], before
         assert before != after
+    for name in ("lanes.cc~", ".lanes.cc.swp", ".#lanes.cc", "lanes.cc.orig"):  # of editors
+        (sources / name).write_text("draft")
+    (sources / ".cache").mkdir()
+    assert stamp(sources)["sources"] == before
     shutil.rmtree(sources)
     assert "sources" not in stamp(sources)  # a wheel
 
 
 def test_a_library_that_others_can_replace_is_not_loaded(installed, tmp_path):
-    problem = "can be written by other users: make native"
     installed.install(append_stamp(CODE, stamp(library.SOURCES)))
-    for path, mode in ((installed.path, 0o757), (installed.path.parent, 0o777)):
-        before = path.stat().st_mode
-        path.chmod(mode)
-        assert installed.state().endswith(problem)
-        path.chmod(before)
-    assert not installed.state().endswith(problem)
-    other = installed.path.rename(tmp_path / "libdrivax.so")
-    installed.path.symlink_to(other)
+    cache = tmp_path / "cache"
+    cache.mkdir(mode=0o755)
+    for is_link in (False, True):
+        if is_link:  # as package managers install it
+            installed.path.symlink_to(installed.path.rename(cache / "libdrivax.so"))
+        assert "does not load here" in installed.state()
+        for path in {installed.path.resolve(), installed.path.resolve().parent, installed.path.parent}:
+            before = path.stat().st_mode
+            path.chmod(0o757)
+            problem = f"{installed.path} or its folder is writable by other users: chmod go-w {path}"
+            assert installed.state() == f"none: {problem}"
+            path.chmod(before)
+
+
+def test_a_library_as_easy_to_write_as_the_code_is_loaded(installed, tmp_path, monkeypatch):
+    """Mounted folders may have all permissions everywhere."""
+    code = tmp_path / "library.py"
+    code.touch()
+    monkeypatch.setattr(library, "__file__", str(code))
+    installed.install(append_stamp(CODE, stamp(library.SOURCES)))
+    for mode, is_loaded in ((0o777, True), (0o775, False), (0o755, False)):
+        for path in (installed.path, installed.path.parent):
+            path.chmod(0o777)
+        code.chmod(mode)
+        assert ("does not load here" in installed.state()) == is_loaded
+
+
+def test_a_pipe_is_not_read(installed):
+    os.mkfifo(installed.path, 0o600)
     assert installed.state().endswith("is not a regular file: make native")
+
+
+def test_a_wheel_is_installed_again(installed, tmp_path, monkeypatch):
+    monkeypatch.setattr(library, "SOURCES", tmp_path)
+    assert installed.state() == "none: install drivax again (on Linux x86-64)"
+    assert installed.install(CODE).endswith("not a drivax library: install drivax again")
+
+
+def test_a_library_with_sanitizers_needs_their_runtime(installed, monkeypatch):
+    """Without it, loading ends the process."""
+    options = {"options": "-g -fsanitize=address"}
+    content = append_stamp(CODE, stamp(library.SOURCES) | options)
+    assert installed.install(content).endswith("is for tests with sanitizers: make native")
+    monkeypatch.setenv("LD_PRELOAD", "/usr/lib/libasan.so")
+    assert "does not load here" in installed.state()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file away")
 def test_a_library_of_another_user_is_not_loaded(installed):
     installed.install(append_stamp(CODE, stamp(library.SOURCES)))
     os.chown(installed.path, 12345, 12345)
-    assert installed.state().endswith("can be written by other users: make native")
+    problem = f"or its folder belongs to another user: chown 0 {installed.path}"
+    assert installed.state() == f"none: {installed.path} {problem}"
 
 
 def test_no_variable_and_no_current_folder_moves_the_library(tmp_path, monkeypatch):
@@ -155,6 +195,79 @@ def test_a_copy_of_the_library_is_used(tmp_path):
         f"from pathlib import Path; from drivax.kernels import library; library.PATH = Path({str(copy)!r}); "
     )
     assert run(program + PRINT_STATE) == f"True {kernels.state()}"
+
+
+REGISTER = """
+from pathlib import Path
+from drivax.kernels import library
+from drivax.kernels.stamp import append_stamp, stamp
+
+library.PATH = Path({path!r})
+library.PATH.write_bytes(append_stamp(library.PATH.read_bytes(), stamp(library.SOURCES)))
+"""
+
+
+@needs_compiler
+def test_a_library_that_xla_refuses_is_not_used(tmp_path):
+    """The handler of this one has version 0.0."""
+    strings = {"kernels": "other", "target": "AVX2", "hash": "0123"}
+    functions = [f'const char* drivax_{name}() {{ return "{value}"; }}' for name, value in strings.items()]
+    source, path = tmp_path / "other.cc", tmp_path / "libdrivax.so"
+    source.write_text(f'extern "C" {{ {" ".join(functions)} void* drivax_other(void*) {{ return 0; }} }}')
+    subprocess.run([COMPILER, "-shared", "-fPIC", str(source), "-o", str(path)], check=True)
+    path.chmod(0o755)
+    state = run(REGISTER.format(path=str(path)) + PRINT_STATE)
+    assert state.startswith(f"False none: {path} does not load here (") and "version" in state
+
+
+@pytest.fixture
+def checkout(repository, tmp_path):
+    """A copy of the build with a single small source."""
+    for name in ("native/build.py", "src/drivax/kernels/stamp.py"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        shutil.copy2(repository / name, tmp_path / name)
+    (tmp_path / "native" / "library.cc").write_text("int one() { return 1; }\n")
+    return tmp_path
+
+
+def build(checkout, *options, umask=0o022, **variables):
+    command = [sys.executable, str(checkout / "native" / "build.py"), *options]
+    environment = os.environ | variables
+    done = subprocess.run(command, env=environment, umask=umask, capture_output=True, text=True, check=False)
+    return done, checkout / "src" / "drivax" / "kernels" / "libdrivax.so"
+
+
+@needs_compiler
+def test_no_umask_makes_the_library_writable_by_others(checkout):
+    _, path = build(checkout, umask=0)
+    assert path.stat().st_mode & 0o777 == 0o755
+    assert read_stamp(path.read_bytes()) == stamp(checkout / "native") | {"options": ""}
+
+
+@needs_compiler
+def test_sources_that_change_during_the_build_end_it(checkout):
+    compiler = checkout / "compiler"
+    source = checkout / "native" / "library.cc"
+    compiler.write_text(f'#!/bin/sh\n{COMPILER} "$@" && echo >> {source}\n')
+    compiler.chmod(0o755)
+    done, path = build(checkout, CXX=str(compiler))
+    assert done.stderr == "make native: sources changed during the build; run it again\n"
+    assert not path.exists()
+
+
+@needs_gcc
+def test_the_stamp_names_sanitizers(checkout):
+    _, path = build(checkout, "--sanitize")
+    assert "-fsanitize=address" in read_stamp(path.read_bytes())["options"]
+
+
+def test_only_skips_for_want_of_kernels_fail_inner_tests(tmp_path):
+    file = tmp_path / "test_skips.py"
+    file.write_text("import pytest\ndef test(): pass\ndef test_skip(): pytest.skip('only root')\n")
+    run_tests(file)
+    file.write_text(file.read_text().replace("only root", "no native kernels: none"))
+    with pytest.raises(AssertionError, match="no native kernels"):
+        run_tests(file)
 
 
 def test_kernels_are_part_of_the_key_of_compiled_programs(monkeypatch):
@@ -258,7 +371,7 @@ def sanitized(repository, tmp_path_factory):
 
 
 @pytest.mark.slow
-@needs_compiler
+@needs_gcc
 @pytest.mark.parametrize("target", [*TARGETS, "best"])
 def test_sanitizers_find_no_error_in_the_kernels(repository, sanitized, target):
     """Over the tests of all kernels, with 10,000 random maps and 10,000 calls with any numbers."""

@@ -35,35 +35,50 @@ def _load() -> ctypes.CDLL | str:
     """Return the library with its kernels registered, or why it is not used."""
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
+    build = "make native" if (SOURCES / "build.py").is_file() else "install drivax again"
     if not PATH.exists():
-        return "none: make native (on Linux x86-64)"
+        return f"none: {build} (on Linux x86-64)"
     try:
-        problem = _problem()
-        return f"none: {PATH} {problem}: make native" if problem else _register()
+        if problem := _access_problem():
+            return f"none: {PATH} or its folder {problem}"
+        problem = _build_problem()
+        return f"none: {PATH} {problem}: {build}" if problem else _register()
     except (OSError, AttributeError, ValueError, RuntimeError) as error:
         message = str(error).partition("\n")[0]
-        return f"none: {PATH} does not load here ({message}): make native"
+        return f"none: {PATH} does not load here ({message}): {build}"
 
 
-def _problem() -> str | None:
-    """Return what is wrong with the library, which has not been loaded yet, or None."""
+def _access_problem() -> str | None:
+    """Return why the library is easier to write than the package's own code, and the cure, or None."""
     own = Path(__file__).stat()
-    writable = stat.S_IWOTH | stat.S_IWGRP & ~own.st_mode
-    if PATH.is_symlink() or not PATH.is_file():
+    for path in (PATH.resolve(), PATH.resolve().parent, PATH.parent):
+        status = path.stat()
+        if status.st_mode & ~own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return f"is writable by other users: chmod go-w {path}"
+        if status.st_uid not in {0, os.getuid(), own.st_uid}:
+            return f"belongs to another user: chown {os.getuid()} {path}"
+    return None
+
+
+def _build_problem() -> str | None:
+    """Return why the library, which has not been loaded yet, is no build for this package and machine, or None."""
+    if not PATH.is_file():
         return "is not a regular file"
-    for status in (PATH.stat(), PATH.parent.stat()):
-        if status.st_mode & writable or status.st_uid not in {0, os.getuid(), own.st_uid}:
-            return "or its folder can be written by other users"
     built = read_stamp(PATH.read_bytes())
     if built is None:
-        return "is incomplete, damaged or not of drivax"
+        return "is incomplete, damaged or not a drivax library"
     for name, value in stamp(SOURCES).items():
         if built.get(name) != value:
             return f"was built for {name} {built.get(name)}, this is {value}"
+    # Loading it without the sanitizer ends the process.
+    if "sanitize" in built.get("options", "") and "asan" not in os.environ.get("LD_PRELOAD", ""):
+        return "is for tests with sanitizers"
     return None
 
 
 def _register() -> ctypes.CDLL:
+    # Backends that start later would raise the errors of registration, such as of XLA's version, and not start.
+    jax.default_backend()
     library = ctypes.CDLL(str(PATH))
     for name in ("drivax_kernels", "drivax_target", "drivax_hash"):
         getattr(library, name).restype = ctypes.c_char_p
@@ -95,7 +110,7 @@ def in_use() -> bool:
 
 
 def without_kernels() -> contextlib.AbstractContextManager[None]:
-    """Trace programs without native kernels, for export and for comparisons."""
+    """Trace programs of this thread without native kernels, for export and for comparisons."""
     return _allowed(False)
 
 

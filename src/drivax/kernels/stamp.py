@@ -13,17 +13,18 @@ from pathlib import Path
 
 import jax.ffi
 
-_VERSION = re.compile(r"#define XLA_FFI_API_(?:MAJOR|MINOR) (\d+)")
+_VERSION = re.compile(r"#define XLA_FFI_API_MAJOR (\d+)")
 
 
 def stamp(sources: Path) -> dict[str, str]:
-    """Return platform, version of XLA's foreign function interface, and hash of the sources, if they are here."""
+    """Return platform, major version of XLA's foreign function interface, and hash of the sources, if any."""
     header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h")
-    values = {"platform": sysconfig.get_platform(), "XLA FFI": ".".join(_VERSION.findall(header.read_text()))}
+    values = {"platform": sysconfig.get_platform(), "XLA FFI": "".join(_VERSION.findall(header.read_text()))}
     if (sources / "build.py").is_file():
         digest = hashlib.sha256()
-        for path in sorted([*sources.glob("*.[ch]*"), sources / "build.py"]):
-            digest.update(path.read_bytes())
+        for path in sorted([*sources.glob("*.cc"), *sources.glob("*.h"), sources / "build.py"]):
+            if not path.name.startswith("."):  # files of editors
+                digest.update(path.read_bytes())
         values["sources"] = digest.hexdigest()[:12]
     return values
 

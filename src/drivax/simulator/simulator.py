@@ -17,7 +17,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import forget_crossings, remember_lights
-from drivax.simulator.situation import entry_strand, measure, replace_strand, surroundings
+from drivax.simulator.situation import PASSAGES, entry_strand, measure, replace_strand, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of, present_frame
 from drivax.simulator.types import (
@@ -93,7 +93,7 @@ class Simulator:
     ) -> EpisodeStart:
         """Return the :meth:`context` of a new episode, and what its recent motion implies."""
         context = self.context(bank, index, step, slot, key)
-        strand = entry_strand(bank, context, self.task.reads)
+        strand = entry_strand(bank, context) if self.task.reads & PASSAGES else None
         return EpisodeStart(context, remember_lights(bank, context), strand)
 
     def frame(

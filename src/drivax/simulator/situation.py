@@ -51,7 +51,7 @@ LONGEST_GAP_S = 10.0
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
 #: Facts that need lane passages.
-_PASSAGES = frozenset({"strand", "lane_changed", "merged"})
+PASSAGES = frozenset({"strand", "lane_changed", "merged"})
 
 
 def measure(
@@ -112,13 +112,11 @@ def measure(
     return Situation(context, _select_facts(facts, reads), around), codes, lights
 
 
-def entry_strand(bank: ScenarioBank, context: AgentContext, reads: frozenset[str]) -> Integer | None:
-    """Return the strand from which an episode's first lane passage starts; None if ``reads`` needs no passages.
+def entry_strand(bank: ScenarioBank, context: AgentContext) -> Integer:
+    """Return the strand from which an episode's first lane passage starts.
 
     An agent that changes lanes at the start comes from its pose 15 steps ago.
     """
-    if not reads & _PASSAGES:
-        return None
     x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
     xy, heading = jnp.stack([x, y]), jnp.stack([jnp.cos(psi), jnp.sin(psi)])
     ground = context.z - bank.height_m(context.index, context.slot) / 2
@@ -217,7 +215,7 @@ def _requested_facts(
     if "lag_m" in reads:
         ego, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
         facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - ego[:2]) * ego[2:4])
-    if reads & _PASSAGES:
+    if reads & PASSAGES:
         facts |= _passage_facts(bank, context, frame, strand)
     return facts
 
@@ -225,7 +223,7 @@ def _requested_facts(
 def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, strand: Any) -> dict[str, Array]:
     """Return the facts of lane passages; ``strand`` is that of the step before, None for :func:`entry_strand`."""
     ego, ground = frame.box[context.slot], _ground(bank, context, frame)
-    strand = entry_strand(bank, context, _PASSAGES) if strand is None else strand
+    strand = entry_strand(bank, context) if strand is None else strand
     passage = queries.lane_passage(bank, context.index, ego[:2], ego[2:4], ground, strand)
     return {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
 
@@ -247,7 +245,7 @@ def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scal
 def _select_facts(facts: Facts, reads: frozenset[str]) -> Facts:
     """Replace facts that are not requested by None."""
     # The next step's lane passage starts from the strand of this one.
-    names = reads | ({"strand"} if reads & _PASSAGES else frozenset())
+    names = reads | ({"strand"} if reads & PASSAGES else frozenset())
 
     def select(path: tuple[Any, ...], fact: Array) -> Array | None:
         return fact if path[0].name in names else None
