@@ -435,7 +435,7 @@ def test_no_file_shadows_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             (folder / "own.yaml").write_text(f"extends: {base}")
             assert settings.load(Training, "own.yaml").steps == steps
     # A misspelt preset reads no file either.
-    with pytest.raises(UsageError, match=r"no preset or file 'fsat'; did you mean 'fast'\?"):
+    with pytest.raises(UsageError, match=r"^no preset 'fsat'; write \./fsat for the file$"):
         settings.load(Training, "fsat")
     (folder / "own.yaml").write_text("extends: fsat")
     with pytest.raises(UsageError, match=r"extends 'fsat', which is not found; did you mean 'fast'\?"):

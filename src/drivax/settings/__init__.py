@@ -73,6 +73,8 @@ def preset(name: str) -> Path:
     """Return the path of the packaged configuration file ``configs/<name>.yaml``."""
     names = presets()
     if name not in names:
+        if Path(name).is_file():
+            raise UsageError(f"no preset {name!r}", cure=f"write ./{name} for the file")
         raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
     return _configs() / f"{name}.yaml"
 
