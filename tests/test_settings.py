@@ -150,6 +150,13 @@ def test_mistakes_are_named_with_their_path(text: str, message: str):
     assert error.value.status == 2 and error.value.cure
 
 
+def test_semicolons_of_the_user_end_no_problem():
+    for name, value in {"steps": "3; 4", "level": "a; b", "optimizer.kind": "x; y"}.items():
+        with pytest.raises(UsageError) as error:
+            settings.load(Training, {}, [f"--{name}", value])
+        assert value in error.value.problem and ";" not in str(error.value.cure)
+
+
 def test_missing_settings_and_failed_checks_are_named():
     with pytest.raises(UsageError, match="'steps' is missing; correct this setting"):
         settings.load(Needy, {})

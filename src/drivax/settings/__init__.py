@@ -56,12 +56,8 @@ def load(
         check_names(values, trust, file)
     try:
         return structure(values, cls)
-    except ValueError as error:
-        # Messages end with a cure unless the problem says what is allowed.
-        problem, separator, cure = str(error).rpartition("; ")
-        if not separator:
-            problem, cure = cure, "correct this setting"
-        raise UsageError(problem, file=file, cure=cure) from error
+    except UsageError as error:
+        raise UsageError(error.problem, file=file, cure=error.cure) from error
 
 
 def dump(record: Any) -> str:
