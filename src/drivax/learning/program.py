@@ -226,15 +226,17 @@ def device_count() -> int:
     return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
-def is_largest(path: Sequence[Any]) -> bool:
+def is_largest(name: str) -> bool:
     """Return whether a logged value is a maximum over samples and updates instead of a mean, by its name."""
-    return any(str(getattr(key, "key", key)).startswith("largest_") for key in path)
+    return name.startswith("largest_")
 
 
-def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:
-    """Return a function's result summed over devices, each with its share of ``divided`` along an axis.
+def sum_over_devices(
+    function: Callable[[Any, Any], tuple[dict[str, Array], Any]], whole: Any, divided: Any, axis: int
+) -> tuple[dict[str, Array], Any]:
+    """Return the logs and sums of a function, summed over devices, each with its share of ``divided`` along an axis.
 
-    Of values ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
+    Of logs ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
     step of a loop. If shares would differ, nothing is divided.
     """
     count = device_count()
@@ -244,11 +246,10 @@ def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: A
 
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def summed(whole: Any, share: Any) -> Any:
-        own = function(whole, share)
-        total = jax.lax.psum(own, _AXIS)
-        return jax.tree_util.tree_map_with_path(
-            lambda path, total, own: jax.lax.pmax(own, _AXIS) if is_largest(path[-1:]) else total, total, own
-        )
+        logs, sums = function(whole, share)
+        total_logs, total = jax.lax.psum((logs, sums), _AXIS)
+        largest = {name: jax.lax.pmax(log, _AXIS) for name, log in logs.items() if is_largest(name)}
+        return total_logs | largest, total
 
     return summed(whole, divided)
 

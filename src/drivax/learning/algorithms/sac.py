@@ -334,7 +334,7 @@ class Sac(OffPolicy[SacConfig]):
         def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             share = len(samples[0].reward) / count
             loss, logs = self.loss(trained, target, *samples)
-            return share * loss, {n: x if is_largest([n]) else share * x for n, x in logs.items()}
+            return share * loss, {n: x if is_largest(n) else share * x for n, x in logs.items()}
 
         samples = (transitions, jax.random.split(key, (count, 2)))
         samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
@@ -375,7 +375,7 @@ def _sums(logs: dict[str, Array]) -> dict[str, Array]:
     """Return the logs of an iteration with counts: sums over updates, and maxima of ``largest_*``."""
     sums: dict[str, Array] = {}
     for name, values in logs.items():
-        largest = is_largest([name])
+        largest = is_largest(name)
         sums[f"loss/{name}"] = values.max() if largest else values.sum()
         sums[f"loss/{name}/n"] = jnp.asarray(1.0 if largest else float(len(values)))
     return sums
