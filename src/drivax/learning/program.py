@@ -22,7 +22,7 @@ from jax.tree_util import keystr
 from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
-from drivax.evaluation.memory import memory_of
+from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithm import Learner
 
 #: Threads of XLA's pool, enough to avoid deadlocks.
@@ -279,7 +279,7 @@ def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
 
 @dataclass(frozen=True)
 class MemoryAccount:
-    """Memory of a run on its fullest device by purpose, in bytes, and the device's capacity, None if unknown."""
+    """Memory of a run on its fullest device by purpose, in bytes, and what is free for it, None if unknown."""
 
     sizes: Mapping[str, int]
     limit: int | None
@@ -293,7 +293,7 @@ class MemoryAccount:
     def text(self) -> str:
         """Return the account as one line."""
         sizes = ", ".join(f"{name} {_readable(size)}" for name, size in self.sizes.items() if size)
-        limit = "" if self.limit is None else f" of {_readable(self.limit)}"
+        limit = "" if self.limit is None else f" of {_readable(self.limit)} free"
         return f"memory: {_readable(self.total)}{limit} on {self.device}: {sizes}"
 
     @property
@@ -320,8 +320,10 @@ def account(
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         sizes[_listed_field(path) or _NETWORKS] += _leaf_bytes(leaf)
     sizes["program"] = _program_bytes(compiled)
-    device = devices[0]
-    return MemoryAccount(sizes, memory_of(device, len(devices)), f"{device.platform}:{device.id}")
+    device, free = devices[0], free_memory(devices[0], len(devices))
+    # Scenarios are in memory already, the rest is not.
+    limit = None if free is None else free + sizes["scenarios"] + sizes["validation"]
+    return MemoryAccount(sizes, limit, f"{device.platform}:{device.id}")
 
 
 def _bytes(tree: Any) -> int:
