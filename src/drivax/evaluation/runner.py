@@ -135,17 +135,12 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", "episodes": len(table), "seed": config.seed, **table.info}
-    if training_sets := planner_training_sets(config.planner):
+    if training_sets := policy_training_sets(config.planner, PLANNERS):
         info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
-
-
-def planner_training_sets(name: str) -> list[dict[str, Any]]:
-    """Return the training sets of a planner by name; only policies have any."""
-    return [] if name in PLANNERS else policy_training_sets(name)
 
 
 def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:
