@@ -16,7 +16,7 @@ from drivax.cli import main
 from drivax.errors import DataError, DrivaxError
 from drivax.files import PartialFolder, atomic_write, replace_folder
 from drivax.learning import loop
-from drivax.learning.algorithms.off_policy import over_updates
+from drivax.learning.algorithms.off_policy import reduce_over_updates
 from drivax.learning.algorithms.optimisers import sum_gradients
 from drivax.learning.algorithms.sac import _sums
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
@@ -236,7 +236,7 @@ def test_large_values_warn_once(data, config, tmp_path):
 
 def test_largest_values_are_maxima_over_updates_and_chunks():
     logs = {"mean_q": jnp.array([1.0, 2.0, 6.0]), "largest_q": jnp.array([4.0, 9.0, 6.0])}
-    assert over_updates(logs) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
+    assert reduce_over_updates(logs) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
     assert mean_logs(_sums(logs)) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
 
     def loss(parameters, x):

@@ -13,8 +13,8 @@ import json
 import logging
 import math
 import os
-import resource
 import re
+import resource
 import sys
 import threading
 import zlib

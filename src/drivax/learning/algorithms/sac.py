@@ -55,7 +55,7 @@ from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
 #: Largest number of steps of n-step returns.
-MOST_STEPS = 1000
+MOST_RETURN_STEPS = 1000
 #: Steps of the replay buffer, and logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 
@@ -111,7 +111,7 @@ class SacConfig:
         check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
         check_at_most(self, MOST_SAMPLES, "environments", "unroll", "updates_per_step", "batch")
         check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
-        check_at_most(self, MOST_STEPS, "steps")
+        check_at_most(self, MOST_RETURN_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")
