@@ -150,6 +150,13 @@ def test_mistakes_are_named_with_their_path(text: str, message: str):
     assert error.value.status == 2 and error.value.cure
 
 
+def test_semicolons_of_the_user_end_no_problem():
+    for name, value in {"steps": "3; 4", "level": "a; b", "optimizer.kind": "x; y"}.items():
+        with pytest.raises(UsageError) as error:
+            settings.load(Training, {}, [f"--{name}", value])
+        assert value in error.value.problem and ";" not in str(error.value.cure)
+
+
 def test_missing_settings_and_failed_checks_are_named():
     with pytest.raises(UsageError, match="'steps' is missing; correct this setting"):
         settings.load(Needy, {})
@@ -435,7 +442,7 @@ def test_no_file_shadows_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             (folder / "own.yaml").write_text(f"extends: {base}")
             assert settings.load(Training, "own.yaml").steps == steps
     # A misspelt preset reads no file either.
-    with pytest.raises(UsageError, match=r"no preset or file 'fsat'; did you mean 'fast'\?"):
+    with pytest.raises(UsageError, match=r"^no preset 'fsat'; write \./fsat for the file$"):
         settings.load(Training, "fsat")
     (folder / "own.yaml").write_text("extends: fsat")
     with pytest.raises(UsageError, match=r"extends 'fsat', which is not found; did you mean 'fast'\?"):

@@ -164,7 +164,7 @@ def find_planner(
         planner = make_planner(name, task and task.actions)
         return planner, task or default_task(planner)
     folder, step = run_and_step(name)
-    if not is_policy(folder):
+    if not is_policy(folder, PLANNERS):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     if task is not None:

@@ -203,11 +203,13 @@ def check_protocol(thing: Any, name: str, protocol: Any) -> None:
     """Check that an object, or a dataclass by its fields, has all members of a protocol.
 
     Raises:
-        ValueError: A member is missing, or a method takes other arguments.
+        UsageError: A member is missing.
+        ValueError: A method takes other arguments.
     """
     for member in protocol_members(protocol):
         if not hasattr(thing, member) and member not in getattr(thing, "__dataclass_fields__", ()):
-            raise ValueError(f"{name!r} lacks {member!r}; see {protocol.__module__}.{protocol.__name__}")
+            cure = f"see {protocol.__module__}.{protocol.__name__}"
+            raise UsageError(f"{name!r} lacks {member!r}", cure=cure)
         _check_method(thing, name, member, getattr(protocol, member, None))
 
 

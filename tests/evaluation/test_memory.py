@@ -27,6 +27,7 @@ def test_half_of_free_memory_holds_two_copies_and_the_program():
 def test_this_machine_has_free_memory():
     device = jax.devices()[0]
     assert 10**7 < free_memory(device) <= memory_of(device)
+    assert free_memory(device, 10**6) < 10**-5 * memory_of(device)
 
 
 def test_free_memory_of_a_kernel_that_does_not_tell_it(tmp_path, monkeypatch):

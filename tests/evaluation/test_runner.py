@@ -18,7 +18,7 @@ from drivax.evaluation.result_tables import paired_difference, summarise
 from drivax.evaluation.runner import EvaluationConfig, evaluate, format_crashes, run_evaluation
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank, identities
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.schema import Flag
@@ -227,18 +227,21 @@ def test_planner_of_another_action_space_is_refused(data):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
 
 
-def test_scenarios_of_one_identity_are_refused_for_planners_that_look_them_up():
-    """The hashes of the two ids are equal."""
-    ids = ("44662", "169336")
-    twins = [assemble(replace(straight_road([car()]), scenario_id=name), SMALL) for name in ids]
+def test_planner_finds_scenarios_whose_hashes_are_equal():
+    """The hashes of the two ids are equal; the identity of the later one is another."""
+    ids, asked = ("44662", "169336"), []
+    scenarios = [assemble(replace(straight_road([car()]), scenario_id=name), SMALL) for name in ids]
+    dataset = scenario_names(scenarios)[0]["dataset"]
+    numbers = identities([(dataset, name) for name in ids]).tolist()
+    assert numbers[:1] == identities([(dataset, ids[0])]).tolist() == identities([(dataset, ids[1])]).tolist()
 
     @record
     class Prepared(Expert):
         def prepare(self, scenario_of):
-            raise AssertionError("not reached")
+            asked.extend(scenario_names([scenario_of(number)])[0]["scenario_id"] for number in numbers)
 
-    with pytest.raises(UsageError, match="scenarios 44662 and 169336 have the same identity"):
-        evaluate(Prepared(), twins)
+    evaluate(Prepared(), scenarios)
+    assert asked == list(ids)
 
 
 def test_plain_function_is_refused_as_planner(data):

@@ -16,7 +16,7 @@ from drivax.cli import main
 from drivax.errors import DataError, DrivaxError
 from drivax.files import PartialFolder, atomic_write, replace_folder
 from drivax.learning import loop
-from drivax.learning.algorithms.off_policy import over_updates
+from drivax.learning.algorithms.off_policy import reduce_over_updates
 from drivax.learning.algorithms.optimisers import sum_gradients
 from drivax.learning.algorithms.sac import _sums
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
@@ -231,20 +231,22 @@ def test_large_values_warn_once(data, config, tmp_path):
     assert warnings == ["warning: seed 4: loss/kl is 1.5, beyond 1 at 10 steps: training may diverge"]
     logs = {"loss/largest_q": 1.01e4, "loss/kl": 0.9, "loss/policy": 1e9}
     assert large_logs(logs) == {"loss/largest_q": "loss/largest_q is 1.01e+04, beyond 10000"}
+    assert large_logs({"loss/mean_q": -1.01e4}) == {"loss/mean_q": "loss/mean_q is -1.01e+04, beyond 10000"}
 
 
 def test_largest_values_are_maxima_over_updates_and_chunks():
     logs = {"mean_q": jnp.array([1.0, 2.0, 6.0]), "largest_q": jnp.array([4.0, 9.0, 6.0])}
-    assert over_updates(logs) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
+    assert reduce_over_updates(logs) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
     assert mean_logs(_sums(logs)) == {"loss/mean_q": 3.0, "loss/largest_q": 9.0}
 
-    def loss(slope, x):
-        return slope * jnp.sum(x) / 4, {"mean_q": jnp.sum(x) / 4, "largest_q": jnp.max(jnp.abs(x))}
+    def loss(parameters, x):
+        logs = {"mean_q": jnp.sum(x) / 4, "largest_q": jnp.max(jnp.abs(x))}
+        return parameters["largest_slope"] * jnp.sum(x) / 4, logs
 
     for chunks in (1, 2, 4):
         samples = jnp.array([1.0, -7.0, 3.0, 5.0]).reshape(chunks, -1)
-        logs, gradient = sum_gradients(loss, jnp.array(2.0), samples)
-        assert (float(gradient), logs) == (0.5, {"mean_q": 0.5, "largest_q": 7.0})
+        result = sum_gradients(loss, {"largest_slope": jnp.array(2.0)}, samples)
+        assert result == ({"mean_q": 0.5, "largest_q": 7.0}, {"largest_slope": 0.5})
 
 
 def damage(checkpoint):

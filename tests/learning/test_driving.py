@@ -209,6 +209,12 @@ def test_demonstrations_leave_out_gaps_of_the_log(bank, driving):
     observation, *_ = jax.jit(driving.demonstrations, static_argnums=2)(gap, jax.random.key(3), 256)
     steps = set(np.asarray(observation["moment"][:, 0, 1]).astype(int))
     assert 37 in steps and not steps & set(range(38, 44))
+    # Nor may step 10, which has no action either, take their place.
+    gap = replace(bank, agents=bank.agents.at[:, 11:-20, 0, AgentColumn.VALID].set(0.0))
+    observation, *_ = jax.jit(driving.demonstrations, static_argnums=2)(gap, jax.random.key(3), 256)
+    assert set(np.asarray(observation["moment"][:, 0, 1]).astype(int)) == set(
+        range(bank.steps - 20, bank.steps - 2)
+    )
 
 
 def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):

@@ -18,7 +18,6 @@ from drivax import settings
 from drivax.api import find_planner
 from drivax.cli import main
 from drivax.errors import DataError, DrivaxError, UsageError
-from drivax.evaluation.runner import planner_training_sets
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import (
     POLICY_FILE,
@@ -28,6 +27,7 @@ from drivax.learning.policies import (
     load_policy,
     policy_traffic,
 )
+from drivax.planners.catalogue import PLANNERS
 from drivax.planners.planner_traffic import TrafficDriver
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.build.assemble import assemble
@@ -37,7 +37,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import Route
 from drivax.tasks.task import Task
-from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
+from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, policy_training_sets, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
 
@@ -180,7 +180,9 @@ def test_no_folder_shadows_a_name(run, bank, tmp_path, monkeypatch):
     for name in names:
         with pytest.raises(UsageError, match=f"trained policy './{name}' has its own task"):
             find_planner(f"./{name}", bank, task=Task())
-        assert planner_training_sets(name) != planner_training_sets(f"./{name}") == run.info["data"]
+        other, own = (policy_training_sets(path, PLANNERS) for path in (name, f"./{name}"))
+        assert other != own == run.info["data"]
+        assert not is_policy(name, PLANNERS) or name == "zoo:ppo"
     assert find_traffic("idm") == find_traffic(traffic) == IdmTraffic()
     assert find_traffic("zoo:ppo").run == str(policy_folder("zoo:ppo"))
     for name in ("idm", "zoo:ppo", traffic):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -320,6 +321,14 @@ def test_state_larger_than_the_memory_is_refused(tmp_path: Path):
     os.truncate(tmp_path / "policy.npz", 1 << 42)
     with pytest.raises(DataError, match=rf"policy\.npz: {problem}"):
         unpack(tmp_path / "policy.npz", {"a": state})
+
+
+def test_state_larger_than_the_limit_of_the_process_is_refused(tmp_path: Path, monkeypatch):
+    file, state = tmp_path / "policy.npz", {"a": np.ones(300, np.float32)}
+    pack(file, state)
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (1000, resource.RLIM_INFINITY))
+    with pytest.raises(DataError, match=r"states .* of arrays, more than the .* of memory"):
+        unpack(file, state)
 
 
 def test_chunks_larger_than_their_array_are_refused(tmp_path: Path):

@@ -53,13 +53,13 @@ class Bench(BenchConfig):
 
 
 #: Flags without a meaning for encoders.
-_OF_SIMULATOR = ("data", "scenarios", "batch", "steps", "traffic", "trust_code", "metrics")
+_SIMULATOR_FLAGS = ("data", "scenarios", "batch", "steps", "traffic", "trust_code", "metrics")
 
 
 def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Run the benchmark and print its results."""
     if args.encoders:
-        ignored = [name for name in _OF_SIMULATOR if getattr(args, name) != getattr(Bench, name)]
+        ignored = [name for name in _SIMULATOR_FLAGS if getattr(args, name) != getattr(Bench, name)]
         if ignored:
             flags = " ".join(f"--{name.replace('_', '-')}" for name in ignored)
             raise UsageError("--encoders times no simulator", cure=f"leave out {flags}")

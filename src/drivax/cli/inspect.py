@@ -124,7 +124,7 @@ def _check_flags(args: Inspect) -> None:
             flag = f"--{name.replace('_', '-')}"
             raise UsageError(f"{flag} needs --observations", cure="add --observations")
     planner = args.planner or "expert"
-    if args.task is not None and planner not in PLANNERS and is_policy(planner.partition("@")[0]):
+    if args.task is not None and is_policy(planner.partition("@")[0], PLANNERS):
         raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None:
         check_output(args.draw, args.overwrite)

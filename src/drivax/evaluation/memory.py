@@ -24,19 +24,19 @@ _GROUPS, _PROCESS_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _MEMORY_INFO = Path("/proc/meminfo")
 
 
-def memory_of(device: Any, share: int = 1) -> int | None:
-    """Return the bytes of a device, or None if unknown; of a CPU those of machine or container divided by ``share``."""
+def memory_of(device: Any) -> int | None:
+    """Return the bytes of a device, or None if unknown; of a CPU those of machine or container."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"])
     if device.platform != "cpu":
         return None
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return min([total, *(limit for limit, _ in _group_limits())]) // share
+    return min([total, *(limit for limit, _ in _group_limits())])
 
 
-def free_memory(device: Any) -> int | None:
-    """Return the free bytes of a device, or None if unknown.
+def free_memory(device: Any, share: int = 1) -> int | None:
+    """Return the free bytes of a device, or None if unknown; of a CPU those of machine or container over ``share``.
 
     The page cache of Linux counts as free; on other systems, all of the memory of a CPU does.
     """
@@ -50,7 +50,8 @@ def free_memory(device: Any) -> int | None:
     if available_kb is not None:
         free.append(1024 * available_kb)
     free += [limit - usage for limit, usage in _group_limits()]
-    return max(min(free), 0) if free else memory_of(device)
+    available = max(min(free), 0) if free else memory_of(device)
+    return None if available is None else available // share
 
 
 def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:

@@ -135,17 +135,12 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     info: dict[str, Any] = {"kind": "evaluation", "episodes": len(table), "seed": config.seed, **table.info}
-    if training_sets := planner_training_sets(config.planner):
+    if training_sets := policy_training_sets(config.planner, PLANNERS):
         info["trained_on"] = training_sets
     with explain_full_disk(Path(out), needed_bytes), replace_folder(Path(out)) as partial_folder:
         RunFolder.create(partial_folder, config, data=[data], overwrite=True, **info)
         table.write(partial_folder)
     return table
-
-
-def planner_training_sets(name: str) -> list[dict[str, Any]]:
-    """Return the training sets of a planner by name; only policies have any."""
-    return [] if name in PLANNERS else policy_training_sets(name)
 
 
 def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:
@@ -260,7 +255,7 @@ def evaluate(
         names = _stored_names(scenarios, start_step)
         identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
         if prepare is not None:
-            rows = _rows_of(identity, names)
+            rows = {number: row for row, number in enumerate(identity.tolist())}
             prepare(lambda number: scenarios[rows[number]])
         sizes = sizes or Sizes.used(scenarios)
         size = min(batch or _batch_size(simulator.traffic, scenarios, sizes), len(scenarios))
@@ -296,17 +291,6 @@ def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
     steps, present = zip(*((int(s.steps), s.agent_valid[start_step, 0]) for s in scenarios), strict=True)
     _check_starts(names, np.array(steps), np.array(present), start_step)
     return names
-
-
-def _rows_of(identity: UInt32[np.ndarray, " n"], names: Names) -> dict[int, int]:
-    """Return the row of each scenario by its identity, which is a hash: two of 65,000 scenarios may share one."""
-    rows: dict[int, int] = {}
-    for row, number in enumerate(identity.tolist()):
-        if (first := rows.setdefault(number, row)) != row:
-            twins = " and ".join(names[index]["scenario_id"] for index in (first, row))
-            problem = f"scenarios {twins} have the same identity, by which the planner finds a scenario"
-            raise UsageError(problem, cure="evaluate them in separate runs, for example with --filter")
-    return rows
 
 
 def _batch_size(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:

@@ -161,10 +161,9 @@ def split_traffic(name: str) -> tuple[str | None, str]:
         UsageError: There is no such traffic.
     """
     run, plus, base = name.rpartition("+")
-    # No folder shadows a built-in name or `module:name`.
-    if plus and base in TRAFFIC and run not in TRAFFIC and is_policy(run):
+    if plus and base in TRAFFIC and is_policy(run, TRAFFIC):
         return run, base
-    if name not in TRAFFIC and is_policy(name):
+    if is_policy(name, TRAFFIC):
         return name, "log"
     if name not in TRAFFIC and not is_dotted(name):
         kinds = [*TRAFFIC, "package.module:name", "the folder of a training run", *zoo()]

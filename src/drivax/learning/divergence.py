@@ -12,7 +12,7 @@ from drivax.learning.program import trained_leaves
 
 #: Absolute logged values beyond which training warns: a KL divergence of 1 nat per iteration, and Q values that only
 #: rewards of +-100 per step reach at a discount of 0.99.
-BOUNDS = {"loss/kl": 1.0, "loss/largest_q": 1e4}
+BOUNDS = {"loss/kl": 1.0, "loss/mean_q": 1e4, "loss/largest_q": 1e4}
 #: Logged values that are finite in a healthy training; causes come first.
 _PREFIXES = ("reward/", "loss/")
 

@@ -200,14 +200,15 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        At a step where the ego is not valid now and in the next two, step 10 is taken instead.
+        All steps of an ego at which it is valid, then and in the next two, are equally probable. Of an ego without any,
+        step 10 is taken.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
             context = self._logged_context(bank, *index)
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
-        *index, _ = self._draw(data, key, count, CURRENT_STEP, later=2)
+        *index, _ = self._draw(data, key, count, CURRENT_STEP, has_action=True)
         return jax.vmap(_bind_bank(demonstrate, data))(*index)
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
@@ -255,12 +256,13 @@ class Driving:
         count: int,
         earliest: int,
         latest: int | None = None,
-        later: int = 0,
+        has_action: bool = False,
     ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
         """Draw scenarios, steps, slots of egos, and keys of episodes.
 
-        The ego is valid at the step and at the ``later`` next ones; else it is step 10. Steps are at most the third
-        last. The slot is None if all egos are the recorded ones.
+        Steps are at most the third last. Where the ego is not valid, step 10 is taken; with ``has_action``, where the
+        expert has no action, another step that has one is drawn, if there is any. The slot is None if all egos are the
+        recorded ones.
         """
         index_key, step_key = jax.random.split(key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
@@ -274,10 +276,18 @@ class Driving:
         last = last if latest is None else jnp.minimum(last, latest)
         step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
         # Egos are always valid at the current step.
-        ego = 0 if slot is None else slot[:, None]
-        steps = step[:, None] + jnp.arange(later + 1)
-        is_valid = (bank.agents[index[:, None], steps, ego, AgentColumn.VALID] > 0).all(axis=1)
-        step = jnp.where(is_valid & (step <= last), step, CURRENT_STEP)
+        ego, other = 0 if slot is None else slot, jnp.int32(CURRENT_STEP)
+        if has_action:
+            steps = jnp.arange(bank.steps)
+            usable = _has_successors(bank.agents[index, :, ego, AgentColumn.VALID] > 0)
+            usable &= (earliest <= steps) & (steps <= last[:, None])
+            rank = jax.random.randint(jax.random.fold_in(step_key, 2), (count,), 1, usable.sum(axis=1) + 1)
+            drawn = jnp.argmax(jnp.cumsum(usable, axis=1) == rank[:, None], axis=1)
+            other = jnp.where(usable.any(axis=1), drawn, other)
+            is_usable = usable[jnp.arange(count), step]
+        else:
+            is_usable = (bank.agents[index, step, ego, AgentColumn.VALID] > 0) & (step <= last)
+        step = jnp.where(is_usable, step, other)
         # Unused, and not computed, with logged starts and without conditions.
         keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
         return index, step, slot, keys
@@ -338,8 +348,12 @@ def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
     valid = bank.agents[jnp.arange(len(bank))[:, None, None], steps, slot, AgentColumn.VALID] > 0
     last = bank.last_step.reshape(bank.egos.shape)[:, :egos, None]
     valid = (valid & (slot >= 0) & (steps <= last)).reshape(-1, bank.steps)
-    has_successors = jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
-    return has_successors & (steps >= CURRENT_STEP)
+    return _has_successors(valid) & (steps >= CURRENT_STEP)
+
+
+def _has_successors(valid: Bool[Array, "M T"]) -> Bool[Array, "M T"]:
+    """Mask of steps that are valid, as are the two after them."""
+    return jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
 
 
 def _totals(

@@ -22,7 +22,7 @@ from jax.tree_util import keystr
 from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
-from drivax.evaluation.memory import memory_of
+from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithm import Learner
 
 #: Threads of XLA's pool, enough to avoid deadlocks.
@@ -226,15 +226,17 @@ def device_count() -> int:
     return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
-def is_largest(path: Sequence[Any]) -> bool:
+def is_largest(name: str) -> bool:
     """Return whether a logged value is a maximum over samples and updates instead of a mean, by its name."""
-    return any(str(getattr(key, "key", key)).startswith("largest_") for key in path)
+    return name.startswith("largest_")
 
 
-def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any, axis: int) -> Any:
-    """Return a function's result summed over devices, each with its share of ``divided`` along an axis.
+def sum_over_devices(
+    function: Callable[[Any, Any], tuple[dict[str, Array], Any]], whole: Any, divided: Any, axis: int
+) -> tuple[dict[str, Array], Any]:
+    """Return the logs and sums of a function, summed over devices, each with its share of ``divided`` along an axis.
 
-    Of values ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
+    Of logs ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
     step of a loop. If shares would differ, nothing is divided.
     """
     count = device_count()
@@ -244,11 +246,10 @@ def sum_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: A
 
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def summed(whole: Any, share: Any) -> Any:
-        own = function(whole, share)
-        total = jax.lax.psum(own, _AXIS)
-        return jax.tree_util.tree_map_with_path(
-            lambda path, total, own: jax.lax.pmax(own, _AXIS) if is_largest(path[-1:]) else total, total, own
-        )
+        logs, sums = function(whole, share)
+        total_logs, total = jax.lax.psum((logs, sums), _AXIS)
+        largest = {name: jax.lax.pmax(log, _AXIS) for name, log in logs.items() if is_largest(name)}
+        return total_logs | largest, total
 
     return summed(whole, divided)
 
@@ -278,7 +279,7 @@ def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
 
 @dataclass(frozen=True)
 class MemoryAccount:
-    """Memory of a run on its fullest device by purpose, in bytes, and the device's capacity, None if unknown."""
+    """Memory of a run on its fullest device by purpose, in bytes, and what is free for it, None if unknown."""
 
     sizes: Mapping[str, int]
     limit: int | None
@@ -292,7 +293,7 @@ class MemoryAccount:
     def text(self) -> str:
         """Return the account as one line."""
         sizes = ", ".join(f"{name} {_readable(size)}" for name, size in self.sizes.items() if size)
-        limit = "" if self.limit is None else f" of {_readable(self.limit)}"
+        limit = "" if self.limit is None else f" of {_readable(self.limit)} free"
         return f"memory: {_readable(self.total)}{limit} on {self.device}: {sizes}"
 
     @property
@@ -319,8 +320,10 @@ def account(
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         sizes[_listed_field(path) or _NETWORKS] += _leaf_bytes(leaf)
     sizes["program"] = _program_bytes(compiled)
-    device = devices[0]
-    return MemoryAccount(sizes, memory_of(device, len(devices)), f"{device.platform}:{device.id}")
+    device, free = devices[0], free_memory(devices[0], len(devices))
+    # Scenarios are in memory already, the rest is not.
+    limit = None if free is None else free + sizes["scenarios"] + sizes["validation"]
+    return MemoryAccount(sizes, limit, f"{device.platform}:{device.id}")
 
 
 def _bytes(tree: Any) -> int:

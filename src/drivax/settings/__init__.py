@@ -56,12 +56,8 @@ def load(
         check_names(values, trust, file)
     try:
         return structure(values, cls)
-    except ValueError as error:
-        # Messages end with a cure unless the problem says what is allowed.
-        problem, separator, cure = str(error).rpartition("; ")
-        if not separator:
-            problem, cure = cure, "correct this setting"
-        raise UsageError(problem, file=file, cure=cure) from error
+    except UsageError as error:
+        raise UsageError(error.problem, file=file, cure=error.cure) from error
 
 
 def dump(record: Any) -> str:
@@ -73,6 +69,8 @@ def preset(name: str) -> Path:
     """Return the path of the packaged configuration file ``configs/<name>.yaml``."""
     names = presets()
     if name not in names:
+        if Path(name).is_file():
+            raise UsageError(f"no preset {name!r}", cure=f"write ./{name} for the file")
         raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
     return _configs() / f"{name}.yaml"
 

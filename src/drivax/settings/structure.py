@@ -38,12 +38,13 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 
 
 class _Problem(ValueError):
-    """A wrong value, with its path inside the enclosing value."""
+    """A wrong value, with its path inside the enclosing value, and a cure."""
 
-    def __init__(self, problem: str, path: str) -> None:
+    def __init__(self, problem: str, path: str = "", cure: str | None = None) -> None:
         super().__init__(problem)
         self.problem = problem
         self.path = path
+        self.cure = cure
 
 
 class Flag(str):
@@ -62,13 +63,14 @@ def structure(values: Any, cls: Any) -> Any:
     """Return an instance of ``cls`` from plain values.
 
     Raises:
-        ValueError: ``path: problem; cure`` of the first wrong value.
+        UsageError: ``path: problem; cure`` of the first wrong value.
     """
     try:
         return _converter().structure(values, cls)
     except Exception as error:
-        problem, path = _first_problem(error, "")
-        raise ValueError(f"{path}: {problem}" if path else problem) from error
+        first = _first_problem(error, "")
+        problem = f"{first.path}: {first.problem}" if first.path else first.problem
+        raise UsageError(problem, cure=first.cure or "correct this setting") from error
 
 
 def plain(record: Any) -> Any:
@@ -129,7 +131,7 @@ def _to_literal(value: Any, cls: Any) -> Any:
     names = [str(option) for option in options]
     quotes = "without quotes" if isinstance(value, str) else "in quotes"
     near = f"write it {quotes}" if str(value) in names else did_you_mean(str(value), names)
-    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, options))}; {near}")
+    raise _Problem(f"{str(value)!r} is not one of {', '.join(map(str, options))}", cure=near)
 
 
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
@@ -162,7 +164,7 @@ def _to_item(value: Any, cls: Any, place: str) -> Any:
     try:
         return _converter().structure(value, cls)
     except Exception as error:  # hooks and the converter raise errors of several types
-        raise _Problem(*_first_problem(error, place)) from error
+        raise _first_problem(error, place) from error
 
 
 def _to_union(value: Any, cls: Any) -> Any:
@@ -178,17 +180,18 @@ def _to_union(value: Any, cls: Any) -> Any:
         return _converter().structure({}, records[value])
     if isinstance(value, Mapping) and records:
         return _to_record_of_kind(dict(value), records)
-    problems = []
+    problems: list[_Problem] = []
     for member in sorted(members, key=_rank_member):
         if not _is_record(member):
             try:
                 return _converter().structure(value, member)
             except (ValueError, TypeError, ClassValidationError, IterableValidationError) as error:
                 if member is not type(None):
-                    problems.append(_first_problem(error, "")[0])
+                    problems.append(_first_problem(error, ""))
     if records:
         raise ValueError(f"{value!r} is not a section with a kind ({', '.join(records)})")
-    raise ValueError(" and ".join(problems))
+    cure = next((problem.cure for problem in problems if problem.cure), None)
+    raise _Problem(" and ".join(problem.problem for problem in problems), cure=cure)
 
 
 def _kind(value: Any) -> Any:
@@ -207,7 +210,7 @@ def _to_user_object(value: Any, cls: Any) -> Any:
     items = value.items() if isinstance(value, Mapping) else ()
     options = {key: item for key, item in items if key != "kind"}
     if options and not _is_record(user_object):
-        raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
+        raise _Problem(f"{name!r} takes no settings", cure="make it a frozen dataclass")
     if _is_protocol(cls):
         check_protocol(user_object, name, cls)
     else:
@@ -222,7 +225,7 @@ def _check_callable(user_object: Any, name: str, cls: Any) -> None:
         has_call = _is_record(user_object) and any("__call__" in vars(base) for base in user_object.__mro__)
         function, instance = (user_object.__call__ if has_call else None), (user_object,)
     if not callable(function):
-        raise ValueError(f"{name!r} is not callable; name a function")
+        raise _Problem(f"{name!r} is not callable", cure="name a function")
     arguments = get_args(cls)[0] if get_args(cls) else ...
     if arguments is not ...:
         check_arguments(function, name, (*instance, *arguments))
@@ -239,10 +242,10 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
     if len(records) == 1 and "kind" not in value:
         return _converter().structure(value, next(iter(records.values())))
     if "kind" not in value:
-        raise ValueError(f"has no kind; use one of {', '.join(records)}")
+        raise _Problem("has no kind", cure=f"use one of {', '.join(records)}")
     kind = str(value["kind"])
     if kind not in records:
-        raise ValueError(f"unknown kind {kind!r}; {did_you_mean(kind, list(records))}")
+        raise _Problem(f"unknown kind {kind!r}", cure=did_you_mean(kind, list(records)))
     if "kind" not in {field.name for field in dataclasses.fields(records[kind])}:
         del value["kind"]
     return _converter().structure(value, records[kind])
@@ -335,12 +338,12 @@ def _converter() -> cattrs.Converter:
     return converter
 
 
-def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
-    """Return the first problem inside a cattrs error and its dotted path."""
+def _first_problem(error: BaseException, path: str) -> _Problem:
+    """Return the first problem inside a cattrs error, with its dotted path below ``path``."""
     if isinstance(error, ForbiddenExtraKeysError):
         names = [field.name for field in dataclasses.fields(error.cl)]
         name = min(error.extra_fields)
-        return f"unknown setting; {did_you_mean(name, names)}", _join(path, name)
+        return _Problem("unknown setting", _join(path, name), did_you_mean(name, names))
     if isinstance(error, ClassValidationError | IterableValidationError):
         inner_errors, own_errors = error.group_exceptions()
         if inner_errors:
@@ -350,18 +353,19 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
             return _first_problem(inner, inner_path)
         return _first_problem(own_errors[0], path)
     if isinstance(error, _Problem):
-        return error.problem, path + error.path if error.path.startswith("[") else _join(path, error.path)
+        return _Problem(error.problem, _join(path, error.path), error.cure)
     if isinstance(error, KeyError):
-        return f"the setting {error.args[0]!r} is missing", path
+        return _Problem(f"the setting {error.args[0]!r} is missing", path)
     if isinstance(error, TypeError) and "missing" in str(error):  # "Cls.__init__() missing 1 required ..."
-        return str(error).split(") ")[-1], path
+        return _Problem(str(error).split(") ")[-1], path)
     if isinstance(error, DrivaxError):
-        return error.problem + (f"; {error.cure}" if error.cure else ""), path
-    return str(error) or type(error).__name__, path
+        return _Problem(error.problem, path, error.cure)
+    return _Problem(str(error) or type(error).__name__, path)
 
 
 def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
+    """Return a dotted path; ``name`` may be empty, or a place in a list (``[0]``)."""
+    return f"{path}.{name}" if path and name and not name.startswith("[") else path + name
 
 
 def _to_plain(value: Any, annotation: Any) -> Any:

@@ -30,7 +30,7 @@ from drivax.simulator.types import Action, AgentContext, History, Motion
 #: Wheelbase as a share of the length, for steering angles of ``published``.
 _WHEELBASE = 0.6
 #: Largest number of levels of each component of :class:`Discrete`, and of steps of :class:`Trajectory`.
-MOST_LEVELS, MOST_STEPS = 255, 1000
+MOST_LEVELS, MOST_TRAJECTORY_STEPS = 255, 1000
 #: Tolerance of the bounds [-1, 1].
 _ROUNDING = 1e-4
 #: Lower bound of lengths in divisors, m: empty slots have length 0.
@@ -363,7 +363,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         if self.steps < 3:
             raise UsageError(f"a plan of {self.steps} steps is too short", cure="use steps: 3 or more")
-        check_at_most(self, MOST_STEPS, "steps")
+        check_at_most(self, MOST_TRAJECTORY_STEPS, "steps")
 
     @property
     def size(self) -> int:

@@ -14,6 +14,7 @@ import logging
 import math
 import os
 import re
+import resource
 import sys
 import threading
 import zlib
@@ -417,9 +418,11 @@ def _stored_type(leaf: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _check_size(path: Path, leaves: Iterable[Any]) -> int:
-    """Return the bytes of leaves; raise DataError if the memory of this machine cannot hold them."""
+    """Return the bytes of leaves; raise DataError if the memory of this machine or process cannot hold them."""
     size = sum(math.prod(shape) * dtype.itemsize for shape, dtype in map(_stored_type, leaves))
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = memory if limit == resource.RLIM_INFINITY else min(memory, limit)
     if size > memory:
         problem = f"states {format_bytes(size)} of arrays, more than the {format_bytes(memory)} of memory"
         raise DataError(problem, file=path, cure="use another checkpoint, or a machine with more memory")

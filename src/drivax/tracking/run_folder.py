@@ -15,7 +15,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -296,19 +296,23 @@ def policy_folder(name: str | Path) -> Path:
     return _ZOO_FOLDER / str(name).removeprefix(ZOO)
 
 
-def is_policy(name: str | Path) -> bool:
-    """Return whether a name is that of a trained policy: ``zoo:NAME``, or a folder other than ``module:name``."""
-    return str(name).startswith(ZOO) or (Path(name).is_dir() and not is_dotted(str(name)))
+def is_policy(name: str | Path, known: Container[str] = ()) -> bool:
+    """Return whether a name is that of a trained policy: ``zoo:NAME``, or a folder.
+
+    No folder shadows ``module:name``, or the ``known`` names of planners or traffic models.
+    """
+    is_name = str(name) in known or is_dotted(str(name))
+    return str(name).startswith(ZOO) or (Path(name).is_dir() and not is_name)
 
 
-def policy_training_sets(planner: str) -> list[dict[str, Any]]:
+def policy_training_sets(planner: str, known: Container[str] = ()) -> list[dict[str, Any]]:
     """Return the training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), including pretraining.
 
-    Other planners have none.
+    Other planners, among them the ``known`` ones, have none.
     """
     run = run_and_step(planner)[0]
     path = policy_folder(run)
-    info = RunFolder.open(path).info if is_policy(run) and (path / RUN_FILE).is_file() else {}
+    info = RunFolder.open(path).info if is_policy(run, known) and (path / RUN_FILE).is_file() else {}
     return training_sets(info) if info.get("kind") in ("training", "policy") else []
 
 

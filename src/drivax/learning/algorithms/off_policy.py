@@ -62,9 +62,9 @@ def q_logs(q: Array) -> dict[str, Array]:
     return {"mean_q": jnp.mean(q), "largest_q": jnp.max(jnp.abs(q))}
 
 
-def over_updates(logs: dict[str, Array]) -> dict[str, Array]:
+def reduce_over_updates(logs: dict[str, Array]) -> dict[str, Array]:
     """Return the logs ``loss/*`` of an iteration from those of its updates: means, and maxima of ``largest_*``."""
-    return {f"loss/{name}": (jnp.max if is_largest([name]) else jnp.mean)(x) for name, x in logs.items()}
+    return {f"loss/{name}": (jnp.max if is_largest(name) else jnp.mean)(x) for name, x in logs.items()}
 
 
 def squared_error(q: Array, target: Array) -> Float[Array, ""]:

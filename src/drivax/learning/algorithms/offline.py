@@ -17,7 +17,13 @@ from jaxtyping import Array, Float
 
 from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_at_most, check_shares
 from drivax.errors import UsageError
-from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, over_updates, squared_error
+from drivax.learning.algorithms.off_policy import (
+    Carry,
+    OffPolicy,
+    Trained,
+    reduce_over_updates,
+    squared_error,
+)
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
@@ -276,7 +282,7 @@ class Offline(OffPolicy[Config]):
         after = OfflineState(
             trained["policy"], _without_policy(trained), target, optimiser, key, state.iteration + 1
         )
-        return after, over_updates(logs) | data.sizes()
+        return after, reduce_over_updates(logs) | data.sizes()
 
     def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
         """Draw the steps for policy evaluation and those for policy improvement."""

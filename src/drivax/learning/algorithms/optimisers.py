@@ -55,11 +55,11 @@ def sum_gradients(
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
 
 
-def _combine(sums: Any, values: Any) -> Any:
-    """Return the sums of trees, and of logs ``largest_*`` the maxima."""
-    return jax.tree_util.tree_map_with_path(
-        lambda path, *pair: (jnp.maximum if is_largest(path[-1:]) else jnp.add)(*pair), sums, values
-    )
+def _combine(sums: tuple[dict[str, Array], Any], values: Any) -> tuple[dict[str, Array], Any]:
+    """Return the sums of logs and gradients, and of logs ``largest_*`` the maxima."""
+    logs, gradient = jax.tree.map(jnp.add, sums, values)
+    largest = {n: jnp.maximum(log, values[0][n]) for n, log in sums[0].items() if is_largest(n)}
+    return logs | largest, gradient
 
 
 def add_auxiliary(

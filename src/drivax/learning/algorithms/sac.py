@@ -55,7 +55,7 @@ from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
 #: Largest number of steps of n-step returns.
-MOST_STEPS = 1000
+MOST_RETURN_STEPS = 1000
 #: Steps of the replay buffer, and logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 
@@ -111,7 +111,7 @@ class SacConfig:
         check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
         check_at_most(self, MOST_SAMPLES, "environments", "unroll", "updates_per_step", "batch")
         check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
-        check_at_most(self, MOST_STEPS, "steps")
+        check_at_most(self, MOST_RETURN_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")
@@ -334,7 +334,7 @@ class Sac(OffPolicy[SacConfig]):
         def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             share = len(samples[0].reward) / count
             loss, logs = self.loss(trained, target, *samples)
-            return share * loss, {n: x if is_largest([n]) else share * x for n, x in logs.items()}
+            return share * loss, {n: x if is_largest(n) else share * x for n, x in logs.items()}
 
         samples = (transitions, jax.random.split(key, (count, 2)))
         samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
@@ -375,7 +375,7 @@ def _sums(logs: dict[str, Array]) -> dict[str, Array]:
     """Return the logs of an iteration with counts: sums over updates, and maxima of ``largest_*``."""
     sums: dict[str, Array] = {}
     for name, values in logs.items():
-        largest = is_largest([name])
+        largest = is_largest(name)
         sums[f"loss/{name}"] = values.max() if largest else values.sum()
         sums[f"loss/{name}/n"] = jnp.asarray(1.0 if largest else float(len(values)))
     return sums
