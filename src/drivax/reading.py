@@ -13,9 +13,9 @@ import threading
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from drivax.escaping import csv_rows
 from drivax.files import format_bytes
 
 Array = np.ndarray[Any, Any]
+#: Shape and dtype.
+ArrayType = tuple[tuple[int, ...], np.dtype[Any]]
 
 #: Errors by which libraries report bytes that they cannot read. RuntimeError includes RecursionError (deep nesting) and
 #: NotImplementedError, and is what ``zipfile`` raises for encrypted members.
@@ -174,8 +176,12 @@ def _check_length(length: int) -> None:
         raise ValueError(f"a row of more than {MOST_LINE:,} characters")
 
 
-def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
+def read_arrays(
+    file: Path, cure: str, most: int, check: Callable[[Mapping[str, ArrayType]], None] | None = None
+) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name; checksums are tested, objects are refused.
+
+    ``check`` gets the shapes and types of all arrays by name before any is unpacked.
 
     Raises:
         DataError: It is missing or damaged, or it or its content has more than ``most`` bytes.
@@ -190,8 +196,16 @@ def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
             raise ValueError("a name occurs twice")
         if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
             raise ValueError("compressed by another method than deflate")
+        if check is not None:
+            check(dict(zip(names, (_read_type(archive, member) for member in members), strict=True)))
         arrays = (parse_array(_unpack(archive, member)) for member in members)
         return dict(zip(names, arrays, strict=True))
+
+
+def _read_type(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayType:
+    with archive.open(member) as file:
+        shape, _, dtype = read_array_header(file)
+    return shape, dtype
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
@@ -219,7 +233,7 @@ def parse_array(data: bytes) -> Array:
     return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
-def read_array_header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file, up to the first byte of data.
 
     Raises:

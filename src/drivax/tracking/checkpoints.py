@@ -27,7 +27,7 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, format_bytes, inside, remove, replace_folder, sync_folder, write_text
-from drivax.reading import check_regular, explain_damage, read_arrays, read_json
+from drivax.reading import ArrayType, check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
 ABOUT = "about.json"
@@ -280,11 +280,14 @@ def unpack(file: Path, template: State) -> State:
     requested_leaves = _named_leaves(template)
     # Every array has a header and an entry in the archive's directory.
     most = _check_size(file, [leaf for _, leaf in requested_leaves]) + 4096 * (len(requested_leaves) + 1)
-    arrays = read_arrays(file, "use another copy", 2 * most)
-    stored_leaves = [
-        {"name": name, "type": str(array.dtype), "shape": array.shape} for name, array in arrays.items()
-    ]
-    _compare(file, stored_leaves, requested_leaves, _CURE)
+
+    def check(types: Mapping[str, ArrayType]) -> None:
+        stored_leaves = [
+            {"name": name, "type": str(dtype), "shape": shape} for name, (shape, dtype) in types.items()
+        ]
+        _compare(file, stored_leaves, requested_leaves, _CURE)
+
+    arrays = read_arrays(file, "use another copy", most, check)
     return jax.tree.unflatten(
         jax.tree.structure(template), [jnp.asarray(arrays[name]) for name, _ in requested_leaves]
     )
