@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -81,7 +81,8 @@ def check_regular(file: Path, cure: str) -> None:
             raise ValueError("not a regular file")
 
 
-def _check_size(file: Path, cure: str, most: int) -> None:
+def check_size(file: Path, cure: str, most: int) -> None:
+    """Raise a DataError if a file has more than ``most`` bytes."""
     if (size := file.stat().st_size) > most:
         problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
         raise DataError(problem, file=file, cure=cure)
@@ -95,7 +96,7 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """
     check_regular(file, cure)
     with explain_damage(file, cure):
-        _check_size(file, cure, most)
+        check_size(file, cure, most)
         return file.read_bytes()
 
 
@@ -143,7 +144,7 @@ def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
     """
     check_regular(file, cure)
     with explain_damage(file, cure, "cannot be read"):
-        _check_size(file, cure, most)
+        check_size(file, cure, most)
         with file.open(encoding="utf-8", newline="") as stream:
             while line := stream.readline(MOST_LINE + 1):
                 _check_length(len(line))
@@ -204,7 +205,7 @@ def read_arrays(
 
 def _read_type(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayType:
     with archive.open(member) as file:
-        shape, _, dtype = read_array_header(file)
+        shape, _, dtype = read_array_header(cast(io.BufferedIOBase, file))
     return shape, dtype
 
 
@@ -233,7 +234,7 @@ def parse_array(data: bytes) -> Array:
     return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
-def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def read_array_header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file, up to the first byte of data.
 
     Raises:
