@@ -294,7 +294,10 @@ def test_table_of_too_many_cells_is_refused(tmp_path, monkeypatch):
     file.write_text(
         "\n".join([",".join((*KEYS, "a")), *(f"p,d,{number},s,0,log,1" for number in range(100))])
     )
-    with pytest.raises(DataError, match="record 42: the table has too many cells"):
+    with pytest.raises(DataError, match="record 33: the table has too many cells"):
+        _read_columns(file, 100)
+    file.write_text("\n".join([",".join(KEYS), *[",,,,,"] * 100]))
+    with pytest.raises(DataError, match="record 83: the table has too many cells"):
         _read_columns(file, 100)
 
 
