@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import json
 import lzma
 import math
 import struct
@@ -21,7 +20,7 @@ import numpy as np
 
 from drivax.errors import DataError, explain_system
 from drivax.escaping import csv_rows
-from drivax.files import format_bytes
+from drivax.files import format_bytes, parse_json
 
 Array = np.ndarray[Any, Any]
 #: Shape and dtype.
@@ -36,9 +35,6 @@ DAMAGE = (
 )  # fmt: skip
 #: Largest text file, in bytes: recordings and maps in JSON have 0.1 to 40 MB.
 MOST_TEXT = 64 << 20
-#: Most values of a JSON file: each takes up to 200 bytes of memory. In recordings, maps and manifests each has 10 to
-#: 30 bytes of text; the second number, bytes of text, is for manifests that are larger than ``MOST_TEXT``.
-MOST_VALUES, _LEAST_VALUE_BYTES = 4 << 20, 12
 #: Longest line of a text, and longest row of a table, in characters: those of drivax have up to 5,000. Cells of a table
 #: end at ``csv.field_size_limit`` (131,072).
 MOST_LINE = 1 << 20
@@ -120,19 +116,6 @@ def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
     data = read_bytes(file, cure, most)
     with explain_damage(file, cure, "is not valid JSON"):
         return parse_json(data)
-
-
-def parse_json(data: bytes) -> Any:
-    """Return the content of JSON text, whose values are counted first: ``[0],`` takes 30 times its bytes in memory.
-
-    Raises:
-        Exception: Of :data:`DAMAGE`.
-    """
-    # An upper bound: texts may contain these characters, too.
-    count, most = sum(map(data.count, (b",", b"[", b"{"))), max(MOST_VALUES, len(data) // _LEAST_VALUE_BYTES)
-    if count > most:
-        raise ValueError(f"{count:,} values, more than the {most:,} that are read")
-    return json.loads(data)
 
 
 def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:

@@ -54,7 +54,9 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
-        names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own(path))
+        names = (
+            path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own_folder(path)
+        )
         return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
     def best(self) -> int | None:
@@ -187,7 +189,7 @@ class Checkpoints:
         remove(hidden_folder)
 
 
-def _is_own(path: Path) -> bool:
+def _is_own_folder(path: Path) -> bool:
     """Return whether a path is a folder, not a link by which a stranger's run could write or delete anywhere."""
     return path.is_dir() and not path.is_symlink()
 
