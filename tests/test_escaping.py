@@ -25,12 +25,27 @@ def rows_of(text: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize(
-    "text", ["=1+1", "+cmd|' /C calc'!A0", "-1+1", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "'=1", "''@x"]
+    "text",
+    [
+        "=1+1",
+        "+cmd|' /C calc'!A0",
+        "-1+1",
+        "@SUM(A1)",
+        "\t=1",
+        "\r=1",
+        "\n=1",
+        "'=1",
+        "''@x",
+        " =1",
+        "\xa0 @x",
+        "＝1",
+        " －x",
+    ],
 )
 def test_formulas_become_text_and_are_read_back(text):
     written = csv_text([[text, "0.5"]])
     (cells,) = csv.reader(io.StringIO(written, newline=""))
-    blank, formula = (text[0], f"'{text[1:]}") if text[0].isspace() else ("", text)
+    blank, formula = (text[0], f"'{text[1:]}") if text[0] in "\t\r\n" else ("", text)
     assert cells == [f"'{blank}{formula}", "0.5"]
     assert rows_of(written) == [[text, "0.5"]]
 
@@ -48,25 +63,46 @@ def test_numbers_and_other_text_are_written_as_before(text):
 def test_any_cells_are_read_back_and_none_begins_a_formula():
     rng = random.Random(0)
     rows = [
-        ["".join(rng.choices("=+-@\t\r\n'\",;|0.e a\u00e9", k=rng.randrange(8))) for _ in range(5)]
+        [
+            "".join(rng.choices("=+-@\t\r\n'\",;|0.e a\u00e9\xa0＝＋－＠", k=rng.randrange(8)))
+            for _ in range(5)
+        ]
         for _ in range(2000)
     ]
     rows = [["key", *row] for row in rows]
     assert rows_of(csv_text(rows)) == rows
     for row in csv.reader(io.StringIO(csv_text(rows), newline="")):
         for cell in row:
-            if cell[:1] in tuple("=+-@\t\r\n"):
+            if cell[:1] in tuple("\t\r\n") or cell.lstrip(" \xa0")[:1] in tuple("=+-@＝＋－＠"):
                 float(cell)
 
 
-@pytest.mark.parametrize("text", [";=1+1", ",=1", "a|@b", "a\t-b", "a\n=1", ';"=1"', ";'=1", "a;;+1;=2"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        ";=1+1",
+        ",=1",
+        "a|@b",
+        "a\t-b",
+        "a\n=1",
+        ';"=1"',
+        ";'=1",
+        "a;;+1;=2",
+        "a; =1",
+        "a,\xa0@b",
+        "a;＋1",
+        'a;" =1"',
+    ],
+)
 def test_formulas_after_separators_become_text(text):
     """With other separators, spreadsheets split cells in which drivax sees no separator."""
     written = csv_text([["x", text]])
     assert rows_of(written) == [["x", text]]
     for separator in ";,|\t":
         for row in csv.reader(io.StringIO(written, newline=""), delimiter=separator):
-            assert all(cell[:1] not in tuple("=+-@") for cell in row if cell), row
+            assert all(
+                cell.lstrip(" \xa0")[:1] not in tuple("=+-@＝＋－＠") for cell in row if cell.strip()
+            ), row
 
 
 def test_names_cannot_control_a_terminal(capsys, tmp_path):

@@ -462,6 +462,9 @@ def alarm():
     signal.signal(signal.SIGALRM, former)
 
 
+LOADS = json.loads
+
+
 @pytest.mark.parametrize("kind", LITTER)
 @pytest.mark.parametrize(
     "name", ["", "lock", "identity.json", "progress", "progress/00000.json", "content", "old"]
@@ -487,6 +490,26 @@ def test_litter_under_hidden_names_is_replaced(tmp_path: Path, kind: str, name: 
             restore_folder(path)
             continue
         assert names(path.parent) == {"out"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("identity.json", '{"seed": 1}' + " " * (1 << 20)),
+        ("progress/00000.json", f"[{'[0],' * (3 << 20)}0]"),
+    ],
+)
+def test_large_identities_and_notes_of_many_values_start_again(
+    tmp_path: Path, monkeypatch, name: str, text: str
+):
+    root = started(tmp_path / "set", {"seed": 1}).root
+    (root / name).write_text(text)
+    monkeypatch.setattr(
+        json, "loads", lambda data: pytest.fail("parsed") if len(data) >= 1 << 20 else LOADS(data)
+    )
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == []
+    folder.close()
 
 
 def test_notes_after_the_intact_ones_are_removed(tmp_path: Path):

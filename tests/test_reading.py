@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import json
 import os
 import struct
 import tokenize
@@ -33,8 +34,10 @@ from drivax.reading import (
     read_lines,
     read_text,
 )
+from drivax.report.runs import _curves
 from drivax.settings import parse_yaml
-from drivax.tracking.sinks import read_rows
+from drivax.tracking.run_folder import RunFolder
+from drivax.tracking.sinks import JsonLines, read_rows
 
 
 def header(text: str) -> bytes:
@@ -160,10 +163,8 @@ def test_sizes_and_kinds_of_files_are_bounded(tmp_path):
         read_json(tmp_path / "c", "again")
 
 
-@pytest.mark.parametrize(
-    "read", [lambda file: list(read_rows(file)), lambda file: _read_columns(file, 9), city]
-)
-def test_logs_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
+@pytest.mark.parametrize("read", [lambda file: _read_columns(file, 9), city])
+def test_tables_and_maps_that_would_take_2_gb_are_refused(tmp_path, read):
     """Values take up to 27 times as much memory as their text."""
     file = tmp_path / "large"
     file.touch()
@@ -232,9 +233,34 @@ def test_log_takes_the_memory_of_one_line(tmp_path):
     file.write_text('{"step":0}\n' * 30_000 + '{"st')
     with memory_below(1 << 20):
         assert sum(1 for _ in read_rows(file)) == 30_000
+    with memory_below(1 << 20):
+        JsonLines(file, resume_step=0).close()
+    assert file.read_bytes() == b'{"step": 0}\n' * 30_000
     file.write_text("a" * (2 << 20))
     with memory_below(8 << 20), pytest.raises(DataError, match="more than 1,048,576 characters"):
         list(read_lines(file, "again"))
+
+
+def test_long_log_is_read_by_row(tmp_path):
+    run = RunFolder(tmp_path, {})
+    run.metrics.write_text('{"step":0}\n')
+    os.truncate(run.metrics, 75 << 20)  # sparse
+    assert next(run.metric_rows()) == {"step": 0}
+    with pytest.raises(
+        DataError, match=r"has 79 MB, more than the 67 MB that are read; use RunFolder.metric_rows"
+    ):
+        run.read_metrics()
+    os.truncate(run.metrics, 1 << 30)
+    with pytest.raises(DataError, match=r"has 1\.1 GB, more than the 537 MB that are read; train again"):
+        next(run.metric_rows())
+
+
+def test_log_of_too_many_quantities_is_refused(tmp_path):
+    """Names take more memory than their values."""
+    run = RunFolder(tmp_path, {})
+    run.metrics.write_text(json.dumps({"step": 7, **{f"x{number}": 0 for number in range(10_001)}}))
+    with pytest.raises(DataError, match=r"metrics\.jsonl: record 7: has more than 10,000 quantities"):
+        _curves(run)
 
 
 @pytest.mark.parametrize("value", ["[0],", '{"a":0},', "0,"])
@@ -268,7 +294,10 @@ def test_table_of_too_many_cells_is_refused(tmp_path, monkeypatch):
     file.write_text(
         "\n".join([",".join((*KEYS, "a")), *(f"p,d,{number},s,0,log,1" for number in range(100))])
     )
-    with pytest.raises(DataError, match="record 42: the table has too many cells"):
+    with pytest.raises(DataError, match="record 33: the table has too many cells"):
+        _read_columns(file, 100)
+    file.write_text("\n".join([",".join(KEYS), *[",,,,,"] * 100]))
+    with pytest.raises(DataError, match="record 83: the table has too many cells"):
         _read_columns(file, 100)
 
 

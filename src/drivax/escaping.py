@@ -7,10 +7,12 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-#: Begins a formula in spreadsheets, or hides the character that does; numbers are safe.
-_FORMULA = r"(?=[=+\-@\t\r\n])(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
+#: What begins a formula in spreadsheets, in full width, too, and blanks before it, which some remove.
+_BEGIN, _BLANKS = r"[=+\-@\uff1d\uff0b\uff0d\uff20]", r"[ \xa0]*"
+#: Begins a formula, or hides the character that does; numbers are safe.
+_FORMULA = rf"(?=[\t\r\n]|{_BLANKS}{_BEGIN})(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
 #: Where a spreadsheet may begin a cell: at the beginning, and after what separates cells in some country or program.
-_AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", r"\"*[=+\-@]"
+_AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", rf"[\" \xa0]*{_BEGIN}"
 _ACTIVE = re.compile(rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})")
 _NEUTRAL = re.compile(rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})")
 _QUOTED = re.compile(r'[,"\r\n]')

@@ -40,8 +40,11 @@ _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errn
 _FILES = ("identity.json", "lock")
 #: What a later process needs to resume a partial folder.
 _RESUMABLE = ("content", "progress", *_FILES)
-#: Largest note that is read, in bytes.
-_MOST_NOTE = 64 << 20
+#: Largest identity and largest note that are read, in bytes.
+_MOST_IDENTITY, _MOST_NOTE = 1 << 20, 64 << 20
+#: Most values of a JSON text: each takes up to 200 bytes of memory. In recordings, maps and manifests each has 10 to
+#: 30 bytes of text; texts of more than 48 MiB, such as the manifests of large sets, may have one for 12 bytes.
+MOST_VALUES, _LEAST_VALUE_BYTES = 4 << 20, 12
 #: Files that a process opens besides those of its data.
 _OTHER_FILES = 128
 
@@ -157,7 +160,7 @@ def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)
-    if _is_own(partial, folder=True):  # of a folder of this name, which another process may write or resume
+    if _has_kind(partial, folder=True):  # of a folder of this name, which another process may write or resume
         folder = PartialFolder(target)
         folder.open()
         folder.close()
@@ -313,7 +316,7 @@ class PartialFolder:
             self._old.rename(self._target)
 
     def _read_notes(self, restart: bool) -> list[dict[str, Any]]:
-        identity = _read_json(self.root / "identity.json")
+        identity = _read_json(self.root / "identity.json", _MOST_IDENTITY)
         if isinstance(identity, dict) and identity != self.identity and not restart and can_resume(self.path):
             own = self.identity or {}
             names = ", ".join(name for name in own if identity.get(name) != own[name]) or "command"
@@ -322,7 +325,7 @@ class PartialFolder:
             raise UsageError(problem, file=self.path, cure=cure)
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
-            note = _read_json(self.root / "progress" / _note_name(len(notes)))
+            note = _read_json(self.root / "progress" / _note_name(len(notes)), _MOST_NOTE)
             if not isinstance(note, dict) or _digest(note.get("value")) != note.get("sha256"):
                 break
             notes.append(note["value"])
@@ -383,13 +386,13 @@ def _follow(path: Path) -> Path:
 
 def remove(path: Path) -> None:
     """Remove whatever has a name: a folder with its content, or a file; of a symbolic link, the link."""
-    if _is_own(path, folder=True):
+    if _has_kind(path, folder=True):
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
 
 
-def _is_own(path: Path, folder: bool) -> bool:
+def _has_kind(path: Path, folder: bool) -> bool:
     """Return whether a path is a folder or regular file itself, not a pipe or a link, which may lead anywhere."""
     try:
         mode = path.lstat().st_mode
@@ -400,7 +403,7 @@ def _is_own(path: Path, folder: bool) -> bool:
 
 def _remove_foreign(path: Path, folder: bool) -> None:
     """Remove what has a hidden name but is not of the kind, folder or file, that drivax creates there."""
-    if not _is_own(path, folder):
+    if not _has_kind(path, folder):
         remove(path)
 
 
@@ -456,11 +459,25 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def _read_json(path: Path) -> Any:
-    """Return the JSON value of a note; None if drivax did not write it."""
+def parse_json(data: bytes) -> Any:
+    """Return the content of JSON text, whose values are counted first: ``[0],`` takes 30 times its bytes in memory.
+
+    Raises:
+        ValueError: It is not JSON, or has too many values.
+        RecursionError: It is nested too deeply.
+    """
+    # An upper bound: texts may contain these characters, too.
+    count, most = sum(map(data.count, (b",", b"[", b"{"))), max(MOST_VALUES, len(data) // _LEAST_VALUE_BYTES)
+    if count > most:
+        raise ValueError(f"{count:,} values, more than the {most:,} that are read")
+    return json.loads(data)
+
+
+def _read_json(path: Path, most: int) -> Any:
+    """Return the JSON value of a note of at most ``most`` bytes; None if drivax did not write it."""
     try:
-        if _is_own(path, folder=False) and path.stat().st_size <= _MOST_NOTE:
-            return json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
+        if _has_kind(path, folder=False) and path.stat().st_size <= most:
+            return parse_json(path.read_bytes())
+    except (ValueError, RecursionError, MemoryError):
         pass
     return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import json
 import lzma
 import math
 import struct
@@ -13,17 +12,19 @@ import threading
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from drivax.errors import DataError, explain_system
 from drivax.escaping import csv_rows
-from drivax.files import format_bytes
+from drivax.files import format_bytes, parse_json
 
 Array = np.ndarray[Any, Any]
+#: Shape and dtype.
+ArrayType = tuple[tuple[int, ...], np.dtype[Any]]
 
 #: Errors by which libraries report bytes that they cannot read. RuntimeError includes RecursionError (deep nesting) and
 #: NotImplementedError, and is what ``zipfile`` raises for encrypted members.
@@ -34,9 +35,6 @@ DAMAGE = (
 )  # fmt: skip
 #: Largest text file, in bytes: recordings and maps in JSON have 0.1 to 40 MB.
 MOST_TEXT = 64 << 20
-#: Most values of a JSON file: each takes up to 200 bytes of memory. In recordings, maps and manifests each has 10 to
-#: 30 bytes of text; the second number, bytes of text, is for manifests that are larger than ``MOST_TEXT``.
-MOST_VALUES, _LEAST_VALUE_BYTES = 4 << 20, 12
 #: Longest line of a text, and longest row of a table, in characters: those of drivax have up to 5,000. Cells of a table
 #: end at ``csv.field_size_limit`` (131,072).
 MOST_LINE = 1 << 20
@@ -79,7 +77,8 @@ def check_regular(file: Path, cure: str) -> None:
             raise ValueError("not a regular file")
 
 
-def _check_size(file: Path, cure: str, most: int) -> None:
+def check_size(file: Path, cure: str, most: int) -> None:
+    """Raise a DataError if a file has more than ``most`` bytes."""
     if (size := file.stat().st_size) > most:
         problem = f"has {format_bytes(size)}, more than the {format_bytes(most)} that are read"
         raise DataError(problem, file=file, cure=cure)
@@ -93,7 +92,7 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """
     check_regular(file, cure)
     with explain_damage(file, cure):
-        _check_size(file, cure, most)
+        check_size(file, cure, most)
         return file.read_bytes()
 
 
@@ -119,19 +118,6 @@ def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
         return parse_json(data)
 
 
-def parse_json(data: bytes) -> Any:
-    """Return the content of JSON text, whose values are counted first: ``[0],`` takes 30 times its bytes in memory.
-
-    Raises:
-        Exception: Of :data:`DAMAGE`.
-    """
-    # An upper bound: texts may contain these characters, too.
-    count, most = sum(map(data.count, (b",", b"[", b"{"))), max(MOST_VALUES, len(data) // _LEAST_VALUE_BYTES)
-    if count > most:
-        raise ValueError(f"{count:,} values, more than the {most:,} that are read")
-    return json.loads(data)
-
-
 def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
     """Yield the lines of a UTF-8 file with their ends, of which one at a time is in memory.
 
@@ -141,7 +127,7 @@ def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
     """
     check_regular(file, cure)
     with explain_damage(file, cure, "cannot be read"):
-        _check_size(file, cure, most)
+        check_size(file, cure, most)
         with file.open(encoding="utf-8", newline="") as stream:
             while line := stream.readline(MOST_LINE + 1):
                 _check_length(len(line))
@@ -174,8 +160,12 @@ def _check_length(length: int) -> None:
         raise ValueError(f"a row of more than {MOST_LINE:,} characters")
 
 
-def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
+def read_arrays(
+    file: Path, cure: str, most: int, check: Callable[[Mapping[str, ArrayType]], None] | None = None
+) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name; checksums are tested, objects are refused.
+
+    ``check`` gets the shapes and types of all arrays by name before any is unpacked.
 
     Raises:
         DataError: It is missing or damaged, or it or its content has more than ``most`` bytes.
@@ -190,8 +180,16 @@ def read_arrays(file: Path, cure: str, most: int) -> dict[str, Array]:
             raise ValueError("a name occurs twice")
         if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
             raise ValueError("compressed by another method than deflate")
+        if check is not None:
+            check(dict(zip(names, (_read_type(archive, member) for member in members), strict=True)))
         arrays = (parse_array(_unpack(archive, member)) for member in members)
         return dict(zip(names, arrays, strict=True))
+
+
+def _read_type(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayType:
+    with archive.open(member) as file:
+        shape, _, dtype = read_array_header(cast(io.BufferedIOBase, file))
+    return shape, dtype
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:

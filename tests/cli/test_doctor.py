@@ -171,7 +171,26 @@ def test_scenario_sets_are_referred_to_inspect(tmp_path, capsys):
     manifest.write_text(manifest.read_text().replace("shard.tfrecord", "other.tfrecord") + " ")
     assert "manifest.json: changed since drivax wrote it" in asked(tmp_path / "set", capsys)[1]
     (tmp_path / "set" / "seal.json").unlink()
-    assert "seal.json: is missing, as in folders of earlier versions" in asked(tmp_path / "set", capsys)[1]
+    out = asked(tmp_path / "set", capsys)[1]
+    assert "seal.json: is missing" in out and "earlier versions" not in out
+    content = json.loads(manifest.read_text())
+    for shard in content["shards"]:
+        del shard["crc_sha256"]
+    manifest.write_text(json.dumps(content))
+    diagnosis = diagnose(tmp_path / "set")
+    assert (
+        len(diagnosis.problems) == 1
+        and "no seal.json, as in folders of earlier versions" in diagnosis.notes[0]
+    )
+    assert "note" in asked(tmp_path / "set", capsys)[1]
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+def test_seal_of_a_run_is_a_problem_only_if_it_was_lost(tmp_path, sealed):
+    (tmp_path / "run.json").write_text(json.dumps({"sealed": sealed}))
+    diagnosis = diagnose(tmp_path)
+    assert [problem.file.name for problem in diagnosis.problems[1:]] == ["seal.json"] * sealed
+    assert len(diagnosis.notes) == (not sealed)
 
 
 @pytest.mark.parametrize(

@@ -205,6 +205,10 @@ def test_edited_tables_need_permission_and_are_noted(data, table, tmp_path):
     np.savez(file, allow_pickle=False, **arrays | {"header": np.array(json.dumps(header))})
     with pytest.raises(DataError, match="edited is not a list"):
         read_scores(file, data)
+    header["edited"] = ["a" * (1 << 20)]
+    np.savez(file, allow_pickle=False, **arrays | {"header": np.array(json.dumps(header))})
+    with pytest.raises(DataError, match=r"a header of 1,0\d\d,\d\d\d characters"):
+        read_scores(file, data)
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.1, 1.1])

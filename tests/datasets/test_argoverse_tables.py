@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from drivax.datasets.argoverse import unpacked
+from drivax.datasets.argoverse import unpacked_size
 from drivax.datasets.argoverse.tables import Kind, read_table
 from drivax.errors import DataError
 
@@ -122,9 +122,39 @@ def test_small_files_that_become_large_are_refused(tmp_path, form, options, word
 def test_rows_and_bytes_are_counted_before_they_are_read(tmp_path, monkeypatch, form, limit, words):
     table = pa.table({"x": np.arange(8.0), "name": list("abcdefgh")})
     path = write(tmp_path / form, table, **FORMATS[form])
-    monkeypatch.setattr(unpacked, limit, 7)
+    monkeypatch.setattr(unpacked_size, limit, 7)
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *_, **__: pytest.fail("read"))
     with pytest.raises(DataError, match=words):
+        read_table(path, COLUMNS)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_pages_and_messages_are_counted(tmp_path, monkeypatch, form):
+    path = write(tmp_path / form, pa.table({"x": np.zeros(8), "name": list("abcdefgh")}), **FORMATS[form])
+    monkeypatch.setattr(unpacked_size, "_MOST_PARTS", 1)
+    with pytest.raises(DataError, match="more than 1 pages or messages"):
+        read_table(path, COLUMNS)
+
+
+def test_headers_of_pages_take_room(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.parquet", pa.table({"x": np.zeros(8), "name": list("abcdefgh")}))
+    group = pq.read_metadata(path).row_group(0)
+    with_headers = sum(group.column(number).total_uncompressed_size for number in range(2))
+    monkeypatch.setattr(unpacked_size, "MOST_BYTES", with_headers)
+    read_table(path, COLUMNS)
+    monkeypatch.setattr(unpacked_size, "MOST_BYTES", with_headers - 1)
+    with pytest.raises(DataError, match="unpacks to more than"):
+        read_table(path, COLUMNS)
+
+
+def test_row_groups_that_share_pages_are_refused(tmp_path):
+    path = write(tmp_path / "a.parquet", pa.table({"x": np.zeros(3), "name": list("abc")}))
+    metadata = pq.read_metadata(path)
+    metadata.append_row_groups(pq.read_metadata(path))
+    metadata.write_metadata_file(tmp_path / "footer")
+    path.write_bytes(path.read_bytes() + (tmp_path / "footer").read_bytes())
+    assert pq.read_table(path).num_rows == 6
+    with pytest.raises(DataError, match="columns that overlap"):
         read_table(path, COLUMNS)
 
 

@@ -315,6 +315,9 @@ def test_tables_of_too_many_or_too_long_rows_are_refused(tmp_path, monkeypatch):
     path.write_text(json.dumps([{"a": "b" * (3 << 20)}]))
     with pytest.raises(DataError, match="damaged after 0 rows"):
         list(rows(path))
+    path.write_text(json.dumps([{"a": "b" * 1_050_000}]))  # in a chunk of 1 MiB and the next one
+    with pytest.raises(DataError, match=r"damaged after 0 rows \(a row of more than 1,048,576 characters"):
+        list(rows(path))
     path.write_text("[" + '{"a": 0},' * 101)
     monkeypatch.setattr(nuscenes_reader, "_MOST_ROWS", 100)
     with pytest.raises(DataError, match="more than 100 rows"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -448,6 +449,14 @@ def test_sparse_shards_do_not_allow_a_manifest_of_any_size(scenario_set: Path):
             file.truncate(size)
     with pytest.raises(DataError, match=r"manifest\.json: has 2\.2 TB, more than the 67 MB that are read"):
         ScenarioSet.open(scenario_set)
+
+
+@pytest.mark.parametrize(("blocks", "size"), [(0, 5000), (1, 0)])
+def test_manifest_on_disks_that_state_no_blocks(blocks: int, size: int):
+    manifest, shard = (
+        os.stat_result((0,) * 6 + (5000,) + (0,) * 3, {"st_blocks": number}) for number in (blocks, 0)
+    )
+    assert store._size_on_disk(manifest, [shard]) == size
 
 
 def exchange(first: Path, second: Path) -> None:

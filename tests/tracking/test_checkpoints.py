@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import tensorstore
 
+from drivax import reading
 from drivax.errors import DataError
 from drivax.tracking.checkpoints import Checkpoints, is_part, pack, unpack
 
@@ -448,6 +449,23 @@ def test_a_packed_tree_that_does_not_fit_is_reported_by_leaf(tmp_path: Path, tem
     pack(tmp_path / "tree.npz", {"w": jnp.zeros(2)})
     with pytest.raises(DataError, match=words):
         unpack(tmp_path / "tree.npz", template)
+
+
+@pytest.mark.parametrize("arrays", [{"['v']": np.zeros(2, np.float32)}, {"['w']": np.zeros(3, np.float32)}])
+def test_unknown_arrays_are_refused_before_any_is_unpacked(tmp_path: Path, monkeypatch: Any, arrays: Any):
+    np.savez_compressed(tmp_path / "tree.npz", **({"['w']": np.zeros(2, np.float32)} | arrays))
+    monkeypatch.setattr(reading, "_unpack", lambda *_: pytest.fail("unpacked"))
+    with pytest.raises(
+        DataError, match=r"contains \['v'\], which the template lacks|\['w'\] is float32\[3\]"
+    ):
+        unpack(tmp_path / "tree.npz", {"w": jnp.zeros(2)})
+
+
+def test_packed_tree_takes_no_more_than_its_template(tmp_path: Path):
+    """Headers and names of an archive have little room next to the arrays."""
+    np.savez_compressed(tmp_path / "tree.npz", **{"['w']": np.zeros(1_900_000, np.float32)})
+    with pytest.raises(DataError, match=r"unpacks to 7.6 MB, more than the 4.0 MB expected"):
+        unpack(tmp_path / "tree.npz", {"w": jnp.zeros(1_000_000)})
 
 
 def test_a_damaged_packed_tree_is_reported(tmp_path: Path):

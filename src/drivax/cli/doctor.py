@@ -140,6 +140,7 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         if others:
             yield "other files", ", ".join(others)
         yield "input", format_bytes(diagnosis.input_bytes)
+    yield from (("note", note) for note in diagnosis.notes)
     for problem in diagnosis.problems:
         # The path is printed above; name only files inside it.
         file = None if problem.file == diagnosis.path else problem.file

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.files import atomic_write, check_output
-from drivax.reading import explain_damage, read_arrays
+from drivax.reading import explain_damage, parse_json, read_arrays
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files, note_edited, refuse_edited
 
@@ -125,6 +125,8 @@ _RERUN = "run `drivax curate` again"
 _COMPONENT = "component_"
 #: Largest table: bytes beyond its columns (ids, header), and columns of float32 per step.
 _MOST_BYTES, _MOST_COLUMNS = 64 << 20, 64
+#: Longest header, in characters; most have less than a thousand.
+_MOST_HEADER = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,9 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         raise DataError("score table not found", file=file, cure=cure)
     arrays = read_arrays(file, _RERUN, _MOST_BYTES + len(data) * _MOST_COLUMNS * data.capacity.steps * 4)
     with explain_damage(file, _RERUN, "not a score table, or damaged"):
-        header = json.loads(str(arrays.pop("header")[()]))
+        if (size := arrays["header"].nbytes) > 4 * _MOST_HEADER:  # of 4 bytes per character
+            raise ValueError(f"a header of {size // 4:,} characters")
+        header = parse_json(str(arrays.pop("header")[()]).encode())
         _check_source(header["version"], header["set_hash"], file, data)
         digest = _digest(header, arrays)
         ids = tuple(str(name) for name in arrays.pop("scenario_id"))

@@ -16,10 +16,11 @@ from drivax.datasets.formats import AUTO, Survey, find_reader, survey
 from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with_steps
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, format_bytes, free_bytes
+from drivax.reading import read_json
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
-from drivax.scenario.store import MANIFEST
-from drivax.seal import SEAL, check_seal
+from drivax.scenario.store import MANIFEST, read_manifest
+from drivax.seal import SEAL, check_seal, require_entries
 
 #: Most files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
@@ -29,6 +30,7 @@ _COUNT_FILES = 48
 _MOST_NAMES = 10
 #: Most notes and flavours that are listed for several files of one kind, and runs of missing shards for a family.
 _NOTES, _FLAVOURS, _RUNS = 6, 3, 8
+_NO_SEAL = f"no {SEAL}, as in folders of earlier versions: changes of files that decide results are not found"
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 
@@ -60,6 +62,7 @@ class Diagnosis:
         scenarios: Estimated number of scenarios after conversion; ``set_bytes`` is their size.
         free_bytes: Free space on the disk of ``path``.
         shards: One sentence per family of numbered shards.
+        notes: What else is to know about the folder.
         problems: What is wrong, and what to do about it: the folder, files of unknown format, damaged files.
         convertible: Whether ``drivax convert`` can convert some of it.
     """
@@ -74,6 +77,7 @@ class Diagnosis:
     set_bytes: int = 0
     free_bytes: int = 0
     shards: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     problems: tuple[BadRecord, ...] = ()
     convertible: bool = False
 
@@ -87,7 +91,9 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
     if path.is_dir() and (error := unsupported.explain_own(path)) is not None:
-        return Diagnosis(path, problems=(BadRecord.of(error, path), *_seal_problems(path)))
+        problems = (BadRecord.of(error, path), *_seal_problems(path))
+        notes = () if len(problems) > 1 or (path / SEAL).exists() else (_NO_SEAL,)
+        return Diagnosis(path, notes=notes, problems=problems)
     data = attempt(survey, path, format, file=path)
     if isinstance(data, BadRecord):
         return Diagnosis(path, problems=(data,))
@@ -112,16 +118,19 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 
 def _seal_problems(folder: Path) -> Iterator[BadRecord]:
-    """Yield what is wrong with the seal of a scenario set or run folder."""
-    if not (folder / SEAL).exists():
-        problem = "is missing, as in folders of earlier versions: changes of files that decide results are not found"
-        yield BadRecord(
-            folder / SEAL, None, problem, "copy the whole folder again, or run the command that wrote it"
-        )
-        return
-    for file in (folder / MANIFEST, folder / "run.json"):
-        if (problem := attempt(check_seal, file, file=file)) is not None:
+    """Yield what is wrong with the seal of a scenario set or run folder; earlier versions wrote none."""
+    for name, read in ((MANIFEST, read_manifest), ("run.json", _check_run)):
+        file = folder / name
+        if file.exists() and isinstance(problem := attempt(read, folder, file=file), BadRecord):
             yield problem
+
+
+def _check_run(folder: Path) -> None:
+    """Check the seal of a run folder as ``RunFolder.open`` does, which imports JAX."""
+    check_seal(folder / "run.json")
+    info = read_json(folder / "run.json", "run the command again")
+    if isinstance(info, dict) and info.get("sealed"):
+        require_entries(folder, "config.yaml")
 
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:

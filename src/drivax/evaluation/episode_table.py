@@ -49,8 +49,8 @@ _RERUN = "run drivax evaluate again"
 _FILES = ("episodes.csv", "summary.json", "crashes.json", "trajectories.npz")
 #: Largest table: bytes per row (most rows have 300), and in all.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
-#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one have 80 million. A
-#: distinct text counts as the second number of cells.
+#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one count as up to 126
+#: million. A cell of a key counts as two (in a list, then in a tuple), a distinct text as the second number of cells.
 _MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
 #: Largest trajectories: bytes in addition to the episodes, and bytes per episode (more than any capacity takes).
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
@@ -332,7 +332,7 @@ def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]
     for number, row in enumerate(rows, start=1):
         if len(row) != len(header):
             raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_RERUN)
-        if number * len(header) + _TEXT_CELLS * len(texts) > _MOST_CELLS:
+        if number * (len(header) + len(KEYS)) + _TEXT_CELLS * len(texts) > _MOST_CELLS:
             raise DataError("the table has too many cells", file=path, record=number, cure=_RERUN)
         for name, cell in zip(header, row, strict=True):
             if name in keys:

@@ -224,7 +224,7 @@ class TrainingLog:
 
     def _read_ranks(self, step: int) -> None:
         """Read the ranks of the validations up to a step."""
-        ranks = (rank(self._rule, row) for row in self.folder.read_metrics() if row["step"] <= step)
+        ranks = (rank(self._rule, row) for row in self.folder.metric_rows() if row["step"] <= step)
         self._ranks = [values for values in ranks if values is not None]
 
     def write(self, step: int, row: Mapping[str, float]) -> tuple[float, ...] | None:

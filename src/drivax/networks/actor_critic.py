@@ -40,8 +40,8 @@ from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, Wayform
 #: the observation is.
 _POLICY_GAIN, _VALUE_GAIN = 0.01, 1.0
 
-#: Largest number of parameters of a network: 1 GiB. The largest preset has 0.7 million.
-MOST_PARAMETERS = 1 << 28
+#: Largest number of parameters of a network: 128 MiB. The largest preset has 0.7 million.
+MOST_PARAMETERS = 1 << 25
 
 #: Built-in encoders by ``kind``, or a configuration of your own.
 EncoderSettings = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from drivax.seal import edited_files, mark_edited
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
 Array = np.ndarray[Any, Any]
+#: Most curves of a training; those of the presets have up to a hundred.
+_MOST_CURVES = 10_000
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,12 @@ def _unique_name(name: str, path: Path, namesakes: dict[str, list[Path]]) -> str
 
 def _curves(run: RunFolder) -> dict[str, Array]:
     """Return the finite logged values of each quantity as points (environment steps, value)."""
-    points: dict[str, list[tuple[float, float]]] = {}
-    for row in run.read_metrics():
+    points: dict[str, array[float]] = {}
+    for row in run.metric_rows():
         for name, value in row.items():
             if name not in ("step", "time_s") and isinstance(value, int | float) and math.isfinite(value):
-                points.setdefault(name, []).append((float(row["step"]), float(value)))
-    return {name: np.array(values) for name, values in points.items()}
+                points.setdefault(name, array("d")).extend((float(row["step"]), float(value)))
+        if len(points) > _MOST_CURVES:
+            problem = f"has more than {_MOST_CURVES:,} quantities"
+            raise DataError(problem, file=run.metrics, record=row["step"], cure="train again")
+    return {name: np.frombuffer(values).reshape(-1, 2) for name, values in points.items()}

@@ -19,6 +19,7 @@ import contextlib
 import dataclasses
 import hashlib
 import math
+import os
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -513,8 +514,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
         raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
     check_seal(file)
-    # A manifest is shorter than the records that it lists, of which those of a sparse file take no space.
-    most = sum(shard.stat().st_blocks * 512 for shard in path.glob("shard-*.npy") if shard.is_file())
+    # A manifest is shorter than the records that it lists.
+    most = _size_on_disk(file.stat(), [shard.stat() for shard in path.glob("shard-*.npy") if shard.is_file()])
     text = read_bytes(file, AGAIN, min(max(MOST_TEXT, most), _MOST_MANIFEST))
     with explain_damage(file, AGAIN, "manifest is damaged"):
         manifest = parse_json(text)
@@ -529,6 +530,12 @@ def read_manifest(path: Path) -> dict[str, Any]:
     if is_sealed:  # Sets of earlier versions have neither these digests nor a seal.
         require_entries(path, MANIFEST)
     return manifest
+
+
+def _size_on_disk(manifest: os.stat_result, shards: Sequence[os.stat_result]) -> int:
+    """Return the bytes that shards take on the disk: those of a sparse file take no space."""
+    # Some network disks state no blocks, not even for the manifest.
+    return sum(shard.st_blocks * 512 if manifest.st_blocks else shard.st_size for shard in shards)
 
 
 def _check_manifest(manifest: dict[str, Any], file: Path) -> None:

@@ -361,12 +361,13 @@ def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
 def _best_step(job: Job) -> int:
     """Return the step of the validation at which ``checkpoints_by`` is largest."""
     metric, run = job.study.definition.checkpoints_by, RunFolder(job.study.run(job.arm, job.seed), {})
-    rows = [row for row in run.read_metrics() if _PROGRESS in row and row.get(metric) is not None]
-    if not rows:
+    rows = (row for row in run.metric_rows() if _PROGRESS in row and row.get(metric) is not None)
+    best = max(rows, key=lambda row: row[metric], default=None)
+    if best is None:
         raise UsageError(
             f"has no {metric!r} at a validation", file=run.metrics, cure="choose another checkpoints_by"
         )
-    return int(max(rows, key=lambda row: row[metric])["step"])
+    return int(best["step"])
 
 
 def _validation_checks(study: Study, arms: Sequence[str]) -> list[ValidationCheck]:
@@ -380,14 +381,13 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[Any]]]:
     metric, curves = study.definition.checkpoints_by, []
     for seed in range(study.config.seeds):
         run = RunFolder(study.run(arm, seed), {})
-        rows = [row for row in run.read_metrics() if _PROGRESS in row]
-        curves.append(
-            {
-                "score": [_validation_score(row) for row in rows],
-                "progress": [row[_PROGRESS] for row in rows],
-                "rule": [row.get(metric) for row in rows],
-            }
-        )
+        curve: dict[str, list[Any]] = {"score": [], "progress": [], "rule": []}
+        for row in run.metric_rows():
+            if _PROGRESS in row:
+                curve["score"].append(_validation_score(row))
+                curve["progress"].append(row[_PROGRESS])
+                curve["rule"].append(row.get(metric))
+        curves.append(curve)
     return curves
 
 

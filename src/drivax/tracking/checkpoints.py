@@ -28,7 +28,7 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, format_bytes, inside, remove, replace_folder, sync_folder, write_text
-from drivax.reading import check_regular, explain_damage, read_arrays, read_json
+from drivax.reading import ArrayType, check_regular, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
 ABOUT = "about.json"
@@ -55,7 +55,9 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
-        names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own(path))
+        names = (
+            path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own_folder(path)
+        )
         return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
     def best(self) -> int | None:
@@ -188,7 +190,7 @@ class Checkpoints:
         remove(hidden_folder)
 
 
-def _is_own(path: Path) -> bool:
+def _is_own_folder(path: Path) -> bool:
     """Return whether a path is a folder, not a link by which a stranger's run could write or delete anywhere."""
     return path.is_dir() and not path.is_symlink()
 
@@ -281,11 +283,14 @@ def unpack(file: Path, template: State) -> State:
     requested_leaves = _named_leaves(template)
     # Every array has a header and an entry in the archive's directory.
     most = _check_size(file, [leaf for _, leaf in requested_leaves]) + 4096 * (len(requested_leaves) + 1)
-    arrays = read_arrays(file, "use another copy", 2 * most)
-    stored_leaves = [
-        {"name": name, "type": str(array.dtype), "shape": array.shape} for name, array in arrays.items()
-    ]
-    _compare(file, stored_leaves, requested_leaves, _CURE)
+
+    def check(types: Mapping[str, ArrayType]) -> None:
+        stored_leaves = [
+            {"name": name, "type": str(dtype), "shape": shape} for name, (shape, dtype) in types.items()
+        ]
+        _compare(file, stored_leaves, requested_leaves, _CURE)
+
+    arrays = read_arrays(file, "use another copy", most, check)
     return jax.tree.unflatten(
         jax.tree.structure(template), [jnp.asarray(arrays[name]) for name, _ in requested_leaves]
     )

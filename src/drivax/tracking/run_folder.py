@@ -15,7 +15,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -26,7 +26,7 @@ from drivax import kernels, settings
 from drivax.errors import DataError, UsageError
 from drivax.files import check_output, inside, replace_folder, restore_folder, write_text
 from drivax.plugins import is_dotted
-from drivax.reading import explain_damage, read_json, read_text
+from drivax.reading import MOST_TEXT, check_size, explain_damage, read_json, read_text
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import allow_edited, check_seal, edited_files, note_edited, require_entries, seal, unseal
 from drivax.tracking.sinks import read_rows
@@ -187,9 +187,19 @@ class RunFolder:
         """Return the rows of ``metrics.jsonl``.
 
         Raises:
+            DataError: The file is missing, a row is damaged, or the rows may not fit in memory.
+        """
+        rows = self.metric_rows()
+        check_size(self.metrics, "use RunFolder.metric_rows, which yields one row at a time", MOST_TEXT)
+        return list(rows)
+
+    def metric_rows(self) -> Iterator[dict[str, Any]]:
+        """Yield the rows of ``metrics.jsonl``, of which one at a time is in memory.
+
+        Raises:
             DataError: The file is missing, or a row is damaged.
         """
-        return list(read_rows(require_file(self.metrics, "train again")))
+        return read_rows(require_file(self.metrics, "train again"))
 
 
 def require_file(path: Path, cure: str) -> Path:

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from drivax.errors import DataError
-from drivax.files import inside, remove, sync_and_close, write_text
+from drivax.files import atomic_write, inside, remove, sync_and_close
 from drivax.reading import DAMAGE, read_lines
 
 #: Least time between two flushes (s).
 _FLUSH_S = 10.0
+#: Largest log, in bytes: those of the presets have up to 61 MB.
+_MOST_LOG = 512 << 20
 
 
 class JsonLines:
@@ -33,8 +35,10 @@ class JsonLines:
     def __init__(self, file: str | Path, resume_step: int | None = None) -> None:
         self.path = Path(file)
         if resume_step is not None and self.path.exists():
-            rows = [row for row in read_rows(self.path) if row["step"] <= resume_step]
-            write_text(self.path, "".join(f"{json.dumps(row)}\n" for row in rows), follow=False)
+            with atomic_write(self.path, follow=False) as out:
+                for row in read_rows(self.path):
+                    if row["step"] <= resume_step:
+                        out.write(f"{json.dumps(row)}\n".encode())
         else:
             remove(self.path)  # perhaps a link or a pipe
         self._file = self.path.open("wb" if resume_step is None else "ab")
@@ -130,13 +134,13 @@ class MetricLog:
 
 
 def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a ``metrics.jsonl`` file, without an incomplete last row.
+    """Yield the rows of a ``metrics.jsonl`` file, without an incomplete last row; one at a time is in memory.
 
     Raises:
-        DataError: A row is damaged.
+        DataError: A row is damaged, or the file has more than 512 MiB.
     """
     file = Path(file)
-    for number, line in enumerate(read_lines(file, "train again"), start=1):
+    for number, line in enumerate(read_lines(file, "train again", _MOST_LOG), start=1):
         try:
             row = json.loads(line)
             if not isinstance(row["step"], int):

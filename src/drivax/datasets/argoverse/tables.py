@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
-from drivax.datasets.argoverse import unpacked
+from drivax.datasets.argoverse import unpacked_size
 from drivax.datasets.reader import read_head
 from drivax.errors import DataError, explain_system, import_extra
 from drivax.reading import DAMAGE, check_regular
@@ -98,22 +98,22 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
 
     with pa.OSFile(str(path)) as source:
         if read_head(path, 4) == PARQUET_MAGIC:
-            unpacked.check_footer(source)
+            unpacked_size.check_footer(source)
             file = pq.ParquetFile(source)
             schema, metadata = file.schema_arrow, file.metadata
             names = _check(schema, columns, optional)
             groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-            unpacked.check_pages(source, groups, names)
+            unpacked_size.check_pages(source, groups, names)
             # Text stays in dictionaries: a text of a megabyte may be that of all rows.
             texts = [name for name in names if columns[name] == "text"]
             file = pq.ParquetFile(source, metadata=metadata, read_dictionary=texts)
             table = file.read(columns=names, use_threads=False)
         else:
             # The file is read as the stream in it: its footer may point elsewhere.
-            unpacked.check_messages(source)
+            unpacked_size.check_messages(source)
             schema = pa.ipc.open_stream(source).schema
             names = _check(schema, columns)
-            unpacked.check_messages(source)
+            unpacked_size.check_messages(source)
             indices = [schema.names.index(name) for name in names]
             options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=indices)
             table = pa.ipc.open_stream(source, options=options).read_all()

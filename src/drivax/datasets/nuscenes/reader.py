@@ -406,6 +406,10 @@ def _table(folder: Path, name: str) -> Iterator[_Row]:
     return (_Row(row, file) for row in rows(file))
 
 
+def _too_long() -> ValueError:
+    return ValueError(f"a row of more than {_LONGEST:,} characters")
+
+
 def rows(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects of a file that holds one array of objects, which is never in memory as a whole."""
     check_regular(path, _AGAIN)
@@ -427,10 +431,14 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                     row, end = decoder.raw_decode(text, position)
                 except ValueError:  # The row goes on in the next chunk, unless the file is damaged.
                     chunk = file.read(_CHUNK)
-                    if not chunk or len(text) - position > _LONGEST:
+                    if not chunk:
                         raise
+                    if len(text) - position > _LONGEST:
+                        raise _too_long() from None
                     text, position = text[position:] + chunk, 0
                     continue
+                if end - position > _LONGEST:
+                    raise _too_long()
                 if not isinstance(row, dict):
                     raise DataError("is not an object", file=path, record=number, cure="download it again")
                 if number >= _MOST_ROWS:

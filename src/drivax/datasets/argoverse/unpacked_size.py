@@ -17,6 +17,8 @@ MOST_ROWS, MOST_BYTES = 1_000_000, 128 << 20
 #: Longest description of a file and of a page or batch, bytes; those of Argoverse 2 have up to 5,000. Each value in one
 #: may take some thousand bytes of memory.
 _LONGEST_FOOTER, _LONGEST_HEADER = 1 << 18, 1 << 16
+#: Most pages or messages; files of Argoverse 2 have up to a hundred. They take time even if they are empty.
+_MOST_PARTS = 1 << 14
 #: Encodings of parquet pages: all but deltas of texts (7), which repeat the beginning of the text before.
 _ENCODINGS = (0, 2, 3, 4, 5, 6, 8, 9)
 #: Compact protocol: kinds of values, and the fields of a page header that hold the header of its content.
@@ -45,16 +47,24 @@ def check_pages(source: Any, groups: Sequence[Any], names: Collection[str]) -> N
     room, rows = _Room(), sum(group.num_rows for group in groups)
     room.take(rows, 0)
     groups = groups if rows else []  # the columns of empty files have no place
-    for column in (group.column(number) for group in groups for number in range(group.num_columns)):
-        if column.path_in_schema in names:
-            start = column.data_page_offset
-            start = min(start, column.dictionary_page_offset) if column.has_dictionary_page else start
-            end = start + column.total_compressed_size
-            if not 0 <= start <= end <= source.size():
-                raise ValueError("a column outside the file")
-            while start < end:
-                start += _check_page(source, start, room)
+    columns = (group.column(number) for group in groups for number in range(group.num_columns))
+    previous_end = 0
+    for start, end in sorted(_extent(column) for column in columns if column.path_in_schema in names):
+        if not 0 <= start <= end <= source.size():
+            raise ValueError("a column outside the file")
+        if start < previous_end:  # Row groups that share their pages would repeat them.
+            raise ValueError("columns that overlap")
+        previous_end = end
+        while start < end:
+            start += _check_page(source, start, room)
     source.seek(0)
+
+
+def _extent(column: Any) -> tuple[int, int]:
+    """Return the first byte of a column of a row group, and the one after its last."""
+    start = column.data_page_offset
+    start = min(start, column.dictionary_page_offset) if column.has_dictionary_page else start
+    return start, start + column.total_compressed_size
 
 
 def check_messages(source: Any) -> None:
@@ -67,6 +77,7 @@ def check_messages(source: Any) -> None:
             raise ValueError("a message of odd length")
         if not length:
             break
+        room.take_part(length)
         header, body = source.read(length), position + 8 + length
         message = _root(header)
         kind, content = _scalar(header, message, 1, "<B"), _table(header, message, 2)
@@ -83,10 +94,17 @@ def check_messages(source: Any) -> None:
 
 
 class _Room:
-    """Rows and bytes that are left."""
+    """Rows, bytes and parts that are left."""
 
     def __init__(self) -> None:
-        self._rows, self._bytes = MOST_ROWS, MOST_BYTES
+        self._rows, self._bytes, self._parts = MOST_ROWS, MOST_BYTES, _MOST_PARTS
+
+    def take_part(self, length: int) -> None:
+        """Take the room of a page or message with a header of ``length`` bytes, whatever its content."""
+        self._parts -= 1
+        self.take(0, length)
+        if self._parts < 0:
+            raise ValueError(f"more than {_MOST_PARTS:,} pages or messages")
 
     def take(self, rows: int, size: int) -> None:
         if rows < 0 or size < 0:
@@ -106,6 +124,7 @@ def _check_page(source: Any, start: int, room: _Room) -> int:
     size = fields[3, _I32]
     if size < 0:
         raise ValueError("a page of negative length")
+    room.take_part(length)
     room.take(0, fields[2, _I32])
     for field, encoding in ((_DATA, 2), (_DICTIONARY, 2), (_DATA_V2, 4)):
         content = fields.get((field, _STRUCT), {})
