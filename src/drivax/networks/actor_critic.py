@@ -131,8 +131,8 @@ def _apply_concatenated(layer: nnx.Linear, x: Array, extra: Array) -> Array:
     kernel, bias = layer.kernel[...], 0.0 if layer.bias is None else layer.bias[...]
     width = x.shape[-1]
     # Not by broadcasting: the sum over leading axes in its gradient takes XLA on CPUs 15 times as long as a product.
-    ones = jnp.ones(extra.shape[: extra.ndim - x.ndim])
-    return jnp.tensordot(ones, x @ kernel[:width], 0) + extra @ kernel[width:] + bias
+    repeats = jnp.ones(extra.shape[: extra.ndim - x.ndim])
+    return jnp.tensordot(repeats, x @ kernel[:width], 0) + extra @ kernel[width:] + bias
 
 
 class Policy(nnx.Module):
