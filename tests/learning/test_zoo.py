@@ -200,7 +200,7 @@ def test_no_folder_shadows_a_name(run, bank, tmp_path, monkeypatch):
             {"hidden": [10**6]},
             r"config\.yaml: algorithm\.network\.encoder: hidden has a layer of width 1000000",
         ),
-        ({"hidden": [4096] * 20}, r"config\.yaml: a network has 320,060,837 parameters; use 268,435,456"),
+        ({"hidden": [4096] * 20}, r"config\.yaml: a network has 320,060,837 parameters; use 33,554,432"),
     ],
 )
 def test_policy_of_huge_sizes_is_refused_at_once(sizes, words, bank, tmp_path):

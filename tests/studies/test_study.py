@@ -378,7 +378,7 @@ def test_no_file_shadows_a_study(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     load_study.cache_clear()
     assert load_study("longtail") == LONGTAIL
-    with pytest.raises(UsageError, match="no preset or file 'studies/own'"):
+    with pytest.raises(UsageError, match="no preset 'studies/own'"):
         load_study("own")
     for path in ("./longtail", "studies/own"):
         with pytest.raises(UsageError, match=rf"^{path.removeprefix('./')}: title: 5 is not text"):
