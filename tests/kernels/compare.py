@@ -18,15 +18,6 @@ needs_compiler = pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"no 
 TARGETS = ("sse4.2", "avx2")
 
 
-def _is_gcc():
-    if shutil.which(COMPILER) is None:
-        return False
-    return "Free Software Foundation" in subprocess.check_output([COMPILER, "--version"], text=True)
-
-
-needs_gcc = pytest.mark.skipif(not _is_gcc(), reason=f"{COMPILER} is not GCC, whose sanitizers are preloaded")
-
-
 def run_on_target(target, test_file):
     """Run a file's fast tests for an older instruction set, in a process of its own."""
     run_tests(test_file, DRIVAX_NATIVE=target)

@@ -14,7 +14,7 @@ from drivax import kernels
 from drivax.kernels import library
 from drivax.kernels.stamp import append_stamp, read_stamp, stamp
 from drivax.networks.encoders import max_pool
-from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_gcc, needs_kernels, run_tests
+from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_kernels, run_tests
 
 
 def run(program, **variables):
@@ -230,6 +230,13 @@ def checkout(repository, tmp_path):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def gcc():
+    version = subprocess.check_output([COMPILER, "--version"], text=True)
+    if "Free Software Foundation" not in version:
+        pytest.skip(f"{COMPILER} is not GCC, whose sanitizers are preloaded")
+
+
 def build(checkout, *options, umask=0o022, **variables):
     command = [sys.executable, str(checkout / "native" / "build.py"), *options]
     environment = os.environ | variables
@@ -255,8 +262,8 @@ def test_sources_that_change_during_the_build_end_it(checkout):
     assert not path.exists()
 
 
-@needs_gcc
-def test_the_stamp_names_sanitizers(checkout):
+@needs_compiler
+def test_the_stamp_names_sanitizers(gcc, checkout):
     _, path = build(checkout, "--sanitize")
     assert "-fsanitize=address" in read_stamp(path.read_bytes())["options"]
 
@@ -354,7 +361,7 @@ def test_compiled_programs_name_the_build():
 
 
 @pytest.fixture(scope="module")
-def sanitized(repository, tmp_path_factory):
+def sanitized(gcc, repository, tmp_path_factory):
     """The environment of a copy of the package whose kernels have AddressSanitizer and UndefinedBehaviorSanitizer."""
     copy = tmp_path_factory.mktemp("sanitized")
     for folder in ("src", "native", "configs"):
@@ -371,7 +378,7 @@ def sanitized(repository, tmp_path_factory):
 
 
 @pytest.mark.slow
-@needs_gcc
+@needs_compiler
 @pytest.mark.parametrize("target", [*TARGETS, "best"])
 def test_sanitizers_find_no_error_in_the_kernels(repository, sanitized, target):
     """Over the tests of all kernels, with 10,000 random maps and 10,000 calls with any numbers."""

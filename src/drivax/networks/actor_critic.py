@@ -130,7 +130,7 @@ def _apply_concatenated(layer: nnx.Linear, x: Array, extra: Array) -> Array:
     """Apply a layer to ``x`` and ``extra`` concatenated; the product with ``x`` is shared by all of ``extra``."""
     kernel, bias = layer.kernel[...], 0.0 if layer.bias is None else layer.bias[...]
     width = x.shape[-1]
-    # Not by broadcasting: the sum over leading axes in its gradient takes XLA on CPUs 15 times as long as a product.
+    # Not by broadcasting: the sum over leading axes in its gradient takes XLA on CPUs far longer than a product.
     repeats = jnp.ones(extra.shape[: extra.ndim - x.ndim])
     return jnp.tensordot(repeats, x @ kernel[:width], 0) + extra @ kernel[width:] + bias
 
