@@ -214,9 +214,9 @@ def memory_below(most: int) -> Iterator[None]:
     [
         ("a" * (4 << 20), "a row of more than 1,048,576 characters"),
         ("ab," * (2 << 20), "a row of more than 1,048,576 characters"),
-        ('"a\n",' * (1 << 20), "a row of more than 1,048,576 characters"),
+        pytest.param('"a\n",' * (1 << 20), "a row of more than 1,048,576 characters", marks=pytest.mark.slow),
         ("a" * 200_000, "field larger than field limit"),
-        ("a\n" * 200_000, None),
+        pytest.param("a\n" * 200_000, None, marks=pytest.mark.slow),
     ],
 )
 def test_table_takes_the_memory_of_one_row(tmp_path, text, words):

@@ -233,6 +233,7 @@ def test_samples_are_evenly_spread(sets, monkeypatch):
     np.testing.assert_allclose(speeds.ego, [0.0] * 91 + [3.0] * 91, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_picture_shows_the_current_step_of_a_short_log(tmp_path, inspect, monkeypatch):
     log = straight_road([car(speed=5.0)])
     short = assemble(replace(log, scenario_id="short"))

@@ -200,6 +200,7 @@ def test_other_commands_accept_the_subset_and_its_scores(data, tmp_path, capsys)
     assert read_scores(tmp_path / "drawn" / "scores.npz", drawn).method == "random_matched"
 
 
+@pytest.mark.slow
 def test_subset_can_be_evaluated(data, tmp_path):
     top, run = tmp_path / "top", tmp_path / "run"
     write_top(hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6]), data, 2, top)

@@ -85,7 +85,7 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
     assert (np.abs(modes["action"] - sampled["action"]).max(axis=(1, 2)) > 0.05).all()
 
 
-@pytest.mark.parametrize("planner", ["random", "constant_velocity"])
+@pytest.mark.parametrize("planner", [pytest.param("random", marks=pytest.mark.slow), "constant_velocity"])
 def test_task_flags_hold_for_rule_based_planners(data, planner, tmp_path):
     assert evaluate(data, planner, tmp_path / "run", "--task.actions", "published") == 0
     task = settings.load(EvaluationConfig, tmp_path / "run" / "config.yaml").task

@@ -79,7 +79,12 @@ def logs():
 
 
 @pytest.mark.parametrize(
-    ("planner", "traffic"), [(Expert(), None), (Expert(replays=False), None), (IdmPlanner(), IdmTraffic())]
+    ("planner", "traffic"),
+    [
+        (Expert(), None),
+        pytest.param(Expert(replays=False), None, marks=pytest.mark.slow),
+        pytest.param(IdmPlanner(), IdmTraffic(), marks=pytest.mark.slow),
+    ],
 )
 def test_short_log_next_to_long_ones_is_judged_to_its_last_step(logs, planner, traffic):
     padded, alone, long = logs
@@ -103,6 +108,7 @@ def test_short_log_next_to_long_ones_is_judged_to_its_last_step(logs, planner, t
     assert (whole.metrics["distance"] > other.metrics["distance"] + 5.0).any()
 
 
+@pytest.mark.slow
 def test_first_steps_of_a_long_log_equal_the_short_log(logs):
     _, alone, long = logs
     bank = ScenarioBank.from_scenarios(long, trim=False)
@@ -118,6 +124,7 @@ def test_first_steps_of_a_long_log_equal_the_short_log(logs):
     assert (first.metrics["red_light"] == [1, 0]).all() and (first.metrics["collision"] == [1, 0]).all()
 
 
+@pytest.mark.slow
 def test_a_planner_cannot_crash_after_the_end_of_the_log(logs):
     padded, _, long = logs
 
@@ -140,6 +147,7 @@ def test_starts_after_the_end_of_the_log_are_refused(logs):
         evaluate(Expert(), logs[1], task=TASK, start_step=SHORT - 1)
 
 
+@pytest.mark.slow
 def test_audit_of_a_short_log_ends_with_it(logs):
     padded, alone, long = logs
     result = audit([*padded, long[0]])
@@ -158,6 +166,7 @@ def test_criticality_of_a_short_log_is_that_of_the_log_alone(logs):
             np.testing.assert_allclose(scores[name][:2, :SHORT], values, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_expert_steps_of_a_short_log_end_with_it(logs):
     padded, alone, long = logs
     driving = Driving(Simulator(replace(TASK, metrics="none", ends=())))
@@ -226,6 +235,7 @@ def test_gymnasium_truncates_a_short_log_at_its_end(tmp_path):
         assert ends == [(False, False)] * (steps - 12) + [(False, True)]
 
 
+@pytest.mark.slow
 def test_sampled_states_lie_within_their_logs(logs):
     mixed, other = (
         observation_statistics(

@@ -90,6 +90,7 @@ def test_hitting_a_standing_car_is_at_fault_by_both_definitions(data, run):
     assert blocked.devkit["ttc_ok"] == blocked.devkit["score"] == 0.0
 
 
+@pytest.mark.slow
 def test_simulated_traffic_is_read_from_its_stored_poses(data, tmp_path):
     """The set's banks are smaller than its records, and the standing car does not move."""
     table = run_evaluation(

@@ -39,6 +39,7 @@ def action(recording, stood_s=0.0):
     return np.asarray(first_action(bank_of(recording), stood_s))
 
 
+@pytest.mark.slow
 def test_free_road_is_driven_by_idm():
     throttle, steering = action(straight_road([car(0, 0, 0, 9)]))
     # Acceleration 2 m/s2 (1 - (v / v0)^4), v0 the limit of 13.4 m/s.

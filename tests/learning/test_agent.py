@@ -77,7 +77,8 @@ def run_optimised(name):
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("algorithm", [SAC, pytest.param(PPO, marks=pytest.mark.slow)], ids=["sac", "ppo"])
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", [SAC, PPO], ids=["sac", "ppo"])
 def test_own_loop_equals_training(data, algorithm, tmp_path, request):
     if not os.environ.get("DRIVAX_OPTIMISED"):
         # Compiled without optimisation, the two programs round sums differently.

@@ -247,6 +247,7 @@ def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):
     assert ended > 3
 
 
+@pytest.mark.slow
 def test_expert_of_the_route_space_is_cloned_by_its_offset(bank):
     """What the clone requests is executed as the expert's action, which the next state remembers."""
     route = Driving(Simulator(Task(actions=ROUTE, observation=OBSERVATION, metrics="none")), LATEST)

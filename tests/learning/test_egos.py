@@ -84,6 +84,7 @@ def test_episodes_begin_with_the_drawn_ego(worlds):
     assert not np.asarray(recorded.state.context.slot).any()
 
 
+@pytest.mark.slow
 def test_logged_steps_are_those_of_recorded_egos(worlds):
     bank, alone, rows = worlds
     steps, own_steps = (

@@ -60,6 +60,7 @@ def test_fitted_q_estimates_returns(table):
         assert float(left) == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_learner_logs_fitted_q(table):
     """A clone of pushes to the right, all features of which lie close together, and only normalisation separates them.
 

@@ -193,6 +193,7 @@ def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_p
     assert not (tmp_path / "never").exists()
 
 
+@pytest.mark.slow
 def test_command_trains_several_seeds(data, tmp_path, capsys):
     (tmp_path / "toy.yaml").write_text(settings.dump(settings.load(TrainConfig, VALUES)))
     out = tmp_path / "out"

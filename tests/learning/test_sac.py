@@ -179,6 +179,7 @@ def largest_change(one, other):
     return max(jax.tree.leaves(differences))
 
 
+@pytest.mark.slow
 def test_clone_learns_from_demonstrations_after_settling(logged):
     """One iteration each of cloning, of fitting critics, and of SAC."""
     environment, table = logged

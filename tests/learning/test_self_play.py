@@ -163,6 +163,7 @@ def test_vehicles_of_a_group_see_each_other_where_they_drive(bank, experience):
     assert compared > 50 and off_log > 5.0
 
 
+@pytest.mark.slow
 def test_padding_is_never_alive(bank):
     """Two egos in groups of four: half of the rows are dead, and nothing in them is infinite or missing."""
     bank = replace(bank, egos=bank.egos.at[:, 2:].set(-1))
@@ -181,6 +182,7 @@ def test_padding_is_never_alive(bank):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rollout.observation))
 
 
+@pytest.mark.slow
 def test_every_vehicle_keeps_the_schedule_of_its_own_route(bank):
     """As logged, each is on its route and neither late nor early; on ego's route further egos would be."""
     task = Task(

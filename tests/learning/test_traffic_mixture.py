@@ -126,6 +126,7 @@ def test_two_policies_are_refused(bank):
         training_environment(replace(CONFIG, traffic=traffic)).prepare(bank)
 
 
+@pytest.mark.slow
 def test_replay_of_states_is_refused(bank):
     sac = SacConfig(network=NETWORK, environments=12, unroll=8, batch=8, replay=ReplayConfig(240), warm_up=96)
     words = r"a replay buffer cannot store states of a mixture of traffic; set replay\.store to observation"
@@ -140,6 +141,7 @@ def test_replay_of_states_is_refused(bank):
         replace(CONFIG, algorithm=sac, self_play=SelfPlayConfig(past=0.5))
 
 
+@pytest.mark.slow
 def test_mixture_equals_its_blocks_alone(bank):
     """Half log, half idm, against an environment of each with the same keys and actions."""
     mixture = training_environment(replace(CONFIG, traffic={"log": 0.5, "idm": 0.5}))

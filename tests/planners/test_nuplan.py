@@ -189,6 +189,7 @@ def test_initialization_names_route_and_goal(replayed, scenarios):
     )
 
 
+@pytest.mark.slow
 def test_a_route_follower_drives_brakes_and_stops(scenarios):
     """On a free road it speeds up on the lane; it stops behind a car and before the line of a red light."""
     planner = make_planner("nuplan_planners:RouteIdm", SPACE)

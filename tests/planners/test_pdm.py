@@ -229,6 +229,7 @@ def test_emergency_brake_applies_when_no_proposal_is_safe():
     assert -3.0 < fast[0] * 6.0 < 0.0
 
 
+@pytest.mark.slow
 def test_proposals_are_unrolled_as_the_simulator_executes_their_plans():
     """In the action space ``trajectory``: the first step of each proposal, off the lane and with turned wheels."""
     space = Trajectory(initial_steering="logged")

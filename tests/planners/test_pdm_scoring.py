@@ -193,7 +193,13 @@ def test_ground_is_looked_up_ahead_of_each_step():
     assert not found.is_offroad[0].any() and found.is_offroad[1].tolist() == [False] * 21 + [True] * 20
 
 
-@pytest.mark.parametrize(("most", "every"), [((96, 40), 5), ((96, 40), 1), ((20, 40), 5), ((96, 6), 5)])
+@pytest.mark.parametrize(
+    ("most", "every"),
+    [
+        ((96, 40), 5),
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in (((96, 40), 1), ((20, 40), 5), ((96, 6), 5))),
+    ],
+)
 def test_ground_along_equals_a_query_of_the_grid_per_pose(monkeypatch, most, every):
     """On curves that leave lanes, road and route of generated worlds, also with more segments than fit."""
     monkeypatch.setattr(ground, "PATH_SEGMENTS", most[0])

@@ -205,6 +205,7 @@ def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulat
     assert float(follow_route(bank, beyond, jnp.zeros(()))) == pytest.approx(-2 / (10.2**2 + 1), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_held_planner_decides_at_every_other_step(simulator):
     """Gaps shrink from step to step, so that IDM's decision changes at each."""
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)]))

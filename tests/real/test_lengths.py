@@ -50,6 +50,7 @@ def test_recordings_of_twenty_seconds_become_scenarios_of_fifteen(long_set):
     assert moved > 5.0 and waymo.agent_valid[:, 0].all()
 
 
+@pytest.mark.slow
 def test_real_short_logs_are_judged_to_their_last_step(real_data):
     path = next((real_data / "scenarionet").glob("sd_waymo*.pkl"))
     (recording,) = detect(path).read(path)

@@ -83,6 +83,7 @@ def test_other_slots_have_no_route_and_no_route_reward():
     assert not np.asarray(mask).any() and float(reward) == 0.0
 
 
+@pytest.mark.slow
 def test_gaps_in_the_ego_log_are_no_divergence():
     steps = [*range(40), *range(50, 80)]
     bank = bank_of(straight_road([car(0, 0, 0, 5, steps=steps), car(40, 3.7, 0, 5)]))

@@ -75,6 +75,7 @@ EVEN = dict.fromkeys(ARMS, 0.16)
 SIZE = "ensemble has 34% of the baseline's collisions or fewer"
 
 
+@pytest.mark.slow
 def test_equal_arms_rarely_support_a_claim():
     results = [result.verdict for seed in range(20) for result in verdicts(EVEN, seed).values()]
     assert results.count("supported") <= 0.01 * len(results)

@@ -57,6 +57,7 @@ def test_worker_count_does_not_change_the_bytes(one_worker, tmp_path):
     assert two.families == result.families
 
 
+@pytest.mark.slow
 def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
     """The command runs with and without these instructions, whose routines differ in the last bits of results."""
     newer = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
@@ -112,6 +113,7 @@ def test_workers_inherit_disabled_features(monkeypatch):
         assert os.environ["NPY_DISABLE_CPU_FEATURES"] == disabled
 
 
+@pytest.mark.slow
 def test_scenarios_of_fifteen_seconds_are_clean_and_have_ids_of_their_own(tmp_path):
     world = WorldConfig(rare_rate=0.5)
     result = generate(tmp_path / "set", 8, 3, Generation(future_s=15.0, world=world), audit=audit)

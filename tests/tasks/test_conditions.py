@@ -160,6 +160,7 @@ class Obedient(Memoryless):
         return jnp.stack([0.3 * observation["conditions"][1], jnp.zeros(())]), carry
 
 
+@pytest.mark.slow
 def test_evaluation_has_fixed_numbers(bank):
     names = [{"dataset": "d", "scenario_id": str(i), "segment": str(i)} for i in range(2)]
     run = partial(evaluate, Obedient(), bank, names)
