@@ -57,17 +57,20 @@ _TRAINING = (
     + """
 from drivax import settings
 from drivax.learning.config import TrainConfig
-from drivax.learning.program import Program, Seeds
+from drivax.learning import program
 from drivax.simulator.traffic.log import LogTraffic
+if hasattr(program, "use_all_cores"):  # as the command `train` of this tree does
+    program.use_all_cores()
 def trainer(preset, *overrides, prepare=lambda algorithm, environment, bank: bank):
     config = settings.load(TrainConfig, f"{PRESETS}/{preset}.yaml", list(overrides))
     bank = ScenarioBank.from_scenarios(first(1024))
     environment = config.environment(LogTraffic())
     learner = config.algorithm.build(environment, bank, config.iterations)
-    program = Program(Seeds(learner, (0,)), prepare(config.algorithm, environment, bank), config.devices)
-    state = [program.initial_state()]
+    data = prepare(config.algorithm, environment, bank)
+    compiled = program.Program(program.Seeds(learner, (0,)), data, config.devices)
+    state = [compiled.initial_state()]
     def call():
-        state[0], logs = program.step(state[0])
+        state[0], logs = compiled.step(state[0])
         jax.block_until_ready((state[0], logs))
         return config.algorithm.steps_per_iteration
     return call
@@ -140,8 +143,8 @@ call = trainer('offline/cql', prepare=training_data)
     "simulator, full, log": Repeated(
         "steps/s",
         """
-from drivax.studies import bench
-bench.use_all_cores()
+import jax, os
+jax.config.update('jax_num_cpu_devices', len(os.sched_getaffinity(0)))
 """
         + _BANK
         + """

@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from drivax.learning.program import use_all_cores
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator, map_where
@@ -33,7 +34,6 @@ from drivax.studies.bench import (
     compile_program,
     replicate,
     steps_per_second,
-    use_all_cores,
 )
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task

@@ -16,9 +16,10 @@ from drivax import settings
 from drivax.cli import record_of
 from drivax.errors import UsageError
 from drivax.escaping import show
+from drivax.learning.program import use_all_cores
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
+from drivax.studies.bench import BenchConfig, bench, bench_metrics
 from drivax.studies.bench_encoders import EncoderBench, bench_encoders
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.task import Task

@@ -19,7 +19,7 @@ from drivax.escaping import show
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
-from drivax.learning.program import widen_pool
+from drivax.learning.program import use_all_cores, widen_pool
 from drivax.scenario.store import ScenarioSet
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(flags))
     if args.seeds > 1 or args.resume:
         widen_pool()
+    use_all_cores()
     config = settings.load(TrainConfig, args.config, list(overrides))
     if args.begin_from is not None:
         config = replace(config, begin_from=args.begin_from)

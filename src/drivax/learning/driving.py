@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.learning.environment import Environments, Outcome, any_across_learners
 from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
+from drivax.learning.program import map_over_devices
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
@@ -131,7 +132,11 @@ class Driving:
 
     def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
         """Observe a batch of contexts."""
-        return dict(jax.vmap(self.simulator.observe, (None, 0))(data, stored))
+
+        def observe(data: ScenarioBank, stored: AgentContext) -> tuple[dict[str, Array], dict[str, Array]]:
+            return dict(jax.vmap(self.simulator.observe, (None, 0))(data, stored)), {}
+
+        return map_over_devices(observe, data, stored)[0]
 
     def cache(self, data: ScenarioBank, state: SimState) -> Frame:
         """Return the frame of all agents, which the current observation and the next step both need."""
@@ -144,7 +149,16 @@ class Driving:
 
         An episode that ends while a decision is held counts no further step. Rewards of the steps are added.
         """
-        state, result = self._step_or_reset(data, now, cache, action, key)
+        start = self._draw_starts(data, key, len(now.over))
+        (after, outcome), totals = map_over_devices(self._step_all, data, (now, cache, action, start))
+        return after, replace(outcome, totals=totals)
+
+    def _step_all(
+        self, data: ScenarioBank, batch: tuple[Environments, Any, Float[Array, "B D"], Any]
+    ) -> tuple[tuple[Environments, Outcome], dict[str, Array]]:
+        """Return environments and outcomes after a decision, given where new episodes would start, and sums to log."""
+        now, cache, action, start = batch
+        state, result = self._step_or_reset(data, now, cache, action, start)
         summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
 
         def step_on(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
@@ -169,15 +183,19 @@ class Driving:
         # Metrics end with the episode, although vehicles of self-play drive on.
         episodes = replace(state, context=replace(state.context, step=last))
         totals = _totals(data, episodes, terms, ends, now.over)
-        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
+        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), {}, terms)
         over = self._over(data, state, now.over, ends)
-        return Environments(state, over, self.observe_all(data, state.context)), outcome
+        after = Environments(state, over, self.observe_all(data, state.context))
+        return (after, outcome), totals
+
+    def _draw_starts(self, data: ScenarioBank, key: Array, count: int) -> Any:
+        """Draw where new episodes start, for ``count`` environments."""
+        return self._draw(data, key, count, self.earliest_start, self.latest_start)
 
     def _step_or_reset(
-        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], start: Any
     ) -> Step:
         """Take the first step of a decision, or start a new episode where the last one is over."""
-        start = self._draw(data, key, now.over.shape[0], self.earliest_start, self.latest_start)
         step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
         fresh = map_where(now.over, _bind_bank(self.simulator.new_episode, data), *start)
         return step_all(data, now.state, action, now.over, fresh, cache)
@@ -208,17 +226,23 @@ class Driving:
             context = self._logged_context(bank, *index)
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
+        def demonstrate_all(data: ScenarioBank, index: Any) -> tuple[ExpertActions, dict[str, Array]]:
+            return jax.vmap(_bind_bank(demonstrate, data))(*index), {}
+
         *index, _ = self._draw(data, key, count, CURRENT_STEP, has_action=True)
-        return jax.vmap(_bind_bank(demonstrate, data))(*index)
+        return map_over_devices(demonstrate_all, data, index)[0]
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
 
-        def observe(row: Array, step: Array) -> dict[str, Array]:
+        def observe(data: ScenarioBank, row: Array, step: Array) -> dict[str, Array]:
             scenario, slot = self._ego_of(data, row)
             return dict(self._log_simulator.observe(data, self._logged_context(data, scenario, step, slot)))
 
-        return jax.vmap(observe)(*index)
+        def observe_steps(data: ScenarioBank, index: StepIndex) -> tuple[dict[str, Array], dict[str, Array]]:
+            return jax.vmap(partial(observe, data))(*index), {}
+
+        return map_over_devices(observe_steps, data, index)[0]
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.

@@ -44,7 +44,7 @@ class Outcome:
         truncated: The episode was cut off: bootstrap the value of the next state.
         cache: :meth:`Environment.cache` of the new state.
         totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
-            ``"reward/<name>"`` over steps.
+            ``"reward/<name>"`` over steps; of any shape, to be added up.
         terms: Terms of the reward by name, with their weights; those of ``Environment.penalties`` are read.
     """
 
@@ -196,13 +196,13 @@ def collect(
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
         row = transition(environment, now, sampled, outcome, keep, terms)
-        counts = {"episodes": (after.over & row.alive).sum(), "steps": row.alive.sum()}
-        totals = outcome.totals | {name: count.astype(jnp.float32) for name, count in counts.items()}
-        return (after, outcome.cache, key), (row, totals)
+        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive)
 
     first = (environments, environment.cache(data, environments.state), key)
-    (environments, _, _), (rollout, totals) = jax.lax.scan(step, first, None, steps)
-    return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), totals)
+    (environments, _, _), (rollout, totals, ends) = jax.lax.scan(step, first, None, steps)
+    counts = {"episodes": ends.sum(), "steps": rollout.alive.sum()}
+    totals |= {name: count.astype(jnp.float32) for name, count in counts.items()}
+    return environments, rollout, {name: value.sum() for name, value in totals.items()}
 
 
 @custom_vmap

@@ -119,7 +119,9 @@ class Mixture:
             stepped, outcome = block.step(data, environments, cache[number], actions, keys[number])
             after.append(stepped)
             outcomes.append(outcome)
-        totals = jax.tree.map(lambda *sums: sum(sums), *(outcome.totals for outcome in outcomes))
+        totals = jax.tree.map(
+            lambda *sums: sum(map(jnp.sum, sums)), *(outcome.totals for outcome in outcomes)
+        )
         caches = tuple(outcome.cache for outcome in outcomes)
         outcome = jax.tree.map(_join, *(replace(outcome, cache=(), totals={}) for outcome in outcomes))
         return _concatenate(after), replace(outcome, cache=caches, totals=totals)

@@ -17,13 +17,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jax.tree_util import keystr
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithm import Learner
+from drivax.tracking.workers import available_cores
 
 #: Threads of XLA's pool, enough to avoid deadlocks.
 _THREADS = 8
@@ -51,6 +53,12 @@ def widen_pool() -> None:
     """
     if (os.cpu_count() or 1) < _THREADS:
         os.environ.setdefault("NPROC", str(_THREADS))
+
+
+def use_all_cores() -> None:
+    """Make every core of this process a JAX device; has no effect once JAX has started."""
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", len(available_cores()))
 
 
 @dataclass(frozen=True)
@@ -247,11 +255,77 @@ def sum_over_devices(
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def summed(whole: Any, share: Any) -> Any:
         logs, sums = function(whole, share)
-        total_logs, total = jax.lax.psum((logs, sums), _AXIS)
+        # Devices meet once for every array, so there is only one.
+        vector, unravel = ravel_pytree((logs, sums))
+        total_logs, total = unravel(jax.lax.psum(vector, _AXIS))
         largest = {name: jax.lax.pmax(log, _AXIS) for name, log in logs.items() if is_largest(name)}
         return total_logs | largest, total
 
     return summed(whole, divided)
+
+
+def map_over_devices(
+    function: Callable[[Any, Any], tuple[Any, dict[str, Array]]], whole: Any, divided: Any
+) -> tuple[Any, dict[str, Array]]:
+    """Return the rows and sums of a function; each device computes the rows of its share of ``divided``.
+
+    Rows lie along the first axis. Sums get an axis of devices, which the caller adds up: once after a loop, where the
+    compiler would do so in every step. If shares would differ, nothing is divided.
+    """
+
+    def share(whole: Any, divided: Any) -> tuple[Any, dict[str, Array]]:
+        rows, sums = function(whole, divided)
+        return rows, {name: value[None] for name, value in sums.items()}
+
+    count = device_count()
+    if count == 1 or any(leaf.shape[0] % count for leaf in jax.tree.leaves(divided)):
+        return share(whole, divided)
+    row = PartitionSpec(_AXIS)
+    return jax.shard_map(share, in_specs=(PartitionSpec(), row), out_specs=row, check_vma=False)(
+        whole, divided
+    )
+
+
+def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batch"]) -> Any:
+    """Return ``leaf[row, column]`` of arrays whose columns devices may divide, whole on each device.
+
+    Bits are summed over devices, each of which has zeros for the columns of others. The compiler would exchange the
+    index for every leaf.
+    """
+    count = device_count()
+    if count == 1 or any(leaf.shape[1] % count for leaf in jax.tree.leaves(tree)):
+        return jax.tree.map(lambda leaf: leaf[row, column], tree)
+    columns = PartitionSpec(None, _AXIS)
+
+    @partial(jax.shard_map, in_specs=(columns, PartitionSpec()), out_specs=PartitionSpec(), check_vma=False)
+    def read(share: Any, index: tuple[Array, Array]) -> Any:
+        size = jax.tree.leaves(share)[0].shape[1]
+        own = index[1] - size * jax.lax.axis_index(_AXIS)
+        is_own = (own >= 0) & (own < size)
+
+        def bits(leaf: Array) -> Array:
+            value = leaf[index[0], jnp.clip(own, 0, size - 1)]
+            mask = is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim))
+            return jnp.where(mask, _as_bits(value), 0)
+
+        vector, unravel = ravel_pytree(jax.tree.map(bits, share))
+        return unravel(jax.lax.psum(vector, _AXIS))
+
+    return jax.tree.map(lambda leaf, bits: _from_bits(bits, leaf.dtype), tree, read(tree, (row, column)))
+
+
+def _as_bits(value: Array) -> Array:
+    """Return the bits of numbers or truth values of at most four bytes as 32-bit integers."""
+    if jnp.issubdtype(value.dtype, jnp.floating):
+        value = jax.lax.bitcast_convert_type(value, jnp.dtype(f"int{8 * value.dtype.itemsize}"))
+    return value.astype(jnp.int32)
+
+
+def _from_bits(bits: Array, dtype: Any) -> Array:
+    """Return the values whose bits :func:`_as_bits` returned."""
+    if not jnp.issubdtype(dtype, jnp.floating):
+        return bits.astype(dtype)
+    return jax.lax.bitcast_convert_type(bits.astype(jnp.dtype(f"int{8 * dtype.itemsize}")), dtype)
 
 
 def _layout(mesh: Mesh, seeds: int, state: Any) -> Any:

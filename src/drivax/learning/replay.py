@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.checks import check_at_most
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment, Environments, Rollout, Store
+from drivax.learning.program import read_columns
 from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
 
@@ -174,24 +175,26 @@ class ReplayBuffer:
         row, column = index
         rows = replay.reward.shape[0]
         window = (row + jnp.arange(steps).reshape(-1, *[1] * row.ndim)) % rows
-        # A row that resets an environment, or the newest, ends the window.
-        follows = replay.alive[window, column] & (window != (replay.next_row - 1) % rows)
-        returns = n_step_returns(
-            replay.reward[window, column], replay.terminated[window, column], follows, gamma
+        columns = jnp.broadcast_to(column, window.shape)
+        reward, terminated, alive = read_columns(
+            (replay.reward, replay.terminated, replay.alive), window, columns
         )
+        # A row that resets an environment, or the newest, ends the window.
+        returns = n_step_returns(reward, terminated, alive & (window != (replay.next_row - 1) % rows), gamma)
 
-        def observe(row: Array) -> dict[str, Array]:
-            sampled = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
+        def observe(sampled: Any) -> dict[str, Array]:
             if replay.store == "state":
                 return self.environment.observe_all(data, sampled)
             return _cast(sampled, jnp.float32)
 
+        stored, action = read_columns((replay.stored, replay.action), row, column)
+        following = read_columns(replay.stored, (row + returns.steps) % rows, column)
         return Transitions(
-            observation=observe(row),
-            action=replay.action[row, column],
+            observation=observe(stored),
+            action=action,
             reward=returns.reward,
             terminated=returns.terminated,
-            next_observation=observe((row + returns.steps) % rows),
+            next_observation=observe(following),
             discount=returns.discount,
         )
 

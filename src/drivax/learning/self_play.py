@@ -98,15 +98,17 @@ class SelfPlay(Driving):
         state = _flatten(reset(data, index, slots, step, keys))
         return state, ~is_driven(data, state)
 
+    def _draw_starts(self, data: ScenarioBank, key: Array, count: int) -> Any:
+        return self._draw_groups(data, key, count // self.config.vehicles, self.latest_start)
+
     def _step_or_reset(
-        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], start: Any
     ) -> Step:
         def new_episodes(index: Array, step: Array, key: Array) -> EpisodeStart:
             slots, keys = self._slots(data, index, step, key)
             return jax.vmap(partial(self.simulator.new_episode, data, index, step))(slots, keys)
 
         states, actions, over = self._groups((now.state, action, now.over))
-        start = self._draw_groups(data, key, len(over), self.latest_start)
         fresh = map_where(over.all(axis=1), new_episodes, *start)
         step_all = jax.vmap(self.simulator.step_together, (None, 0, 0, 0, 0))
         return _flatten(step_all(data, states, actions, over, fresh))

@@ -1,6 +1,6 @@
 """Speed of the simulator on this machine: as a whole, by part, and by set of metrics.
 
-Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core a
+Every device steps its share of the environments. A CPU is one device unless ``program.use_all_cores`` makes each core a
 device, which is faster: most operations of a step are too small to divide between cores.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -36,7 +35,6 @@ from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
-from drivax.tracking.workers import available_cores
 
 #: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table.
 METRIC_SETS, BATCHES = ("none", "training", "full"), (32, 128)
@@ -76,12 +74,6 @@ class BenchConfig:
         for name in ("batch", "steps", "repeats"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use 1 or more")
-
-
-def use_all_cores() -> None:
-    """Make every core of this process a JAX device; has no effect once JAX has started."""
-    with suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", len(available_cores()))
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:

@@ -29,6 +29,23 @@ def chunk_size(batch: int) -> int:
     return next(dividing, batch) if jax.default_backend() == "cpu" else batch
 
 
+def in_chunks(batch: Any) -> Any:
+    """Return a batch (leaves ``[sample, ...]``) as chunks ``[chunk, sample, ...]`` for :func:`sum_gradients`.
+
+    Devices that hold consecutive parts of the batch keep these: a chunk has samples of each.
+    """
+    count = len(jax.tree.leaves(batch)[0])
+    size, devices = chunk_size(count), device_count()
+    if count == size or size % devices:
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), batch)
+
+    def divide(leaf: Array) -> Array:
+        parts = leaf.reshape(devices, count // size, size // devices, *leaf.shape[1:])
+        return jnp.swapaxes(parts, 0, 1).reshape(-1, size, *leaf.shape[1:])
+
+    return jax.tree.map(divide, batch)
+
+
 def sum_gradients(
     loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
 ) -> tuple[dict[str, Array], Any]:

@@ -27,7 +27,7 @@ from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, q_logs, sample_each, target_entropy
-from drivax.learning.algorithms.optimisers import add_auxiliary, chunk_size, clipped_adam, sum_gradients
+from drivax.learning.algorithms.optimisers import add_auxiliary, clipped_adam, in_chunks, sum_gradients
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -336,8 +336,7 @@ class Sac(OffPolicy[SacConfig]):
             loss, logs = self.loss(trained, target, *samples)
             return share * loss, {n: x if is_largest(n) else share * x for n, x in logs.items()}
 
-        samples = (transitions, jax.random.split(key, (count, 2)))
-        samples = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk_size(count), *leaf.shape[1:]), samples)
+        samples = in_chunks((transitions, jax.random.split(key, (count, 2))))
         logs, gradient = sum_gradients(share_of_loss, trained, samples)
         logs, policy = add_auxiliary(auxiliary_loss, trained.policy, auxiliary_key, logs, gradient.policy)
         return logs, replace(gradient, policy=policy)
