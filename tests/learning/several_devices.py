@@ -57,6 +57,9 @@ def run(learner, data, seeds, devices):
     """Parameters and logs after three iterations; shapes of what each device holds; bytes by part."""
     program = Program(Seeds(learner, seeds), data, devices)
     assert len(program.devices) == (devices or 4), program.devices
+    for leaf in jax.tree.leaves(program.data):
+        copies = {shard.data.unsafe_buffer_pointer() for shard in leaf.addressable_shards}
+        assert leaf.nbytes < 1024 or len(copies) == 1, "cores share one copy of the data"
     state = program.initial_state()
     for _ in range(3):
         state, logs = program.step(state)

@@ -132,11 +132,7 @@ class Driving:
 
     def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
         """Observe a batch of contexts."""
-
-        def observe(data: ScenarioBank, stored: AgentContext) -> tuple[dict[str, Array], dict[str, Array]]:
-            return dict(jax.vmap(self.simulator.observe, (None, 0))(data, stored)), {}
-
-        return map_over_devices(observe, data, stored)[0]
+        return dict(map_over_devices(jax.vmap(self.simulator.observe, (None, 0)), data, stored))
 
     def cache(self, data: ScenarioBank, state: SimState) -> Frame:
         """Return the frame of all agents, which the current observation and the next step both need."""
@@ -150,13 +146,15 @@ class Driving:
         An episode that ends while a decision is held counts no further step. Rewards of the steps are added.
         """
         start = self._draw_starts(data, key, len(now.over))
-        (after, outcome), totals = map_over_devices(self._step_all, data, (now, cache, action, start))
-        return after, replace(outcome, totals=totals)
+        return map_over_devices(self._step_all, data, (now, cache, action, start))
 
     def _step_all(
         self, data: ScenarioBank, batch: tuple[Environments, Any, Float[Array, "B D"], Any]
-    ) -> tuple[tuple[Environments, Outcome], dict[str, Array]]:
-        """Return environments and outcomes after a decision, given where new episodes would start, and sums to log."""
+    ) -> tuple[Environments, Outcome]:
+        """Return environments and outcomes after a decision, given where new episodes would start.
+
+        Totals are those of a device: added after a rollout, they cost no exchange in each step.
+        """
         now, cache, action, start = batch
         state, result = self._step_or_reset(data, now, cache, action, start)
         summed = (result.reward, result.reward_terms, result.terminated, result.truncated)
@@ -182,11 +180,10 @@ class Driving:
         ends = terminated | truncated
         # Metrics end with the episode, although vehicles of self-play drive on.
         episodes = replace(state, context=replace(state.context, step=last))
-        totals = _totals(data, episodes, terms, ends, now.over)
-        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), {}, terms)
+        totals = {n: total[None] for n, total in _totals(data, episodes, terms, ends, now.over).items()}
+        outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
         over = self._over(data, state, now.over, ends)
-        after = Environments(state, over, self.observe_all(data, state.context))
-        return (after, outcome), totals
+        return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def _draw_starts(self, data: ScenarioBank, key: Array, count: int) -> Any:
         """Draw where new episodes start, for ``count`` environments."""
@@ -226,11 +223,10 @@ class Driving:
             context = self._logged_context(bank, *index)
             return (dict(self._log_simulator.observe(bank, context)), *self._expert_action(bank, context))
 
-        def demonstrate_all(data: ScenarioBank, index: Any) -> tuple[ExpertActions, dict[str, Array]]:
-            return jax.vmap(_bind_bank(demonstrate, data))(*index), {}
-
         *index, _ = self._draw(data, key, count, CURRENT_STEP, has_action=True)
-        return map_over_devices(demonstrate_all, data, index)[0]
+        return map_over_devices(
+            lambda data, index: jax.vmap(_bind_bank(demonstrate, data))(*index), data, index
+        )
 
     def observe_recorded(self, data: ScenarioBank, index: StepIndex) -> dict[str, Array]:
         """Observe logged steps as in :meth:`demonstrations`."""
@@ -239,10 +235,7 @@ class Driving:
             scenario, slot = self._ego_of(data, row)
             return dict(self._log_simulator.observe(data, self._logged_context(data, scenario, step, slot)))
 
-        def observe_steps(data: ScenarioBank, index: StepIndex) -> tuple[dict[str, Array], dict[str, Array]]:
-            return jax.vmap(partial(observe, data))(*index), {}
-
-        return map_over_devices(observe_steps, data, index)[0]
+        return map_over_devices(lambda data, index: jax.vmap(partial(observe, data))(*index), data, index)
 
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.

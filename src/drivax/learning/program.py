@@ -122,6 +122,8 @@ class Program:
         if len(self.devices) > 1:
             self._layout = _layout(self._mesh, len(seeds.seeds), shapes)
             self._init = jax.jit(seeds.init, out_shardings=self._layout)
+            if self.devices[0].platform == "cpu":  # cores share memory, but only that of NumPy's arrays
+                data = jax.tree.map(np.asarray, data)
             data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
                 lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
@@ -264,26 +266,16 @@ def sum_over_devices(
     return summed(whole, divided)
 
 
-def map_over_devices(
-    function: Callable[[Any, Any], tuple[Any, dict[str, Array]]], whole: Any, divided: Any
-) -> tuple[Any, dict[str, Array]]:
-    """Return the rows and sums of a function; each device computes the rows of its share of ``divided``.
+def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any) -> Any:
+    """Return ``function(whole, divided)``; each device computes the rows of its share of ``divided``.
 
-    Rows lie along the first axis. Sums get an axis of devices, which the caller adds up: once after a loop, where the
-    compiler would do so in every step. If shares would differ, nothing is divided.
+    Rows lie along the first axis of all arrays. If shares would differ, nothing is divided.
     """
-
-    def share(whole: Any, divided: Any) -> tuple[Any, dict[str, Array]]:
-        rows, sums = function(whole, divided)
-        return rows, {name: value[None] for name, value in sums.items()}
-
     count = device_count()
     if count == 1 or any(leaf.shape[0] % count for leaf in jax.tree.leaves(divided)):
-        return share(whole, divided)
-    row = PartitionSpec(_AXIS)
-    return jax.shard_map(share, in_specs=(PartitionSpec(), row), out_specs=row, check_vma=False)(
-        whole, divided
-    )
+        return function(whole, divided)
+    specs = (PartitionSpec(), PartitionSpec(_AXIS))
+    return jax.shard_map(function, in_specs=specs, out_specs=specs[1], check_vma=False)(whole, divided)
 
 
 def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batch"]) -> Any:
