@@ -32,7 +32,7 @@ def chunk_size(batch: int) -> int:
 def in_chunks(batch: Any) -> Any:
     """Return a batch (leaves ``[sample, ...]``) as chunks ``[chunk, sample, ...]`` for :func:`sum_gradients`.
 
-    Devices that hold consecutive parts of the batch keep these: a chunk has samples of each.
+    Devices that hold consecutive shares of the batch keep these: a chunk has samples of each.
     """
     count = len(jax.tree.leaves(batch)[0])
     size, devices = chunk_size(count), device_count()
@@ -40,8 +40,8 @@ def in_chunks(batch: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), batch)
 
     def divide(leaf: Array) -> Array:
-        parts = leaf.reshape(devices, count // size, size // devices, *leaf.shape[1:])
-        return jnp.swapaxes(parts, 0, 1).reshape(-1, size, *leaf.shape[1:])
+        shares = leaf.reshape(devices, count // size, size // devices, *leaf.shape[1:])
+        return jnp.swapaxes(shares, 0, 1).reshape(-1, size, *leaf.shape[1:])
 
     return jax.tree.map(divide, batch)
 
