@@ -5,11 +5,12 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.learning.program import choose_devices
+from drivax.learning.program import _as_bits, _from_bits, choose_devices
 
 CASES = [
     ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("ppo", "two"), ("sac", "two"),
@@ -28,6 +29,24 @@ def test_cure_names_only_work_that_there_is(monkeypatch):
     ):
         with pytest.raises(UsageError, match=words):
             choose_devices(2, 1, state, batch)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.float32([np.nan, -0.0, np.inf, 1e-45, -1.5]),
+        np.float16([np.nan, -0.0, -np.inf, 6e-8]),
+        np.uint32([0, 2**31, 2**32 - 1]),
+        np.int32([-1, 2**31 - 1, -(2**31)]),
+        np.array([True, False]),
+    ],
+    ids=lambda values: str(values.dtype),
+)
+def test_devices_exchange_every_bit(values):
+    bits = _as_bits(jnp.asarray(values))
+    assert bits.dtype == np.int32
+    result = np.asarray(_from_bits(bits + jnp.zeros_like(bits), values.dtype))
+    assert result.dtype == values.dtype and result.tobytes() == values.tobytes()
 
 
 @pytest.mark.slow
