@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax import kernels
 from drivax.errors import UsageError, did_you_mean
-from drivax.kernels.observations import Ego, observe_agents, observe_road, observe_route
+from drivax.kernels.bindings import Ego, observe_agents, observe_road, observe_route
 from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
