@@ -15,9 +15,8 @@ from drivax.errors import UsageError
 from drivax.evaluation.rollout import evaluation_task
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
-from drivax.metrics.catalogue import METRICS, SETS
+from drivax.metrics.catalogue import METRICS, SETS, metric_specs, select_metrics
 from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
-from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
 from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator

@@ -25,9 +25,16 @@ from drivax.checks import (
 )
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, q_logs, sample_each, target_entropy
-from drivax.learning.algorithms.optimisers import add_auxiliary, clipped_adam, in_chunks, sum_gradients
+from drivax.learning.algorithms.optimisers import (
+    add_auxiliary,
+    average,
+    check_average,
+    clipped_adam,
+    in_chunks,
+    sum_gradients,
+    trained_parameters,
+)
 from drivax.learning.environment import (
     Environment,
     Environments,
