@@ -6,6 +6,7 @@ have fields ``parameters`` (of the planner), ``trained`` (None without an averag
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -75,6 +76,20 @@ def sum_gradients(
     # Without barriers the compiler fuses these sums with the program around them, and each program rounds differently.
     inputs = jax.lax.optimization_barrier((parameters, samples))
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
+
+
+def mean_gradients(
+    loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
+) -> tuple[dict[str, Array], Any]:
+    """Return logs and gradient as :func:`sum_gradients`, of a loss and logs that are means over samples."""
+    count = math.prod(jax.tree.leaves(samples)[0].shape[:2])
+
+    def share_of_loss(parameters: Any, chunk: Any) -> tuple[Array, dict[str, Array]]:
+        share = len(jax.tree.leaves(chunk)[0]) / count
+        value, logs = loss(parameters, chunk)
+        return share * value, {n: x if is_largest(n) else share * x for n, x in logs.items()}
+
+    return sum_gradients(share_of_loss, parameters, samples)
 
 
 def _combine(sums: tuple[dict[str, Array], Any], values: Any) -> tuple[dict[str, Array], Any]:
