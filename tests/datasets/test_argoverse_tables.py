@@ -184,6 +184,18 @@ def test_headers_of_pages_take_room(tmp_path, monkeypatch):
         read_table(path, COLUMNS)
 
 
+def test_messages_beyond_the_file_are_refused(tmp_path):
+    """pyarrow takes memory for the length that a message claims."""
+    path = write(tmp_path / "a.feather", pa.table({"x": np.zeros(8), "name": list("abcdefgh")}))
+    data = path.read_bytes()
+    length = max(message.body.size for message in pa.ipc.MessageReader.open_stream(data[8:]))
+    claimed = length.to_bytes(8, "little")
+    assert claimed in data
+    path.write_bytes(data.replace(claimed, (1 << 60).to_bytes(8, "little")))
+    with pytest.raises(DataError, match="a message outside the file"):
+        read_table(path, COLUMNS)
+
+
 def test_row_groups_that_share_pages_are_refused(tmp_path):
     path = write(tmp_path / "a.parquet", pa.table({"x": np.zeros(3), "name": list("abc")}))
     metadata = pq.read_metadata(path)

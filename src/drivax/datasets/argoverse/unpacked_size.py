@@ -101,8 +101,8 @@ def check_messages(source: Any) -> None:
             _check_batch(source, header, content, body, room, kind == _RECORD_BATCH)
         elif kind != _SCHEMA:
             raise ValueError(f"a message of kind {kind}")
-        if (size := _scalar(header, message, 3, "<q")) < 0:
-            raise ValueError("a message of negative length")
+        if not 0 <= (size := _scalar(header, message, 3, "<q")) <= source.size() - body:
+            raise ValueError("a message outside the file")
         position = body + size
     source.seek(_STREAM)
 
