@@ -87,8 +87,8 @@ class Polylines:
     def at(self, row: Array, s: Array) -> Float[Array, "*query dim"]:
         """Points at arc lengths ``s`` of polylines ``row`` (straight on beyond the ends)."""
         index, fraction = self.locate(np.asarray(row), np.asarray(s, dtype=np.float64))
-        begin = self.points[index]
-        return begin + fraction[..., None] * (self.points[index + 1] - begin)
+        begin = self.points.take(index, axis=0)
+        return begin + fraction[..., None] * (self.points.take(index + 1, axis=0) - begin)
 
     def heading(self, row: Array, s: Array, span_m: float = 1.0) -> Float[Array, "*query"]:
         """Heading at arc lengths ``s``: of the chord from half a span behind to half a span ahead, radians.
@@ -167,7 +167,7 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
         vertices, interval = np.flatnonzero(keep), keep.cumsum()[interior]
         begin, end = vertices[interval - 1], vertices[interval]
         distance, _ = _distance_to_chords(
-            [x[interior] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
+            [x.take(interior) - x.take(begin) for x in axes], [x.take(end) - x.take(begin) for x in axes]
         )
         first = _changes(interval)  # the first interior point of each interval
         farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
@@ -205,10 +205,10 @@ def resample(
     s = np.arange(count if most is None else min(count, most)) * spacing_m
     index = arc.searchsorted(s + 1e-9, side="right") - 1
     index = np.minimum(np.maximum(index, 0), len(points) - 2)
-    begin, start = points[index], arc[index]
+    begin, start = points.take(index, axis=0), arc[index]
     span = arc[index + 1] - start
     fraction = np.minimum(np.maximum((s - start) / np.where(span > 0.0, span, 1.0), 0.0), 1.0)
-    return begin + fraction[:, None] * (points[index + 1] - begin), index
+    return begin + fraction[:, None] * (points.take(index + 1, axis=0) - begin), index
 
 
 def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:

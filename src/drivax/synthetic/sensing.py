@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, corners, passage
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
-from drivax.scenario.schema import AgentKind
+from drivax.scenario.schema import AgentKind, nonzero
 
 #: Speed below which noise decreases, m/s, and its share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
@@ -113,7 +113,7 @@ def visible(
     distance = np.hypot(offset[..., 0], offset[..., 1])
     in_range = valid & valid[:1] & (distance <= config.range_m)
     in_range[0] = False
-    target, step = np.nonzero(in_range)
+    target, step = nonzero(in_range)
     is_visible = np.zeros(valid.shape, bool)
     is_visible[0] = valid[0]
     if not len(target):
@@ -158,7 +158,7 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
         reach += length[batch]
         may_cut &= ahead < reach
         may_cut &= near_rows[:, None] != targets
-        occluder, ray = np.nonzero(may_cut)
+        occluder, ray = nonzero(may_cut)
         pairs.append((ray + first, near_rows[occluder]))
     ray, occluder = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return ray, occluder

@@ -62,11 +62,12 @@ class Track:
         self, xy: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Stations and lateral offsets (left positive) of points."""
-        rel = xy[:, None] - self.xy
-        index = np.argmin(np.sum(rel**2, axis=-1), axis=1)
-        rel = rel[np.arange(len(xy)), index]
+        x, y = (np.subtract.outer(xy[:, axis], self.xy[:, axis]) for axis in (0, 1))
+        index = np.argmin(x**2 + y**2, axis=1)
+        nearest = np.arange(len(xy)), index
+        x, y = x[nearest], y[nearest]
         cos, sin = np.cos(self.heading[index]), np.sin(self.heading[index])
-        return STEP_M * index + rel[:, 0] * cos + rel[:, 1] * sin, rel[:, 1] * cos - rel[:, 0] * sin
+        return STEP_M * index + x * cos + y * sin, y * cos - x * sin
 
 
 def ego_track(motion: Motion) -> Track:

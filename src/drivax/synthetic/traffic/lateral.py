@@ -64,8 +64,8 @@ def displace_path(
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
     index = np.rint(source / step).astype(int)
-    lane = path.lane[index]
-    lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
+    lane = path.lane.take(index, axis=0)
+    lane_m = path.lane_m.take(index, axis=0) + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _enter_span(span, source, lane, lane_m)
     new_curve, step = interpolate_curve(new_curve, new, position), float(new[-1]) / (count - 1)
