@@ -248,9 +248,11 @@ def project_monotone(
     position is searched on the whole polyline, which needs two points, and ``window[0]`` is not used.
     """
     arc = arc_lengths(points)
-    (x, y), (step_x, step_y), span = points[:-1, :2].T, (points[1:, :2] - points[:-1, :2]).T, np.diff(arc)
+    (step_x, step_y), span, starts = (points[1:, :2] - points[:-1, :2]).T, np.diff(arc), arc[:-1]
     square = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
     divisor = np.maximum(span, 1e-12)
+    offset_x, offset_y = (np.subtract.outer(xy[:, axis], points[:-1, axis]) for axis in (0, 1))
+    feet = (offset_x * step_x + offset_y * step_y) / square * span
     result = np.zeros(len(xy))
     low, high = 0.0, arc[-1]
     for k in range(len(xy)):
@@ -258,16 +260,15 @@ def project_monotone(
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
         reach = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
-        along_x, along_y, length, begin = step_x[reach], step_y[reach], span[reach], arc[:-1][reach]
+        length, begin = span[reach], starts[reach]
         if not len(length):  # ``low`` is the end of the line, which begins no segment
             result[k] = low
             continue
-        offset_x, offset_y = xy[k, 0] - x[reach], xy[k, 1] - y[reach]
-        fraction = (offset_x * along_x + offset_y * along_y) / square[reach]
-        foot = np.minimum(np.maximum(fraction * length, low - begin), high - begin)
+        foot = np.minimum(np.maximum(feet[k, reach], low - begin), high - begin)
         foot = np.minimum(np.maximum(foot, 0.0), length)
         fraction = foot / divisor[reach]
-        residual_x, residual_y = offset_x - fraction * along_x, offset_y - fraction * along_y
+        residual_x = offset_x[k, reach] - fraction * step_x[reach]
+        residual_y = offset_y[k, reach] - fraction * step_y[reach]
         nearest = (residual_x * residual_x + residual_y * residual_y).argmin()
         result[k] = arc[i + nearest] + foot[nearest]
     return result

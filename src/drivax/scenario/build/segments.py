@@ -250,10 +250,11 @@ def road_rows(
     order = rank(group, path_distance(middle, path))[:most]
     overflow = +Counter(road_rows=len(owner) - len(order))
     owner, begin, span, middle, kind = owner[order], begin[order], span[order], middle[order], kind[order]
-    angle = _angle(roads, owner, begin, begin + span)
+    start, end = roads.lines.at(owner, begin), roads.lines.at(owner, begin + span)
+    angle = _angle(start, end)
     # Curvature is the turn from the first third to the last, over the distance of their middles.
-    first = _angle(roads, owner, begin, begin + span / 3)
-    last = _angle(roads, owner, begin + span * 2 / 3, begin + span)
+    first = _angle(start, roads.lines.at(owner, begin + span / 3))
+    last = _angle(roads.lines.at(owner, begin + span * 2 / 3), end)
     turn = wrap(last - first)
     limits = np.array([plausible_limit(feature) for feature in features], dtype=np.float64)
     return RoadRows(
@@ -268,10 +269,10 @@ def road_rows(
     )
 
 
-def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Array, " row"]:
-    """Angle of the chord between two arc lengths of each polyline."""
-    chord = roads.lines.at(line, end) - roads.lines.at(line, begin)
-    return np.arctan2(chord[..., 1], chord[..., 0])
+def _angle(begin: Float[Array, "row 3"], end: Float[Array, "row 3"]) -> Float[Array, " row"]:
+    """Angle of each chord."""
+    chord = end - begin
+    return np.arctan2(chord[:, 1], chord[:, 0])
 
 
 def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array, " row"]:

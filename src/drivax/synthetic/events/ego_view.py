@@ -147,10 +147,13 @@ class EgoView:
         """Lane of ego at a station (-1: none), the route's where several coincide."""
         xy, heading = self.track.place(station)
         points, headings, lane = self._lane_points
-        gap = np.hypot(*(points - xy).T)
-        is_near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
+        dx, dy = (points - xy).T
+        near = np.flatnonzero(dx * dx + dy * dy < 4.1)
+        gap = np.hypot(dx[near], dy[near])
+        is_near = (gap < 2.0) & (np.cos(headings[near] - heading) > 0.8)
         if not is_near.any():
             return -1
+        lane = lane[near]
         is_on_route = is_near & np.isin(lane, self.roles.route)
         is_candidate = is_on_route if is_on_route.any() else is_near
         return int(lane[is_candidate][np.argmin(gap[is_candidate])])

@@ -149,12 +149,14 @@ def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 
 def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, start: Pose) -> Curve:
     """Integrate curvature (1/m, one value per sample) to a curve by the midpoint rule."""
-    turns = (curvature[1:] + curvature[:-1]) * (step_m / 2)
-    heading = start.heading + np.concatenate([[0.0], np.cumsum(turns)])
+    heading, xy = np.zeros(len(curvature)), np.zeros((len(curvature), 2))
+    np.cumsum((curvature[1:] + curvature[:-1]) * (step_m / 2), out=heading[1:])
+    heading += start.heading
     middle = (heading[1:] + heading[:-1]) / 2
-    steps = step_m * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-    origin = np.array([[start.x, start.y]])
-    return Curve(np.concatenate([origin, origin + np.cumsum(steps, axis=0)]), heading)
+    np.cumsum(step_m * np.cos(middle), out=xy[1:, 0])
+    np.cumsum(step_m * np.sin(middle), out=xy[1:, 1])
+    xy += (start.x, start.y)
+    return Curve(xy, heading)
 
 
 def straight(start: Pose, length_m: float) -> Curve:

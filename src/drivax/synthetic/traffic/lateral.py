@@ -136,8 +136,8 @@ def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tupl
     if near_m is not None:
         first = max(0, int((near_m - 30.0) / path.step_m))
         last = max(first + 2, int((near_m + 30.0) / path.step_m))
-    gap = xy - path.curve.xy[first:last]
-    index = first + int(np.argmin(np.sum(gap**2, axis=1)))
+    gap_x, gap_y = (xy - path.curve.xy[first:last]).T
+    index = first + int(np.argmin(gap_x**2 + gap_y**2))
     heading = float(path.curve.heading[index])
     dx, dy = xy - path.curve.xy[index]
     along = dx * math.cos(heading) + dy * math.sin(heading)
