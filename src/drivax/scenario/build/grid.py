@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Int8, Int32
 
 from drivax.errors import DataError
 from drivax.scenario.build.segments import Segments, inside_box, path_distance
-from drivax.scenario.schema import Capacity, nonzero
+from drivax.scenario.schema import Capacity
 
 #: Nearer to an edge than this the edge itself decides (``scenario.bank.queries.EDGE_CUTOFF_M``), m.
 CUTOFF_M = 3.0
@@ -253,18 +253,18 @@ def _nearest_pairs(
     ``base`` is the column and row of each segment's midpoint, ``low`` the first column and row.
     """
     steps = np.arange(-int(np.ceil(_REACH_M / width)), int(np.ceil(_REACH_M / width)) + 1)
-    index = (base - low) @ np.array([1, shape[1]])
+    index, window = (base - low) @ np.array([1, shape[1]]), (shape[1] * steps[:, None] + steps).ravel()
     nearest, pairs = np.full(shape[0] * shape[1], np.inf), []
     # Blocks keep the tables in the processor's cache.
     for first in range(0, len(a), _BLOCK):
         block = slice(first, first + _BLOCK)
-        cell = index[block, None, None] + (shape[1] * steps[:, None] + steps)
+        cell = index[block, None] + window
         x, y = (((base[block, axis, None] + steps) + 0.5) * width for axis in (0, 1))
-        squared = _squared_distances(x, y, a[block], b[block])
-        nearer = squared < nearest.take(cell)
-        np.minimum.at(nearest, cell[nearer], squared[nearer])
-        near = nonzero(squared <= _almost(nearest.take(cell)))
-        pairs.append((near[0] + first, cell[near], squared[near]))
+        squared = _squared_distances(x, y, a[block], b[block]).reshape(cell.shape)
+        nearer = (squared < nearest.take(cell)).ravel().nonzero()[0]
+        np.minimum.at(nearest, cell.take(nearer), squared.take(nearer))
+        near = (squared <= _almost(nearest.take(cell))).ravel().nonzero()[0]
+        pairs.append((near // len(window) + first, cell.take(near), squared.take(near)))
     segment, cell, squared = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     # All segments that are nearest up to rounding: at a vertex there are two.
     keep = squared <= _almost(nearest[cell])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -84,13 +84,13 @@ class Segments:
             **{name: getattr(self, name).take(rows, axis=0) for name in self.__dataclass_fields__}
         )
 
-    @property
+    @cached_property
     def middle(self) -> Float[Array, "segment 2"]:
         """Midpoints in the plane of the end points rounded to float32."""
         ends = self.a[:, :2].astype(np.float32), self.b[:, :2].astype(np.float32)
         return ((ends[0] + ends[1]) * np.float32(0.5)).astype(np.float64)
 
-    @property
+    @cached_property
     def block(self) -> Int[Array, " segment"]:
         """Storage block: 0 road edge, 1 car lane, 2 the rest."""
         is_edge = among(self.kind, EDGE_KINDS)

@@ -136,7 +136,7 @@ class Pedestrians:
             for network, conflicts, times in zip(worlds.networks, self._conflicts, times_s, strict=True)
         ]
         self._remaining_red = np.concatenate(pad_steps(red_s), axis=1)
-        curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
+        curves = [pedestrian.samples for pedestrian in pedestrians]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         ends = np.cumsum(self._last + 1)
         self._begin, self._table = ends - self._last - 1, np.empty((ends[-1] if curves else 0, 3))
