@@ -5,12 +5,12 @@ import subprocess
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.learning.program import _as_bits, _from_bits, choose_devices
+from drivax.learning.program import choose_devices
+from drivax.tracking.workers import available_cores
 
 CASES = [
     ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("driving_td3_bc", "batches"),
@@ -19,6 +19,7 @@ CASES = [
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
     ("driving_self_ppo", "two"),
 ]  # fmt: skip
+DEVICES = "--xla_force_host_platform_device_count"
 
 
 def test_cure_names_only_work_that_there_is(monkeypatch):
@@ -32,30 +33,33 @@ def test_cure_names_only_work_that_there_is(monkeypatch):
             choose_devices(2, 1, state, batch)
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        np.float32([np.nan, -0.0, np.inf, 1e-45, -1.5]),
-        np.float16([np.nan, -0.0, -np.inf, 6e-8]),
-        np.uint32([0, 2**31, 2**32 - 1]),
-        np.int32([-1, 2**31 - 1, -(2**31)]),
-        np.array([True, False]),
-    ],
-    ids=lambda values: str(values.dtype),
-)
-def test_devices_exchange_every_bit(values):
-    bits = _as_bits(jnp.asarray(values))
-    assert bits.dtype == np.int32
-    result = np.asarray(_from_bits(bits + jnp.zeros_like(bits), values.dtype))
-    assert result.dtype == values.dtype and result.tobytes() == values.tobytes()
+def run_on_devices(count, file, *arguments, repository):
+    """Run a file of this folder in a process that simulates a number of devices."""
+    paths = (str(repository / folder) for folder in ("src", "tests", "tests/learning"))
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, str(repository / "tests" / "learning" / file), *arguments]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.stdout == "same\n", result.stderr
+
+
+@pytest.mark.parametrize("name", ["functions", "ppo", pytest.param("bc", marks=pytest.mark.slow)])
+def test_devices_exchange_little_and_resume(name, repository):
+    run_on_devices(2, "two_devices.py", name, repository=repository)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "extent"), CASES)
-def test_devices_and_seeds_learn_the_same_as_one_alone(name, extent, repository, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
-    folders = ("src", "tests", "tests/learning")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(repository / folder) for folder in folders))
-    command = [sys.executable, str(repository / "tests" / "learning" / "several_devices.py"), name, extent]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.stdout == "same\n", result.stderr
+def test_devices_and_seeds_learn_the_same_as_one_alone(name, extent, repository):
+    run_on_devices(4, "several_devices.py", name, extent, repository=repository)
+
+
+@pytest.mark.parametrize(
+    ("variables", "count"),
+    [({}, len(available_cores())), ({"JAX_NUM_CPU_DEVICES": "3"}, 3), ({"XLA_FLAGS": f"{DEVICES}=3"}, 3)],
+    ids=["default", "JAX_NUM_CPU_DEVICES", "XLA_FLAGS"],
+)
+def test_every_core_is_a_device_unless_the_user_sets_their_number(variables, count):
+    code = "from drivax.learning.program import use_all_cores as use; use(); import jax; print(jax.device_count())"
+    environment = os.environ | {"XLA_FLAGS": ""} | variables | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True) == f"{count}\n"

@@ -29,6 +29,8 @@ from drivax.tracking.workers import available_cores
 
 #: Threads of XLA's pool, enough to avoid deadlocks.
 _THREADS = 8
+#: Flag of XLA that sets the number of CPU devices.
+_DEVICE_FLAG = "--xla_force_host_platform_device_count"
 #: Axis of the mesh of devices that divide the work of one seed, and of those with whole seeds.
 _AXIS, _SEEDS = "devices", "seeds"
 
@@ -57,7 +59,12 @@ def widen_pool() -> None:
 
 
 def use_all_cores() -> None:
-    """Make every core of this process a JAX device; has no effect once JAX has started."""
+    """Make every core of this process a JAX device; has no effect once JAX has started.
+
+    ``JAX_NUM_CPU_DEVICES`` and the flag ``--xla_force_host_platform_device_count`` in ``XLA_FLAGS`` take precedence.
+    """
+    if jax.config.values["jax_num_cpu_devices"] >= 0 or _DEVICE_FLAG in os.environ.get("XLA_FLAGS", ""):
+        return
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", len(available_cores()))
 
@@ -248,24 +255,36 @@ def sum_over_devices(
 ) -> tuple[dict[str, Array], Any]:
     """Return the logs and sums of a function, summed over devices, each with its share of ``divided`` along an axis.
 
-    Of logs ``largest_*`` the result is the maximum. The sum is taken once, where the compiler would take it in every
-    step of a loop. If shares would differ, nothing is divided.
+    Logs, sums and ``whole`` are floating-point numbers; of logs ``largest_*`` the result is the maximum, NaN if any is
+    NaN. The sum is taken once, where the compiler would take it in every step of a loop. The gradient of a sum is
+    exchanged as one vector, too. If shares would differ, nothing is divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):
         return function(whole, divided)
     specs = (PartitionSpec(), PartitionSpec(*[None] * axis, _AXIS))
+    # Devices wait for each other once per array: parameters and sums are exchanged as one vector each.
+    parameters, unravel_parameters = ravel_pytree(whole)
 
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
-    def summed(whole: Any, share: Any) -> Any:
-        logs, sums = function(whole, share)
-        # Devices meet once for every array, so there is only one.
+    def summed(parameters: Array, share: Any) -> Any:
+        logs, sums = function(unravel_parameters(parameters), share)
         vector, unravel = ravel_pytree((logs, sums))
         total_logs, total = unravel(jax.lax.psum(vector, _AXIS))
-        largest = {name: jax.lax.pmax(log, _AXIS) for name, log in logs.items() if is_largest(name)}
+        # Unlike ``pmax`` on CPUs, this keeps NaN.
+        largest = {n: jax.lax.all_gather(log, _AXIS).max(axis=0) for n, log in logs.items() if is_largest(n)}
         return total_logs | largest, total
 
-    return summed(whole, divided)
+    return summed(parameters, divided)
+
+
+def compute_on_each_device(function: Callable[..., Any], *whole: Any) -> Any:
+    """Return ``function(*whole)``, which every device computes from whole arrays: its sums need no exchange."""
+    if device_count() == 1:
+        return function(*whole)
+    return jax.shard_map(function, in_specs=PartitionSpec(), out_specs=PartitionSpec(), check_vma=False)(
+        *whole
+    )
 
 
 def mean_over_devices(x: Array) -> Float[Array, ""]:
@@ -278,9 +297,10 @@ def mean_over_devices(x: Array) -> Float[Array, ""]:
 
 
 def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any) -> Any:
-    """Return ``function(whole, divided)``; each device computes the rows of its share of ``divided``.
+    """Return ``function(whole, divided)``, computed by each device for its share of ``divided``.
 
-    Rows lie along the first axis of all arrays. If shares would differ, nothing is divided.
+    Arrays of ``divided`` and of the result are divided along their first axis. A result that sums over it has one sum
+    per device, so give it an axis of size 1. If shares would differ, nothing is divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[0] % count for leaf in jax.tree.leaves(divided)):
@@ -290,13 +310,13 @@ def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: A
 
 
 def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batch"]) -> Any:
-    """Return ``leaf[row, column]`` of arrays whose columns devices may divide, whole on each device.
+    """Return ``leaf[row, column]`` of arrays ``[row, column, ...]`` that devices may divide by columns.
 
-    Bits are summed over devices, each of which has zeros for the columns of others. The compiler would exchange the
-    index for every leaf.
+    The result is whole on every device. Each device contributes the bits of its own columns, and zeros for others; the
+    compiler would exchange the index for every leaf. Indices must be in range: not negative, and less than the sizes.
     """
-    count = device_count()
-    if count == 1 or any(leaf.shape[1] % count for leaf in jax.tree.leaves(tree)):
+    count, leaves = device_count(), jax.tree.leaves(tree)
+    if count == 1 or any(leaf.shape[1] % count or not _has_bits(leaf.dtype) for leaf in leaves):
         return jax.tree.map(lambda leaf: leaf[row, column], tree)
     columns = PartitionSpec(None, _AXIS)
 
@@ -307,9 +327,8 @@ def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batc
         is_own = (own >= 0) & (own < size)
 
         def bits(leaf: Array) -> Array:
-            value = leaf[index[0], jnp.clip(own, 0, size - 1)]
-            mask = is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim))
-            return jnp.where(mask, _as_bits(value), 0)
+            value = _as_bits(leaf[index[0], jnp.clip(own, 0, size - 1)])
+            return jnp.where(is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim)), value, 0)
 
         vector, unravel = ravel_pytree(jax.tree.map(bits, share))
         return unravel(jax.lax.psum(vector, _AXIS))
@@ -317,18 +336,25 @@ def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batc
     return jax.tree.map(lambda leaf, bits: _from_bits(bits, leaf.dtype), tree, read(tree, (row, column)))
 
 
+def _has_bits(dtype: Any) -> bool:
+    """Return whether :func:`_as_bits` accepts a type: not random keys or complex numbers."""
+    return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+
+
 def _as_bits(value: Array) -> Array:
-    """Return the bits of numbers or truth values of at most four bytes as 32-bit integers."""
-    if jnp.issubdtype(value.dtype, jnp.floating):
-        value = jax.lax.bitcast_convert_type(value, jnp.dtype(f"int{8 * value.dtype.itemsize}"))
+    """Return the bits of an array as 32-bit integers: one per value, or for 64-bit types two along a last axis."""
+    if value.dtype != jnp.bool_:
+        size = min(value.dtype.itemsize, 4)
+        value = jax.lax.bitcast_convert_type(value, jnp.dtype(f"int{8 * size}"))
     return value.astype(jnp.int32)
 
 
 def _from_bits(bits: Array, dtype: Any) -> Array:
     """Return the values whose bits :func:`_as_bits` returned."""
-    if not jnp.issubdtype(dtype, jnp.floating):
+    if dtype == jnp.bool_:
         return bits.astype(dtype)
-    return jax.lax.bitcast_convert_type(bits.astype(jnp.dtype(f"int{8 * dtype.itemsize}")), dtype)
+    size = min(dtype.itemsize, 4)
+    return jax.lax.bitcast_convert_type(bits.astype(jnp.dtype(f"int{8 * size}")), dtype)
 
 
 def _layout(mesh: Mesh, is_stacked: bool, state: Any) -> Any:

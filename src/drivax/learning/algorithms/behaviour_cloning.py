@@ -26,7 +26,7 @@ from drivax.learning.experience import (
     require_log,
     sample_steps,
 )  # fmt: skip
-from drivax.learning.program import shard_axis
+from drivax.learning.program import sum_over_devices
 from drivax.networks.actor_critic import NetworkConfig, Policy, graph_of
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -96,24 +96,31 @@ class Cloning:
             batch = expert_actions(require_log(environment), data, index)
         else:
             batch = environment.demonstrations(data, key, self.batch)
-        observation, action, clipped = shard_axis(batch, axis=0)
-        return self.imitation_loss(policy(parameters, observation), action, ~(clipped & self.mask_clipped))
+
+        def sums(parameters: Any, samples: ExpertActions) -> tuple[dict[str, Array], Array]:
+            observation, action, clipped = samples
+            mask = ~(clipped & self.mask_clipped)
+            return self._sums(policy(parameters, observation), action, mask)
+
+        # As a whole: the compiler would exchange the gradient of each parameter.
+        return _mean(*sum_over_devices(sums, parameters, batch, axis=0), len(batch[1]))
 
     def imitation_loss(
         self, policy: Distribution, action: Float[Array, "B D"], mask: Bool[Array, " B"]
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """Return the mean loss of expert actions where ``mask`` holds, and values to log."""
+        return _mean(*self._sums(policy, action, mask), len(mask))
+
+    def _sums(
+        self, policy: Distribution, action: Float[Array, "B D"], mask: Bool[Array, " B"]
+    ) -> tuple[dict[str, Array], Float[Array, ""]]:
+        """Return the sums over steps where ``mask`` holds of values to log, 1 among them, and of the loss."""
         error = policy.mode() - action
         squared = self.loss == "mse"
         loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(action))
-        share = 1.0 / jnp.maximum(mask.sum(dtype=jnp.float32), 1.0)
-        mean = jnp.sum(loss * mask) * share
-        logs = {
-            "imitation": mean,
-            "imitation_error": jnp.sum(jnp.mean(jnp.abs(error), axis=-1) * mask) * share,
-            "left_out": 1.0 - mask.mean(dtype=jnp.float32),
-        }
-        return mean, logs
+        count, total = mask.sum(dtype=jnp.float32), jnp.sum(loss * mask)
+        logs = {"count": count, "imitation_error": jnp.sum(jnp.mean(jnp.abs(error), axis=-1) * mask)}
+        return logs, total
 
     def run_updates(
         self, carry: Carry, optimiser: optax.GradientTransformation, loss: AuxiliaryLoss, key: Array
@@ -201,6 +208,17 @@ class Bc:
         if isinstance(data, Experience):
             logs |= data.sizes()
         return BcState(*carry, key, state.iteration + 1), logs
+
+
+def _mean(sums: dict[str, Array], loss: Array, steps: int) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Return the mean loss and values to log, given the sums over the unmasked of these steps."""
+    share = 1.0 / jnp.maximum(sums["count"], 1.0)
+    logs = {
+        "imitation": loss * share,
+        "imitation_error": sums["imitation_error"] * share,
+        "left_out": 1.0 - sums["count"] / steps,
+    }
+    return logs["imitation"], logs
 
 
 def imitation_update(

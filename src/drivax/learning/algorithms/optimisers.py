@@ -38,12 +38,12 @@ def chunk_size(batch: int) -> int:
 def in_chunks(batch: Any) -> Any:
     """Return a batch (leaves ``[sample, ...]``) as chunks ``[chunk, sample, ...]`` for :func:`sum_gradients`.
 
-    Devices that hold consecutive shares of the batch keep these: a chunk has samples of each.
+    Each device has a consecutive share of the batch, and every chunk has as many samples of each share, so that no
+    sample moves to another device.
     """
     count = len(jax.tree.leaves(batch)[0])
-    size, devices = chunk_size(count), device_count()
-    if count == size or size % devices:
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), batch)
+    size = chunk_size(count)
+    devices = device_count() if size % device_count() == 0 else 1
 
     def divide(leaf: Array) -> Array:
         shares = leaf.reshape(devices, count // size, size // devices, *leaf.shape[1:])

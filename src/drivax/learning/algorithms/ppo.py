@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.checks import (
     MOST_SAMPLES,
@@ -43,7 +43,7 @@ from drivax.learning.environment import (
     past_policy,
     transition,
 )
-from drivax.learning.program import shard_axis
+from drivax.learning.program import compute_on_each_device, shard_axis
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig, graph_of
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -52,6 +52,8 @@ from drivax.scenario.record import record
 
 #: Parameters, the optimiser's state, and whether ``target_kl`` stopped the updates.
 _Carry = tuple[Any, ...]
+#: Arrays of a minibatch that are averaged before the gradient: every device has them whole.
+_WHOLE = ("alive", "advantage", "target")
 
 
 @dataclass(frozen=True)
@@ -273,7 +275,8 @@ class Ppo:
         order = jax.random.permutation(order_key, steps)
         order = order.reshape(minibatches, -1, chunk_size(steps // minibatches))
         # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
-        shuffled = shard_axis(jax.tree.map(lambda leaf: leaf[order], batch), axis=2)
+        whole, divided = _split(batch)
+        shuffled = compute_on_each_device(_read, whole, order) | shard_axis(_read(divided, order), axis=2)
         keys = jax.random.split(noise_key, minibatches)
         return jax.lax.scan(partial(self._update, auxiliary_loss), carry, (shuffled, keys))
 
@@ -323,25 +326,14 @@ class Ppo:
         self, parameters: Any, minibatch: dict[str, Any], key: Array, auxiliary_loss: AuxiliaryLoss | None
     ) -> tuple[dict[str, Array], Any]:
         """Return values to log, and the gradient of the loss of a minibatch ``[chunk, sample]``."""
-        alive, advantage, target = (minibatch[name] for name in ("alive", "advantage", "target"))
-        weight = alive / jnp.maximum(jnp.sum(alive), 1.0)
-
-        def deviations(value: Array) -> tuple[Array, Array]:
-            """Return differences from the mean of the minibatch, and the variance."""
-            difference = value - jnp.sum(value * weight)
-            return difference, jnp.sum(difference**2 * weight)
-
+        whole, samples = _split(minibatch)
+        normalised, variance = compute_on_each_device(_normalise, whole)
         entropy_key, auxiliary_key = jax.random.split(key)
-        advantage, variance = deviations(advantage)
-        samples = minibatch | {
-            "advantage": advantage / (jnp.sqrt(variance) + 1e-8),
-            "weight": weight,
-            # A key per sample: its noise does not depend on the chunks.
-            "key": jax.random.split(entropy_key, weight.shape),
-        }
+        # A key per sample: its noise does not depend on the chunks.
+        keys = jax.random.split(entropy_key, normalised["weight"].shape)
+        samples |= normalised | {"key": keys}
         logs, gradient = sum_gradients(self._loss, parameters, samples)
-        variance = jnp.maximum(deviations(target)[1], 1e-8)
-        logs["explained_variance"] = 1.0 - logs["value"] / variance
+        logs["explained_variance"] = 1.0 - logs["value"] / jnp.maximum(variance, 1e-8)
         return add_auxiliary(auxiliary_loss, parameters, auxiliary_key, logs, gradient)
 
     def _loss(self, parameters: Any, samples: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
@@ -362,6 +354,32 @@ class Ppo:
         logs = {name: jnp.sum(value * weight) for name, value in values.items()}
         value_loss, entropy_bonus = config.value_coefficient * logs["value"], logs["entropy"]
         return logs["policy"] + value_loss - config.entropy_coefficient * entropy_bonus, logs
+
+
+def _read(batch: dict[str, Any], order: Int[Array, "*samples"]) -> dict[str, Any]:
+    """Return the samples of a batch in an order."""
+    return jax.tree.map(lambda leaf: leaf[order], batch)
+
+
+def _split(minibatch: dict[str, Any]) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the arrays that every device has whole, and those of which each device has its share."""
+    whole = {name: minibatch[name] for name in _WHOLE}
+    return whole, {name: value for name, value in minibatch.items() if name not in whole}
+
+
+def _normalise(samples: dict[str, Array]) -> tuple[dict[str, Array], Float[Array, ""]]:
+    """Return weights with sum 1, normalised advantages and targets of samples, and the variance of targets."""
+    weight = samples["alive"] / jnp.maximum(jnp.sum(samples["alive"]), 1.0)
+
+    def deviations(value: Array) -> tuple[Array, Array]:
+        """Return differences from the mean of the minibatch, and the variance."""
+        difference = value - jnp.sum(value * weight)
+        return difference, jnp.sum(difference**2 * weight)
+
+    advantage, variance = deviations(samples["advantage"])
+    advantage = advantage / (jnp.sqrt(variance) + 1e-8)
+    normalised = {"weight": weight, "advantage": advantage, "target": samples["target"]}
+    return normalised, deviations(samples["target"])[1]
 
 
 @dataclass(frozen=True)
