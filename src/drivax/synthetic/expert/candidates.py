@@ -112,7 +112,7 @@ def shift_path(
 
 def _speeds(curve: Curve, limit_mps: _Points, drivers: Drivers) -> tuple[_Points, _Points]:
     """Return the preferred speeds of ego along a curve, and the largest ones in bends."""
-    curvature, no_lanes = mean_curvature(curve, SPACING_M), np.full((len(limit_mps), 1), -1)
+    curvature, no_lanes = mean_curvature(curve, SPACING_M), np.full((len(limit_mps), 1), -1, np.int32)
     path = Path(curve, SPACING_M, curvature, limit_mps, (), no_lanes, np.zeros((len(limit_mps), 1)))
     driver = drivers.speed_factor[0], drivers.lateral_mps2[0], drivers.slowing_mps2[0]
     bend = np.maximum(np.abs(curvature), 1e-6)
