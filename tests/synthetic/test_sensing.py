@@ -170,7 +170,7 @@ class Extreme(np.random.Generator):
         super().__init__(np.random.PCG64(seed))
 
     def normal(self, loc=0.0, scale=1.0, size=None):
-        return 1e6 * self.choice([-1.0, 1.0], size=(size[0], 1)) * np.ones(size)
+        return 1e6 * self.choice([-1.0, 1.0], size=(*size[:-1], 1)) * np.ones(size)
 
 
 #: The longest vehicles of the world (buses), cars, and pedestrians.
