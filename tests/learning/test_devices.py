@@ -43,7 +43,10 @@ def run_on_devices(count, file, *arguments, repository):
     assert result.stdout == "same\n", result.stderr
 
 
-@pytest.mark.parametrize("name", ["functions", "ppo", pytest.param("bc", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    ["functions", "ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "driving_cql"))],
+)
 def test_devices_exchange_little_and_resume(name, repository):
     run_on_devices(2, "two_devices.py", name, repository=repository)
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from test_resume import ALGORITHMS, SHOWN
+from several_devices import problem
 
 from drivax.learning.algorithms.optimisers import in_chunks
 from drivax.learning.program import (
@@ -24,11 +24,10 @@ from drivax.learning.program import (
     sum_over_devices,
 )
 from drivax.tracking.checkpoints import Checkpoints
-from pendulum import Pendulum
 
 TYPES = (jnp.float32, jnp.bfloat16, jnp.uint32, jnp.int8, jnp.float64, jnp.int64)
 #: Most exchanges per update of each algorithm, however many parameters there are.
-EXCHANGES = {"ppo": 1, "bc": 3}
+EXCHANGES = {"ppo": 1, "bc": 3, "driving_cql": 3}
 MESH = jax.sharding.Mesh(np.array(jax.devices()), (_AXIS,))
 
 
@@ -113,7 +112,8 @@ def exchanges(program):
 
 def check_training(name):
     """An update exchanges one vector; restored from disk, a run logs what it logs without an interruption."""
-    program = Program(Seeds(ALGORITHMS[name].build(Pendulum(), SHOWN, 6), (3,)), SHOWN, 2)
+    learner, data = problem(name)
+    program = Program(Seeds(learner, (3,)), data, 2)
     sizes = exchanges(program)
     assert sum(map(len, sizes)) <= EXCHANGES[name], sizes
     state, rows = program.initial_state(), []

@@ -40,7 +40,7 @@ class LearnerState(Protocol):
 class Learner(Protocol):
     """An algorithm in one environment; everything computed is in the state.
 
-    A learner that divides its batches among devices (``program.shard_axis``) has their size as attribute ``batch``.
+    A learner that divides its batches among devices has their size as attribute ``batch``.
     """
 
     def init(self, data: Any, key: Array) -> Any:

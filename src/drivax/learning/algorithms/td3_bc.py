@@ -80,10 +80,8 @@ class Td3Bc(Offline[Td3BcConfig]):
         policy_q = self.q_values(jax.lax.stop_gradient(trained["critic"]), observation, action)[0]
         error = action - expert
         imitation = jnp.mean(error**2)
-        policy = (
-            config.q_weight * jnp.mean(scaled_policy_loss(-policy_q, mean_over_devices(jnp.abs(policy_q))))
-            + imitation
-        )
+        scaled = scaled_policy_loss(-policy_q, mean_over_devices(jnp.abs(policy_q)))
+        policy = config.q_weight * jnp.mean(scaled) + imitation
         return critic_loss + policy, {
             "critic": critic_loss,
             "policy": policy,
