@@ -18,6 +18,7 @@ CASES = [
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
     ("driving_self_ppo", "two"),
 ]  # fmt: skip
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "sac")]
 DEVICES = "--xla_force_host_platform_device_count"
 
 
@@ -42,7 +43,7 @@ def run_on_devices(count, file, *arguments, repository):
     assert result.stdout == "same\n", result.stderr
 
 
-@pytest.mark.parametrize("name", ["functions", "ppo", pytest.param("bc", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["functions", "ppo", *SLOW])
 def test_devices_exchange_little_and_resume(name, repository):
     run_on_devices(2, "two_devices.py", name, repository=repository)
 

@@ -28,7 +28,7 @@ from pendulum import Pendulum
 
 TYPES = (jnp.float32, jnp.bfloat16, jnp.uint32, jnp.int8, jnp.float64, jnp.int64)
 #: Most exchanges per update of each algorithm, however many parameters there are.
-EXCHANGES = {"ppo": 1, "bc": 3}
+EXCHANGES = {"ppo": 1, "bc": 3, "sac": 6}
 MESH = jax.sharding.Mesh(np.array(jax.devices()), (_AXIS,))
 
 
