@@ -283,9 +283,9 @@ def test_curves_show_every_seed(script, learning):
 
 def test_speed_page_shows_ratios_against_the_earlier_state(script, stored):
     ratios = script("speed.ratios")
-    for kernels, (begin, end) in ratios.MARKERS.items():
-        table = ratios.table(stored("speed_ratios")["kernel_rows" if kernels else "rows"], kernels)
-        assert f"{begin}\n\n{table}\n\n{end}" in ratios.PAGE.read_text()
+    for comparison in ratios.COMPARISONS:
+        table = ratios.table(stored("speed_ratios")[comparison.key], comparison)
+        assert f"{comparison.begin}\n\n{table}\n\n{comparison.end}" in ratios.PAGE.read_text()
 
 
 def test_robustness_page_shows_stored_outcomes(script, stored):

@@ -3,9 +3,11 @@
     git worktree add ../before COMMIT
     python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
     python -m experiments.speed.ratios --data SET --kernels [--only NAME ...] [--write]
+    python -m experiments.speed.ratios --data SET --cores [--only NAME ...] [--write]
 
-With ``--kernels``, this tree is timed without native kernels against itself with them; with ``--against``, both trees
-run without. Both sides train the presets of the first.
+With ``--against``, both trees run without native kernels; with ``--kernels``, this tree is timed without them against
+itself with them; with ``--cores``, with them on one core against itself on all cores. Both sides train the presets of
+the first.
 
 SET has at least 1,024 scenarios, and both trees can open it. Each tree runs in processes of its own. A repeated
 measurement keeps one process per tree alive, runs both by turns, and quotes the median of the ratios of neighbouring
@@ -36,12 +38,29 @@ from experiments.speed.machine import HEADINGS, cells, conditions
 
 RESULT = RESULTS / "speed_ratios.json"
 PAGE = DOCS / "results" / "speed.md"
-#: Markers around the table of trees and that of kernels.
-MARKERS = {
-    False: ("<!-- ratios.py: begin -->", "<!-- ratios.py: end -->"),
-    True: ("<!-- ratios.py kernels: begin -->", "<!-- ratios.py kernels: end -->"),
-}
 
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the two sides are: key of the rows in the result, markers around the table, and headings of its sides."""
+
+    key: str
+    begin: str
+    end: str
+    sides: tuple[str, str]
+
+
+TREES = Comparison("rows", "<!-- ratios.py: begin -->", "<!-- ratios.py: end -->", ("before", "after"))
+KERNELS = Comparison(
+    "kernel_rows", "<!-- ratios.py kernels: begin -->", "<!-- ratios.py kernels: end -->", ("without", "with")
+)
+CORES = Comparison(
+    "core_rows", "<!-- ratios.py cores: begin -->", "<!-- ratios.py cores: end -->", ("one core", "two cores")
+)
+COMPARISONS = (TREES, KERNELS, CORES)
+
+#: Pins a program to one core; it comes before anything that starts JAX.
+_ONE_CORE = "import os; os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})\n"
 #: Setup that several programs share: the first scenarios of the set, as a bank.
 _BANK = """
 import jax
@@ -80,10 +99,11 @@ def trainer(preset, *overrides, prepare=lambda algorithm, environment, bank: ban
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two sides that are compared: a tree, with variables of the environment."""
+    """One of the two sides that are compared: a tree, with variables of the environment, on all cores or on one."""
 
     tree: Path
     variables: Mapping[str, str] = field(default_factory=dict)
+    one_core: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,10 +112,9 @@ class Repeated:
 
     unit: str
     program: str
-    goal: str
+    #: By comparison; those without a goal are measured only when they are named.
+    goals: Mapping[Comparison, str] = field(default_factory=dict)
     warm_up: int = 1
-    #: The goal of native kernels.
-    kernels_goal: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,7 +123,7 @@ class Command:
 
     words: Sequence[str]
     until: str | None
-    goal: str
+    goals: Mapping[Comparison, str] = field(default_factory=dict)
 
 
 _EVALUATE = ("evaluate", "--planner", "idm", "--data", "DATA", "--limit", "4", "--out", "OUT")
@@ -112,23 +131,21 @@ _TRAIN = ("train", "ppo", "--data", "DATA", "--out", "OUT")
 #: What is timed, with the goal: what must be reached, and the aim in parentheses.
 MEASUREMENTS: dict[str, Repeated | Command] = {
     "PPO training": Repeated(
-        "steps/s", _TRAINING + "call = trainer('ppo')", "1.4 x (1.8 x)", kernels_goal="1.8 x (3 x)"
+        "steps/s",
+        _TRAINING + "call = trainer('ppo')",
+        {TREES: "1.4 x (1.8 x)", KERNELS: "1.8 x (3 x)", CORES: "1.8 x"},
     ),
     "PPO training, one core": Repeated(
         "steps/s",
-        "import os; os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})\n"
-        + _TRAINING
-        + "call = trainer('ppo', '--devices', '1')",
-        "",
-        kernels_goal="2.0 x (3 x)",
+        _ONE_CORE + _TRAINING + "call = trainer('ppo', '--devices', '1')",
+        {KERNELS: "2.0 x (3 x)"},
     ),
     # Updates begin after 512 steps instead of 10,000.
     "SAC training": Repeated(
         "steps/s",
         _TRAINING + "call = trainer('sac', '--algorithm.warm_up', '512')",
-        "1.2 x (1.5 x)",
+        {TREES: "1.2 x (1.5 x)", KERNELS: "2.0 x (3 x)"},
         warm_up=3,
-        kernels_goal="2.0 x (3 x)",
     ),
     "offline training (CQL)": Repeated(
         "steps/s",
@@ -137,8 +154,7 @@ MEASUREMENTS: dict[str, Repeated | Command] = {
 from drivax.learning.algorithm import training_data
 call = trainer('offline/cql', prepare=training_data)
 """,
-        "",
-        kernels_goal="2.0 x (3 x)",
+        {KERNELS: "2.0 x (3 x)"},
     ),
     "simulator, full, log": Repeated(
         "steps/s",
@@ -153,8 +169,7 @@ def call():
     jax.block_until_ready(program.run())
     return program.steps
 """,
-        "1.1 x (1.3 x)",
-        kernels_goal="1.3 x (3 x)",
+        {TREES: "1.1 x (1.3 x)", KERNELS: "1.3 x (3 x)"},
     ),
     "PDM-Closed evaluation": Repeated(
         "scenarios/s",
@@ -168,8 +183,7 @@ planner = make_planner("pdm", None)
 def call():
     return len(evaluate(planner, bank, names))
 """,
-        "3 x (10 x)",
-        kernels_goal="1.3 x (3 x)",
+        {TREES: "3 x (10 x)", KERNELS: "1.3 x (3 x)"},
     ),
     "generation, one core": Repeated(
         "scenarios/s",
@@ -183,7 +197,7 @@ def call():
     seed[0] += 1
     return 128
 """,
-        "2 x (4 x)",
+        {TREES: "2 x (4 x)"},
     ),
     "bank building": Repeated(
         "scenarios/s",
@@ -194,12 +208,12 @@ def call():
     jax.block_until_ready(ScenarioBank.from_scenarios(scenarios))
     return len(scenarios)
 """,
-        "2,000/s (5,000/s)",
+        {TREES: "2,000/s (5,000/s)"},
     ),
-    "evaluate, 4 scenarios, first": Command(_EVALUATE, None, "12 s (8 s)"),
-    "evaluate, 4 scenarios, again": Command(_EVALUATE, None, "5 s (3 s)"),
-    "train to its first iteration, first": Command(_TRAIN, "metrics.jsonl", ""),
-    "train to its first iteration, again": Command(_TRAIN, "metrics.jsonl", "15 s (8 s)"),
+    "evaluate, 4 scenarios, first": Command(_EVALUATE, None, {TREES: "12 s (8 s)"}),
+    "evaluate, 4 scenarios, again": Command(_EVALUATE, None, {TREES: "5 s (3 s)"}),
+    "train to its first iteration, first": Command(_TRAIN, "metrics.jsonl"),
+    "train to its first iteration, again": Command(_TRAIN, "metrics.jsonl", {TREES: "15 s (8 s)"}),
 }
 #: Runs what it was given for each line of input; prints the work done and the seconds.
 _LOOP = """
@@ -222,20 +236,19 @@ def environment(side: Side, cache: str) -> dict[str, str]:
 
 
 def check_kernels(sides: Sequence[Side]) -> None:
-    """Check that native kernels are in use on the second side only.
+    """Check that native kernels are in use on every side that does not switch them off.
 
     Raises:
-        SystemExit: They are not.
+        SystemExit: They are not, or are in use on another side.
     """
     program = "from drivax import kernels; print(kernels.in_use(), kernels.state())"
-    for side, expected in zip(sides, ("False", "True"), strict=True):
+    for side in sides:
         command = [sys.executable, "-c", program]
         output = subprocess.check_output(command, env=environment(side, ""), text=True)
         in_use, _, state = output.strip().partition(" ")
-        if in_use != expected:
-            raise SystemExit(
-                f"nothing to compare {'with' if expected == 'True' else 'without'} kernels: {state}"
-            )
+        expected = side.variables.get("DRIVAX_NATIVE") != "0"
+        if in_use != str(expected):
+            raise SystemExit(f"nothing to compare {'with' if expected else 'without'} kernels: {state}")
 
 
 class Worker:
@@ -243,7 +256,8 @@ class Worker:
 
     def __init__(self, side: Side, program: str, data: Path, presets: Path, cache: str) -> None:
         constants = f"DATA, PRESETS = {str(data)!r}, {str(presets)!r}"
-        command = [sys.executable, "-c", f"{constants}\n{program}\n{_LOOP}"]
+        pinned = _ONE_CORE if side.one_core else ""
+        command = [sys.executable, "-c", f"{constants}\n{pinned}{program}\n{_LOOP}"]
         self._process = subprocess.Popen(
             command,
             env=environment(side, cache),
@@ -375,16 +389,15 @@ def measure(names: Sequence[str], sides: Sequence[Side], data: Path, repeats: in
     return rows
 
 
-def table(rows: Mapping[str, Any], kernels: bool = False) -> str:
+def table(rows: Mapping[str, Any], comparison: Comparison = TREES) -> str:
     """Return the Markdown table of stored ratios."""
+    first, second = comparison.sides
     lines = [
-        f"| what | ratio | goal (aim) | {'without' if kernels else 'before'} | {'with' if kernels else 'after'} | unit "
-        f"| {HEADINGS} |",
+        f"| what | ratio | goal (aim) | {first} | {second} | unit | {HEADINGS} |",
         "|---|---:|---|---:|---:|---|---|---|",
     ]
     for name, row in rows.items():
-        measurement = MEASUREMENTS[name]
-        goal = measurement.kernels_goal if kernels and isinstance(measurement, Repeated) else measurement.goal
+        goal = MEASUREMENTS[name].goals.get(comparison, "")
         lines.append(
             f"| {name} | {row['ratio']} | {goal} | {row['before']:,} "
             f"| {row['after']:,} | {row['unit']} | {cells(row)} |"
@@ -393,15 +406,13 @@ def table(rows: Mapping[str, Any], kernels: bool = False) -> str:
 
 
 def write_tables(result: Mapping[str, Any]) -> None:
-    """Put both tables into the page."""
-    for kernels, markers in MARKERS.items():
-        before, rest = PAGE.read_text().split(markers[0])
-        inserted = f"{markers[0]}\n\n{table(result.get(_key(kernels), {}), kernels)}\n\n{markers[1]}"
-        PAGE.write_text(before + inserted + rest.split(markers[1])[1])
-
-
-def _key(kernels: bool) -> str:
-    return "kernel_rows" if kernels else "rows"
+    """Put all tables into the page."""
+    for comparison in COMPARISONS:
+        before, rest = PAGE.read_text().split(comparison.begin)
+        rows = table(result.get(comparison.key, {}), comparison)
+        PAGE.write_text(
+            f"{before}{comparison.begin}\n\n{rows}\n\n{comparison.end}{rest.split(comparison.end)[1]}"
+        )
 
 
 def main() -> None:
@@ -412,38 +423,36 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--against", type=Path, help="root of the other tree")
     parser.add_argument("--kernels", action="store_true", help="this tree without and with native kernels")
+    parser.add_argument("--cores", action="store_true", help="this tree with them, on one core and on all")
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--write", action="store_true", help="store the rows; others stay")
     parser.add_argument("--table", action="store_true", help="write the stored rows into the page")
     args = parser.parse_args()
     if not args.table:
-        if args.data is None or (args.against is None) != args.kernels:
-            parser.error("needs --data, and one of --against and --kernels")
+        if args.data is None or (args.against is not None) + args.kernels + args.cores != 1:
+            parser.error("needs --data, and one of --against, --kernels and --cores")
+        without = Side(ROOT, {"DRIVAX_NATIVE": "0"})
         if args.kernels:
-            sides = Side(ROOT, {"DRIVAX_NATIVE": "0"}), Side(ROOT)
+            comparison, sides = KERNELS, (without, Side(ROOT))
+            check_kernels(sides)
+        elif args.cores:
+            comparison, sides = CORES, (Side(ROOT, one_core=True), Side(ROOT))
             check_kernels(sides)
         else:
-            sides = Side(args.against.resolve()), Side(ROOT, {"DRIVAX_NATIVE": "0"})
-        names = args.only or [name for name, row in MEASUREMENTS.items() if _has_goal(row, args.kernels)]
+            comparison, sides = TREES, (Side(args.against.resolve()), without)
+        names = args.only or [name for name, row in MEASUREMENTS.items() if comparison in row.goals]
         rows = measure(names, sides, args.data.resolve(), args.repeats)
         if args.write:
             result = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-            key = _key(args.kernels)
-            stored = result.get(key, {}) | rows
-            result[key] = {name: stored[name] for name in MEASUREMENTS if name in stored}
+            stored = result.get(comparison.key, {}) | rows
+            result[comparison.key] = {name: stored[name] for name in MEASUREMENTS if name in stored}
             result["command"] = (
-                "python -m experiments.speed.ratios --data SET [--against TREE | --kernels] --write"
+                "python -m experiments.speed.ratios --data SET [--against TREE | --kernels | --cores] --write"
             )
             write_json(RESULT, result | {"versions": versions()})
     if args.write or args.table:
         write_tables(json.loads(RESULT.read_text()))
-
-
-def _has_goal(measurement: Repeated | Command, kernels: bool) -> bool:
-    if kernels:
-        return isinstance(measurement, Repeated) and bool(measurement.kernels_goal)
-    return not (isinstance(measurement, Repeated) and not measurement.goal)
 
 
 if __name__ == "__main__":

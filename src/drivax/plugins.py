@@ -1,4 +1,4 @@
-"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files.
+"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files; their names.
 
 A name that the user writes resolves anywhere. A name in data (a run folder, a policy, a score table) resolves only to a
 component of drivax, or within a module that the user trusts.
@@ -13,7 +13,7 @@ import inspect
 import re
 import sys
 import typing
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -234,3 +234,22 @@ def protocol_members(protocol: Any) -> list[str]:
             members = [*vars(cls).get("__annotations__", {}), *vars(cls)]
             names += [n for n in members if not n.startswith("_") and n not in names]
     return names
+
+
+def name_of(function: Any, name: str = "") -> str:
+    """Return ``name``, or that of the function, or that of its class in snake_case."""
+    name = name or getattr(function, "__name__", None) or ""
+    if not name:
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(function).__name__).lower()
+    if not name.isidentifier():
+        raise ValueError(f"{name!r} is not a name; pass one with name=")
+    return name
+
+
+def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
+    """Check that names are distinct and not taken."""
+    used = set(taken)
+    for name in names:
+        if name in used:
+            raise ValueError(f"{section}: name {name!r} is taken; pass another with name=")
+        used.add(name)

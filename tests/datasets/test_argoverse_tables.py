@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -115,6 +117,41 @@ def test_small_files_that_become_large_are_refused(tmp_path, form, options, word
     assert caught.value.file == path and "\n" not in str(caught.value)
 
 
+def test_columns_are_checked_by_their_place(tmp_path):
+    path = small_file_of_150_mb(tmp_path / "a.parquet", compression="zstd", use_dictionary=False)
+    head, found, rest = path.read_bytes().rpartition(b"\x04name")
+    path.write_bytes(head + found.replace(b"a", b"o") + rest)
+    assert pq.read_metadata(path).row_group(0).column(0).path_in_schema == "nome"
+    with memory_below(5e6), pytest.raises(DataError, match="unpacks to more than 134 MB"):
+        read_table(path, COLUMNS)
+
+
+def test_damaged_footers_do_not_end_the_process(tmp_path):
+    path = write(tmp_path / "a.parquet", pa.table({"x": np.arange(3.0), "name": list("abc")}))
+    program = """
+import struct, sys
+from pathlib import Path
+from drivax.datasets.argoverse.tables import read_table
+from drivax.errors import DataError
+path = Path(sys.argv[1])
+data = path.read_bytes()
+refused = 0
+for place in range(len(data) - 8 - struct.unpack("<I", data[-8:-4])[0], len(data)):
+    for flip in (1, 4):
+        path.write_bytes(data[:place] + bytes([data[place] ^ flip]) + data[place + 1 :])
+        try:
+            read_table(path, {"name": "text", "x": "number"})
+        except DataError:
+            refused += 1
+print(refused)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 100
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize(
     ("limit", "words"), [("MOST_ROWS", "more than 7 rows"), ("MOST_BYTES", "more than 7 bytes")]
@@ -144,6 +181,18 @@ def test_headers_of_pages_take_room(tmp_path, monkeypatch):
     read_table(path, COLUMNS)
     monkeypatch.setattr(unpacked_size, "MOST_BYTES", with_headers - 1)
     with pytest.raises(DataError, match="unpacks to more than"):
+        read_table(path, COLUMNS)
+
+
+def test_messages_beyond_the_file_are_refused(tmp_path):
+    """pyarrow takes memory for the length that a message claims."""
+    path = write(tmp_path / "a.feather", pa.table({"x": np.zeros(8), "name": list("abcdefgh")}))
+    data = path.read_bytes()
+    length = max(message.body.size for message in pa.ipc.MessageReader.open_stream(data[8:]))
+    claimed = length.to_bytes(8, "little")
+    assert claimed in data
+    path.write_bytes(data.replace(claimed, (1 << 60).to_bytes(8, "little")))
+    with pytest.raises(DataError, match="a message outside the file"):
         read_table(path, COLUMNS)
 
 

@@ -10,8 +10,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.result_tables import planners_table
 from drivax.evaluation.rollout import evaluation_task
 from drivax.evaluation.runner import EvaluationConfig, evaluate, run_evaluation
-from drivax.metrics.catalogue import Metric
-from drivax.metrics.selection import select_metrics
+from drivax.metrics.catalogue import Metric, select_metrics
 from drivax.metrics.steps import STEP_VALUES, StepValue
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.report import explanations

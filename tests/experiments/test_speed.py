@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from drivax.tracking.workers import available_cores
 from experiment_scripts import load_script
 
 
@@ -38,9 +39,16 @@ def test_ratio_of_two_trees_is_that_of_their_work(ratios, tmp_path):
         (tmp_path / name / "src").mkdir(parents=True)
         (tmp_path / name / "src" / "drivax.py").write_text(f"COST = {cost}")
     sides = [ratios.Side(tmp_path / name) for name in ("before", "after")]
-    row = ratios.repeated(ratios.Repeated("calls/s", program, ""), sides, tmp_path, 3)
+    row = ratios.repeated(ratios.Repeated("calls/s", program), sides, tmp_path, 3)
     assert row["ratio"] == pytest.approx(3, rel=0.2)
     assert row["before"] == pytest.approx(1 / 0.06, rel=0.2)
+
+
+def test_side_on_one_core_is_pinned_to_it(ratios, tmp_path):
+    program = "import os, time\ndef call():\n    time.sleep(0.05)\n    return len(os.sched_getaffinity(0))"
+    sides = [ratios.Side(tmp_path, one_core=one_core) for one_core in (True, False)]
+    row = ratios.repeated(ratios.Repeated("cores/s", program), sides, tmp_path, 3)
+    assert row["ratio"] == pytest.approx(len(available_cores()), rel=0.3)
 
 
 def test_failed_program_is_an_error(ratios, tmp_path):

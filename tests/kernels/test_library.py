@@ -352,10 +352,10 @@ def test_devices_divide_a_batch_and_its_gradient():
 
 @needs_kernels
 def test_compiled_programs_name_the_build():
-    from drivax.kernels import set_encoder
+    from drivax.kernels.bindings import encode_sets
 
     layers = [(jnp.ones((3, 32)), jnp.zeros(32)), (jnp.ones((32, 32)), jnp.zeros(32))]
-    text = jax.jit(set_encoder.encode).lower(layers, jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)).as_text()
+    text = jax.jit(encode_sets).lower(layers, jnp.ones((2, 4, 3)), jnp.ones((2, 4), bool)).as_text()
     digest = kernels.state().split()[-1]
     assert f"drivax_encode_sets_{digest}" in text
 

@@ -11,7 +11,9 @@ import numpy as np
 from test_resume import ALGORITHMS, SHOWN
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.loop import train
@@ -33,6 +35,12 @@ from drivax.tracking.sinks import read_rows
 from pendulum import Pendulum
 from tiny_algorithms import TINY
 
+#: With losses that are scaled by a mean over the batch, where there are any.
+OFFLINE = {
+    "driving_iql": IqlConfig(batch=8, updates=2, network=TINY),
+    "driving_td3_bc": Td3BcConfig(batch=8, updates=2, network=TINY, delay=1),
+    "driving_cql": CqlConfig(batch=8, updates=2, network=TINY, imitation=1.0, gap=0.1, next_actions=True),
+}
 OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
 
 
@@ -47,8 +55,7 @@ def problem(name):
         group = SelfPlay(environment.simulator, latest_start=60, config=SelfPlayConfig(2, past=1.0))
         mixture = Mixture((("log", environment), ("self", group)), (0.5, 0.5))
         return ALGORITHMS["ppo"].build(mixture, bank, 6), bank
-    if name == "driving_iql":
-        config = IqlConfig(batch=8, updates=2, network=TINY)
+    if config := OFFLINE.get(name):
         return config.build(environment, bank, 6), config.experience(environment, bank, None)
     return ALGORITHMS[name.removeprefix("driving_")].build(environment, bank, 6), bank
 
@@ -119,6 +126,8 @@ def check_batches(learner, data):
     for devices in (2, None):
         several, _, _ = run(learner, data, (3,), devices)
         same(one, several)
+    pair, _, _ = run(learner, data, (3, 4), 2)
+    same(one, Seeds(learner, (3, 4)).member(pair, 0))
     for devices in (1, 4):
         program = Program(Seeds(learner, (3,)), data, devices)
         work.append(program.compiled.cost_analysis()["flops"])

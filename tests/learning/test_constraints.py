@@ -12,8 +12,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.learning import TrainConfig, make_agent
 from drivax.learning.algorithms.behaviour_cloning import Cloning
-from drivax.learning.algorithms.constraints import Constraints
-from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.ppo import Constraints, PpoConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.environment import Environments, Outcome, Rollout, collect
 from drivax.learning.loop import mean_logs

@@ -13,7 +13,8 @@ from drivax.learning.program import choose_devices
 from drivax.tracking.workers import available_cores
 
 CASES = [
-    ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("ppo", "two"), ("sac", "two"),
+    ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("driving_td3_bc", "batches"),
+    ("driving_cql", "batches"), ("ppo", "two"), ("sac", "two"),
     ("ppo", "four_and_seeds"), ("sac", "four_and_seeds"), ("sac_observations", "two"), ("bc_sac", "two"),
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
     ("driving_self_ppo", "two"),

@@ -65,9 +65,27 @@ def build_learner(config):
     return learner, {"policy": state.parameters, **state.rest}, target
 
 
-def losses(learner, trained, target, batch, policy_batch, key):
+def step_keys(count):
+    """``count`` keys of each step of the batch, and its key."""
+    keys = jax.random.split(jax.random.key(7), COUNT)
+    return jax.vmap(lambda key: jax.random.split(key, count))(keys).T, keys
+
+
+def draw_raw(policy, keys):
+    """A raw action of each step, by its own key."""
+    steps = [jax.tree.map(lambda leaf, row=row: leaf[row], policy) for row in range(COUNT)]
+    return jnp.stack([step.sample(keys[row]) for row, step in enumerate(steps)])
+
+
+def draw_several(policy, keys, count):
+    """``count`` raw actions of each step."""
+    own = jax.vmap(lambda key: jax.random.split(key, count))(keys)
+    return jnp.stack([draw_raw(policy, own[:, number]) for number in range(count)])
+
+
+def losses(learner, trained, target, batch, policy_batch, keys):
     """What is logged of a batch."""
-    result = jax.jit(lambda t: learner.loss(t, target, batch, policy_batch, key))(trained)
+    result = jax.jit(lambda t: learner.loss(t, target, batch, policy_batch, keys))(trained)
     return float(result[0]), {name: float(value) for name, value in result[1].items()}
 
 
@@ -78,30 +96,32 @@ def to_numpy(tree):
 def test_cql_against_numpy(batch, policy_batch):
     config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0, backup_actions=2)
     learner, trained, target = build_learner(config)
-    key = jax.random.key(7)
-    total, logs = losses(learner, trained, target, batch, policy_batch, key)
+    (policy_keys, next_keys, uniform_keys, now_keys, then_keys), keys = step_keys(5)
+    total, logs = losses(learner, trained, target, batch, policy_batch, keys)
 
     @jax.jit
     def outputs(trained):
         """What the losses are made of, drawn by the same keys."""
-        critic_key, policy_key = jax.random.split(key)
-        next_key, sample_key = jax.random.split(critic_key)
-        uniform_key, now_key, then_key = jax.random.split(sample_key, 3)
         following = learner.distribution(trained["policy"], batch.next_observation)
         now = learner.distribution(trained["policy"], batch.observation)
         there = learner.distribution(trained["policy"], policy_batch[0])
-        then = jnp.stack([jnp.tanh(following.sample(own)) for own in jax.random.split(next_key, 2)])
-        uniform = jax.random.uniform(uniform_key, (ACTIONS, COUNT, 1), minval=-1.0)
+        then = jnp.tanh(draw_several(following, next_keys, 2))
+        uniform = [jax.random.uniform(uniform_keys[row], (ACTIONS, 1), minval=-1.0) for row in range(COUNT)]
+        uniform = jnp.stack(uniform, axis=1)
+        drawn = {
+            "now": draw_several(now, now_keys, ACTIONS),
+            "then": draw_several(following, then_keys, ACTIONS),
+        }
         rows = {"uniform": [], "now": [], "then": []}
         for number in range(ACTIONS):
-            for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
-                raw_action = policy.sample(jax.random.split(own, ACTIONS)[number])
+            for name, policy in (("now", now), ("then", following)):
+                raw_action = drawn[name][number]
                 q = learner.q_values(trained["critic"], batch.observation, jnp.tanh(raw_action))
                 rows[name].append((q, policy.log_prob(raw_action)))
             rows["uniform"].append(
                 (learner.q_values(trained["critic"], batch.observation, uniform[number]), None)
             )
-        raw_action = there.sample(policy_key)
+        raw_action = draw_raw(there, policy_keys)
         return {
             "target": learner.q_values(target["critic"], batch.next_observation, then),
             "q": learner.q_values(trained["critic"], batch.observation, batch.action),
@@ -151,14 +171,15 @@ def test_cql_against_numpy(batch, policy_batch):
 def test_published_penalty_includes_the_logged_action(batch, policy_batch):
     config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
     learner, trained, target = build_learner(config)
-    key = jax.random.key(7)
-    _, logs = losses(learner, trained, target, batch, policy_batch, key)
-    sample_key = jax.random.split(jax.random.split(key)[0])[1]
+    (*_, uniform_keys, now_keys, then_keys), keys = step_keys(5)
+    _, logs = losses(learner, trained, target, batch, policy_batch, keys)
     now, following = (
         learner.distribution(trained["policy"], observation)
         for observation in (batch.observation, batch.next_observation)
     )
-    action, density = learner._penalty_actions(now, following, batch.action, sample_key)
+    action, density = learner._penalty_actions(
+        now, following, batch.action, (uniform_keys, now_keys, then_keys)
+    )
     assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
     np.testing.assert_array_equal(action[-1], batch.action)
     q = np.asarray(learner.q_values(trained["critic"], batch.observation, action), np.float64)
@@ -170,7 +191,7 @@ def test_published_penalty_includes_the_logged_action(batch, policy_batch):
 
 def test_iql_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(IQL, largest_weight=1.05))
-    total, logs = losses(learner, trained, target, batch, policy_batch, jax.random.key(7))
+    total, logs = losses(learner, trained, target, batch, policy_batch, step_keys(1)[1])
 
     @jax.jit
     def outputs(trained):
@@ -207,13 +228,13 @@ def test_iql_against_numpy(batch, policy_batch):
 
 def test_td3_bc_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3))
-    key = jax.random.key(7)
-    total, logs = losses(learner, trained, target, batch, policy_batch, key)
+    _, keys = step_keys(1)
+    total, logs = losses(learner, trained, target, batch, policy_batch, keys)
 
     @jax.jit
     def outputs(trained):
         mode = learner.distribution(target["policy"], batch.next_observation).mode()
-        noise = 0.5 * jax.random.normal(key, mode.shape)
+        noise = 0.5 * jnp.stack([jax.random.normal(keys[row], mode.shape[1:]) for row in range(COUNT)])
         then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
         action = learner.distribution(trained["policy"], policy_batch[0]).mode()
         return {
@@ -244,7 +265,7 @@ def test_every_loss_reaches_its_own_parameters_only(config, batch, policy_batch)
     @jax.jit
     def slopes(trained):
         def of(trained, name):
-            total, logs = learner.loss(trained, target, batch, policy_batch, jax.random.key(7))
+            total, logs = learner.loss(trained, target, batch, policy_batch, step_keys(1)[1])
             return total if name == "total" else logs[name]
 
         return {name: jax.grad(of)(trained, name) for name in ("total", "critic", "policy")}

@@ -11,9 +11,13 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.averaging import trained_parameters
 from drivax.learning.algorithms.behaviour_cloning import Cloning
-from drivax.learning.algorithms.optimisers import chunk_size, clip_per_network, clipped_adam
+from drivax.learning.algorithms.optimisers import (
+    chunk_size,
+    clip_per_network,
+    clipped_adam,
+    trained_parameters,
+)
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.environment import Rollout

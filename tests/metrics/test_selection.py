@@ -13,11 +13,11 @@ import pytest
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import evaluation_task
+from drivax.kernels import without_kernels
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
-from drivax.metrics.catalogue import METRICS, SETS
+from drivax.metrics.catalogue import METRICS, SETS, metric_specs, select_metrics
 from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
-from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
 from drivax.simulator import contact, situation
 from drivax.simulator.simulator import Simulator
@@ -56,7 +56,8 @@ class Traced:
 def traced():
     """The default task with each set and with a single metric, by name."""
     result = {}
-    with pytest.MonkeyPatch.context() as patch:
+    # Native kernels compute some of it in other functions.
+    with pytest.MonkeyPatch.context() as patch, without_kernels():
         called = set()
 
         def record_calls(module, name):

@@ -17,8 +17,15 @@ from drivax.evaluation.runner import evaluate
 from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast, boxes_of
 from drivax.planners.pdm.ground import ground_at
-from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
-from drivax.planners.pdm.proposals import LINE_ALONG, LINE_CURVATURE, Lines, unroll_idm
+from drivax.planners.pdm.planner import (
+    LINE_ALONG,
+    LINE_CURVATURE,
+    PUBLISHED_DRIVER,
+    Lines,
+    PdmConfig,
+    PdmPlanner,
+    unroll_idm,
+)
 from drivax.planners.pdm.scoring import ScoringConfig
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank

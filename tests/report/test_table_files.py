@@ -15,8 +15,7 @@ from markdown_it import MarkdownIt
 
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
-from drivax.report.pages.report import write_report
-from drivax.report.table_files import write_tables
+from drivax.report.pages.report import write_report, write_tables
 from drivax.table import Cell, Column, Table
 
 from .conftest import redescribe

@@ -9,12 +9,12 @@ import pytest
 
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.rollout import drive, evaluation_task
+from drivax.planners.nuplan.map import lane_count
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank import scenario_bank
 from drivax.scenario.bank.columns import LaneRow
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank, Sizes, as_words
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.roadblocks import lane_count
 from drivax.scenario.schema import Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording

@@ -53,6 +53,7 @@ def test_sizes_are_medians_and_defaults_are_counted():
     tracks = make_tracks([driving(y=y) for y in (0, 5, 9, 12)], kind=kinds)
     tracks.size[0] = np.nan
     tracks.size[1] = 0.0
+    tracks.size[1, :, 1] = 1e-300  # 0 as float32
     tracks.size[2, :50, 0] = 9.9  # more than half of the steps
     tracks.size[3, :, 2] = -1.0
     local = local_tracks(tracks, 0, ZERO)

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from drivax.datasets import spool
+from drivax.datasets import conversion
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import CAPACITIES
 from drivax.synthetic import generate
@@ -162,7 +162,7 @@ def pools(monkeypatch):
         made.append(worker_pool(*arguments))
         return made[-1]
 
-    for module in (generate, spool):
+    for module in (generate, conversion):
         monkeypatch.setattr(module, "worker_pool", record_pool)
     return made
 
@@ -194,7 +194,7 @@ def open_draws(tmp_path):
 
 
 def open_conversion(tmp_path):
-    return spool.convert_ahead([(0,), (1,)], sleep_in_conversion, CAPACITIES["default"], 2, tmp_path)
+    return conversion.convert_ahead([(0,), (1,)], sleep_in_conversion, CAPACITIES["default"], 2, tmp_path)
 
 
 @pytest.mark.parametrize("start", [open_draws, open_conversion])

@@ -21,7 +21,7 @@ from drivax.evaluation.runner import (
     format_summary,
     run_evaluation,
 )
-from drivax.metrics.selection import select_metrics
+from drivax.metrics.catalogue import select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
 from drivax.tasks.conditions import fix_conditions, parse_values

@@ -54,9 +54,8 @@ def run(args: Report) -> int:
     """Write the page, the videos or the tables, and print their path."""
     from drivax.errors import UsageError
     from drivax.files import inside
-    from drivax.report.pages.report import write_report
+    from drivax.report.pages.report import write_report, write_tables
     from drivax.report.pictures.video import write_videos
-    from drivax.report.table_files import write_tables
     from drivax.tracking.progress import Progress
 
     if not args.runs:

@@ -25,7 +25,6 @@ from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.config import check_learnable
-from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving
 from drivax.learning.experience import (
     Experience,
@@ -36,6 +35,7 @@ from drivax.learning.experience import (
     sampler,
 )
 from drivax.learning.program import all_finite, trained_leaves
+from drivax.learning.training_log import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig

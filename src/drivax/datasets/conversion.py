@@ -10,8 +10,11 @@ from __future__ import annotations
 import hashlib
 import operator
 import os
+import shutil
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,19 +23,21 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
+import numpy as np
+
 from drivax.datasets.doctor import Estimate, count_text, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
-from drivax.datasets.spool import convert_ahead
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
 from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import STRIDE, Recording, windows
-from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Capacity, Scenario
+from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Capacity, Scenario, record_dtype
 from drivax.scenario.select.selection import Selection
 from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, manifest_entry
+from drivax.tracking.workers import worker_pool
 
 _Result = TypeVar("_Result")
 #: Options that do not change the bytes of a set.
@@ -47,6 +52,8 @@ _Item = tuple[Scenario | BadRecord, tuple[int, int]]
 Progress = Callable[[int, int, int], None]
 #: Returns the audit of each scenario as a dictionary.
 Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
+#: In place of a record that is in the spool file.
+_SPOOLED = np.zeros(())
 
 
 @dataclass(frozen=True)
@@ -499,3 +506,67 @@ def _empty_error(data: Survey, sink: _Sink) -> DataError:
         problem = f"{first.problem} (and none of the other {count_text(others, 'record')} could be converted)"
         first = replace(first, problem=problem)
     return first.error()
+
+
+def convert_ahead(
+    tasks: Sequence[tuple[Any, ...]],
+    convert: Callable[..., Iterator[Scenario | BadRecord]],
+    capacity: Capacity,
+    workers: int,
+    folder: Path,
+) -> Generator[Iterator[Scenario | BadRecord], None, None]:
+    """Yield the scenarios and bad records of each task in order; read them before asking for the next task's.
+
+    Args:
+        tasks: Arguments of ``convert``, which can be sent to other processes.
+        convert: What a worker does, a function of a module.
+        capacity: Padded sizes of the scenarios.
+        workers: Number of processes.
+        folder: An existing folder for the records of about ``workers + 2`` tasks.
+    """
+    spool = folder / f"spool-{os.getpid()}"
+    spool.mkdir()
+    waiting: deque[tuple[Path, Future[list[Scenario | BadRecord]]]] = deque()
+    remaining = enumerate(tasks)
+    try:
+        with worker_pool(min(workers, len(tasks))) as pool:
+            while True:
+                # Two tasks ahead keep all workers busy and bound the space on the disk.
+                while len(waiting) < workers + 2 and (item := next(remaining, None)) is not None:
+                    number, task = item
+                    path = spool / f"{number}.records"
+                    waiting.append((path, pool.submit(_spool, task, convert, path)))
+                if not waiting:
+                    return
+                path, future = waiting.popleft()
+                yield _unspool(future.result(), path, capacity)
+                path.unlink(missing_ok=True)
+    finally:
+        shutil.rmtree(spool, ignore_errors=True)
+
+
+def _spool(
+    task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
+) -> list[Scenario | BadRecord]:
+    """Run one task in a worker: write the records of its scenarios to ``path``, return all else."""
+    items: list[Scenario | BadRecord] = []
+    with path.open("wb") as file:
+        for item in convert(*task):
+            if isinstance(item, Scenario):
+                file.write(item.record.tobytes())
+                item = replace(item, record=_SPOOLED)
+            items.append(item)
+    return items
+
+
+def _unspool(
+    items: Sequence[Scenario | BadRecord], path: Path, capacity: Capacity
+) -> Iterator[Scenario | BadRecord]:
+    """Yield the results of a task, with their records from ``path``."""
+    dtype = record_dtype(capacity)
+    with path.open("rb") as file:
+        for item in items:
+            if isinstance(item, Scenario):
+                record = np.frombuffer(file.read(dtype.itemsize), dtype).reshape(())
+                item = replace(item, record=record)
+            yield item

@@ -27,8 +27,7 @@ from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Tr
 from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
 from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_keys, evaluation_task
 from drivax.files import check_space, explain_full_disk, replace_folder
-from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import metric_specs, select_metrics
+from drivax.metrics.catalogue import METRICS, Metric, metric_specs, select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner, hold
@@ -166,7 +165,7 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.selection``.
+    """Format metrics of one planner as a table: mean, 95 % interval and n; ``names`` as in ``metrics.catalogue``.
 
     Codes and counts, which have no mean, are left out.
     """

@@ -87,8 +87,8 @@ class Polylines:
     def at(self, row: Array, s: Array) -> Float[Array, "*query dim"]:
         """Points at arc lengths ``s`` of polylines ``row`` (straight on beyond the ends)."""
         index, fraction = self.locate(np.asarray(row), np.asarray(s, dtype=np.float64))
-        begin = self.points[index]
-        return begin + fraction[..., None] * (self.points[index + 1] - begin)
+        begin = self.points.take(index, axis=0)
+        return begin + fraction[..., None] * (self.points.take(index + 1, axis=0) - begin)
 
     def heading(self, row: Array, s: Array, span_m: float = 1.0) -> Float[Array, "*query"]:
         """Heading at arc lengths ``s``: of the chord from half a span behind to half a span ahead, radians.
@@ -167,7 +167,7 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
         vertices, interval = np.flatnonzero(keep), keep.cumsum()[interior]
         begin, end = vertices[interval - 1], vertices[interval]
         distance, _ = _distance_to_chords(
-            [x[interior] - x[begin] for x in axes], [x[end] - x[begin] for x in axes]
+            [x.take(interior) - x.take(begin) for x in axes], [x.take(end) - x.take(begin) for x in axes]
         )
         first = _changes(interval)  # the first interior point of each interval
         farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
@@ -205,10 +205,10 @@ def resample(
     s = np.arange(count if most is None else min(count, most)) * spacing_m
     index = arc.searchsorted(s + 1e-9, side="right") - 1
     index = np.minimum(np.maximum(index, 0), len(points) - 2)
-    begin, start = points[index], arc[index]
+    begin, start = points.take(index, axis=0), arc[index]
     span = arc[index + 1] - start
     fraction = np.minimum(np.maximum((s - start) / np.where(span > 0.0, span, 1.0), 0.0), 1.0)
-    return begin + fraction[:, None] * (points[index + 1] - begin), index
+    return begin + fraction[:, None] * (points.take(index + 1, axis=0) - begin), index
 
 
 def left_normals(heading: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
@@ -248,9 +248,11 @@ def project_monotone(
     position is searched on the whole polyline, which needs two points, and ``window[0]`` is not used.
     """
     arc = arc_lengths(points)
-    (x, y), (step_x, step_y), span = points[:-1, :2].T, (points[1:, :2] - points[:-1, :2]).T, np.diff(arc)
+    (step_x, step_y), span, starts = (points[1:, :2] - points[:-1, :2]).T, np.diff(arc), arc[:-1]
     square = np.maximum(step_x * step_x + step_y * step_y, 1e-12)
     divisor = np.maximum(span, 1e-12)
+    offset_x, offset_y = (np.subtract.outer(xy[:, axis], points[:-1, axis]) for axis in (0, 1))
+    feet = (offset_x * step_x + offset_y * step_y) / square * span
     result = np.zeros(len(xy))
     low, high = 0.0, arc[-1]
     for k in range(len(xy)):
@@ -258,16 +260,15 @@ def project_monotone(
             low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
         i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
         reach = slice(i, max(int(arc.searchsorted(high, side="left")), i + 1))
-        along_x, along_y, length, begin = step_x[reach], step_y[reach], span[reach], arc[:-1][reach]
+        length, begin = span[reach], starts[reach]
         if not len(length):  # ``low`` is the end of the line, which begins no segment
             result[k] = low
             continue
-        offset_x, offset_y = xy[k, 0] - x[reach], xy[k, 1] - y[reach]
-        fraction = (offset_x * along_x + offset_y * along_y) / square[reach]
-        foot = np.minimum(np.maximum(fraction * length, low - begin), high - begin)
+        foot = np.minimum(np.maximum(feet[k, reach], low - begin), high - begin)
         foot = np.minimum(np.maximum(foot, 0.0), length)
         fraction = foot / divisor[reach]
-        residual_x, residual_y = offset_x - fraction * along_x, offset_y - fraction * along_y
+        residual_x = offset_x[k, reach] - fraction * step_x[reach]
+        residual_y = offset_y[k, reach] - fraction * step_y[reach]
         nearest = (residual_x * residual_x + residual_y * residual_y).argmin()
         result[k] = arc[i + nearest] + foot[nearest]
     return result

@@ -1,6 +1,6 @@
 """Optional native kernels for CPUs, with the results of the JAX functions that call them, up to rounding.
 
-``library`` finds, registers and calls them; each other module is a kernel. The sources are in ``native``.
+``library`` finds, registers and calls them; ``bindings`` has a function for each kernel. The sources are in ``native``.
 """
 
 import lazy_loader

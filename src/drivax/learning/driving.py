@@ -29,7 +29,7 @@ from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
 
-#: Drivers of training episodes: the recorded ego, or any of the set's egos (``scenario.build.egos``).
+#: Drivers of training episodes: the recorded ego, or any of the set's egos (``scenario.build.assemble``).
 Egos = Literal["recorded", "moving"]
 #: Logs that are replayed in one batch.
 _BATCH = 64

@@ -18,13 +18,21 @@ from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet, check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
 from drivax.learning.program import Program, Seeds
-from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
+from drivax.learning.training_log import (
+    DivergenceError,
+    Preempted,
+    StopSignal,
+    TrainingLog,
+    Validation,
+    nonfinite_leaf,
+    nonfinite_log,
+    validate,
+)
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out

@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jax.tree_util import keystr
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
@@ -31,7 +31,8 @@ from drivax.tracking.workers import available_cores
 _THREADS = 8
 #: Flag of XLA that sets the number of CPU devices.
 _DEVICE_FLAG = "--xla_force_host_platform_device_count"
-_AXIS = "devices"
+#: Axis of the mesh of devices that divide the work of one seed, and of those with whole seeds.
+_AXIS, _SEEDS = "devices", "seeds"
 
 _NETWORKS = "networks and optimiser"
 #: Settings are named without their path, which begins with ``algorithm.`` and, in a warm start, ``ppo.`` or ``sac.``.
@@ -124,10 +125,11 @@ class Program:
         shapes = self._init.eval_shape(data)
         batch = getattr(seeds.learner, "batch", None)
         self.devices = choose_devices(devices, len(seeds.seeds), shapes, batch)
-        self._mesh = Mesh(np.array(self.devices), (_AXIS,))
+        by_seeds = len(seeds.seeds) > 1 and len(seeds.seeds) % len(self.devices) == 0
+        self._mesh = Mesh(np.array(self.devices), (_SEEDS if by_seeds else _AXIS,))
         self._layout: Any = None
         if len(self.devices) > 1:
-            self._layout = _layout(self._mesh, len(seeds.seeds), shapes)
+            self._layout = _layout(self._mesh, seeds.is_stacked, shapes)
             self._init = jax.jit(seeds.init, out_shardings=self._layout)
             if self.devices[0].platform == "cpu":  # devices share the memory of NumPy arrays, not of JAX's
                 data = jax.tree.map(np.asarray, data)
@@ -148,9 +150,9 @@ class Program:
 
     def _iterate(self, data: Any, state: Any) -> tuple[Any, Any]:
         """Iterate whole seeds on each device; learners divide their work themselves if seeds cannot be divided."""
-        if self._layout is None or len(self.seeds.seeds) % len(self.devices):
+        if self._layout is None or _SEEDS not in self._mesh.axis_names:
             return self.seeds.iterate(data, state)
-        specs = (PartitionSpec(), PartitionSpec(_AXIS))
+        specs = (PartitionSpec(), PartitionSpec(_SEEDS))
         run = jax.shard_map(self.seeds.iterate, in_specs=specs, out_specs=specs[1], check_vma=False)
         return run(data, state)
 
@@ -212,7 +214,7 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     count = len(available) if requested is None else requested
     if count == 1 or seeds % count == 0:
         return available[:count]
-    divisible = ((leaf, axis) for leaf, axis in _divisible(state, seeds) if axis is not None)
+    divisible = ((leaf, axis) for leaf, axis in _divisible(state, seeds > 1) if axis is not None)
     sizes = [(leaf.shape[axis], "environments") for leaf, axis in divisible]
     sizes += [] if batch is None else [(batch, "steps per batch")]
     indivisible = [f"{size} {kind}" for size, kind in sizes if size % count]
@@ -285,6 +287,15 @@ def compute_on_each_device(function: Callable[..., Any], *whole: Any) -> Any:
     )
 
 
+def mean_over_devices(x: Array) -> Float[Array, ""]:
+    """Return the mean of an array of which a function that :func:`sum_over_devices` runs may hold a device's share.
+
+    No gradient passes.
+    """
+    mean = jax.lax.stop_gradient(jnp.mean(x))
+    return jax.lax.pmean(mean, _AXIS) if _AXIS in jax.sharding.get_abstract_mesh().manual_axes else mean
+
+
 def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any) -> Any:
     """Return ``function(whole, divided)``, computed by each device for its share of ``divided``.
 
@@ -346,15 +357,15 @@ def _from_bits(bits: Array, dtype: Any) -> Array:
     return jax.lax.bitcast_convert_type(bits.astype(jnp.dtype(f"int{8 * size}")), dtype)
 
 
-def _layout(mesh: Mesh, seeds: int, state: Any) -> Any:
+def _layout(mesh: Mesh, is_stacked: bool, state: Any) -> Any:
     """Return the sharding of each array of a state: divided by seeds, by environments, or whole on every device."""
-    by_seeds = seeds > 1 and seeds % mesh.size == 0
-    axes = (0 if by_seeds else axis for _, axis in _divisible(state, seeds))
-    specs = [PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS) for axis in axes]
+    (name,) = mesh.axis_names
+    axes = (0 if name == _SEEDS else axis for _, axis in _divisible(state, is_stacked))
+    specs = [PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, name) for axis in axes]
     return jax.tree.unflatten(jax.tree.structure(state), [NamedSharding(mesh, spec) for spec in specs])
 
 
-def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
+def _divisible(state: Any, is_stacked: bool) -> list[tuple[Any, int | None]]:
     """Return the leaves of a state with the axis that counts environments, or None, as their records say."""
 
     def axis_of(node: Any) -> int | None:
@@ -363,7 +374,7 @@ def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
     leaves: list[tuple[Any, int | None]] = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: axis_of(node) is not None):
         axis = axis_of(node)
-        axis = None if axis is None else axis + (seeds > 1)
+        axis = None if axis is None else axis + is_stacked
         for leaf in jax.tree.leaves(node):
             leaves.append((leaf, axis if axis is not None and len(leaf.shape) > axis else None))
     return leaves

@@ -4,7 +4,10 @@ from .catalogue import SETS as SETS
 from .catalogue import Column as Column
 from .catalogue import EpisodeEnd as EpisodeEnd
 from .catalogue import Metric as Metric
+from .catalogue import MetricNames as MetricNames
+from .catalogue import metric_specs as metric_specs
 from .catalogue import nuplan_score as nuplan_score
+from .catalogue import select_metrics as select_metrics
 from .catalogue import vmax_score as vmax_score
 from .comfort import check_trip_comfort as check_trip_comfort
 from .episode import Episode as Episode
@@ -12,9 +15,6 @@ from .episode import episode_add as episode_add
 from .episode import episode_metrics as episode_metrics
 from .episode import episode_start as episode_start
 from .episode import event_steps as event_steps
-from .selection import MetricNames as MetricNames
-from .selection import metric_specs as metric_specs
-from .selection import select_metrics as select_metrics
 from .steps import STEP_VALUES as STEP_VALUES
 from .steps import Moment as Moment
 from .steps import StepValue as StepValue

@@ -11,8 +11,14 @@ from functools import partial
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.metrics.catalogue import EpisodeEnd, Metric, Operator
-from drivax.metrics.selection import MetricNames, MetricSelection, select_metrics
+from drivax.metrics.catalogue import (
+    EpisodeEnd,
+    Metric,
+    MetricNames,
+    MetricSelection,
+    Operator,
+    select_metrics,
+)
 from drivax.metrics.steps import STEP_VALUES, Moment, StepValue, Value
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static

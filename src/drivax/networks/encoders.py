@@ -16,7 +16,7 @@ from jax.custom_derivatives import CustomVJPPrimal
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.kernels import set_encoder
+from drivax.kernels import bindings
 
 Groups = Mapping[str, Array]
 #: Shapes of one observation, by group.
@@ -200,8 +200,8 @@ def max_pool(
 def _dense_and_max(
     activation: Activation, layers: Layers, rows: Float[Array, "B row inputs"], valid: Bool[Array, "B row"]
 ) -> Float[Array, "B outputs"]:
-    if set_encoder.supports(layers, activation):
-        return set_encoder.encode(layers, rows, valid)[0]
+    if bindings.supports_layers(layers, activation):
+        return bindings.encode_sets(layers, rows, valid)[0]
     return _dense_and_max_forward(activation, layers, rows, valid)[0]
 
 
@@ -210,8 +210,8 @@ def _save_dense_and_max(
 ) -> tuple[Array, Any]:
     """Return the output and the residuals of either implementation; the native one has no gradient of rows."""
     layers = tuple((kernel.value, bias.value) for kernel, bias in layers)
-    if set_encoder.supports(layers, activation) and not rows.perturbed:
-        output, winner = set_encoder.encode(layers, rows.value, valid.value)
+    if bindings.supports_layers(layers, activation) and not rows.perturbed:
+        output, winner = bindings.encode_sets(layers, rows.value, valid.value)
         return output, _NativeResiduals(layers, rows.value, winner)
     return _dense_and_max_forward(activation, layers, rows.value, valid.value)
 
@@ -248,7 +248,7 @@ def _dense_and_max_backward(
 ) -> tuple[Any, Array | None, None]:
     """Differentiate all rows as one matrix: on CPUs, XLA multiplies zeros faster than it gathers and scatters."""
     if isinstance(residuals, _NativeResiduals):
-        return set_encoder.differentiate(*residuals, gradient), None, None
+        return bindings.differentiate_sets(*residuals, gradient), None, None
     layers, valid, inputs, hidden_vjps, products, largest, is_positive, vjp = residuals
     (gradient,) = vjp(jnp.where(is_positive, gradient, 0.0))
     is_largest = (products == largest[:, None]) & valid[..., None]

@@ -1,6 +1,7 @@
 """Reports of runs and scenario sets: pages, tables, comparisons, videos and pictures.
 
-:mod:`drivax.table` renders tables; ``evaluation.result_tables`` fills those of evaluations, ``table_files`` saves them.
+:mod:`drivax.table` renders tables; ``evaluation.result_tables`` fills those of evaluations; ``pages.report`` saves
+them.
 """
 
 import lazy_loader

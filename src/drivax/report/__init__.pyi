@@ -8,6 +8,7 @@ from .pages.comparison import comparison_text as comparison_text
 from .pages.comparison import write_comparison as write_comparison
 from .pages.inspection import write_histograms as write_histograms
 from .pages.report import write_report as write_report
+from .pages.report import write_tables as write_tables
 from .pages.viewer import write_player as write_player
 from .pictures.drawing import Drawing as Drawing
 from .pictures.drawing import Rollout as Rollout
@@ -15,4 +16,3 @@ from .pictures.observation import draw_observation as draw_observation
 from .pictures.still import draw_scenario as draw_scenario
 from .pictures.video import write_videos as write_videos
 from .runs import read_runs as read_runs
-from .table_files import write_tables as write_tables

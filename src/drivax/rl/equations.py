@@ -183,12 +183,12 @@ def advantage_weights(
     return jax.lax.stop_gradient(jnp.exp(exponent))
 
 
-def scaled_policy_loss(loss: Float[Array, "*batch"], q: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """``loss / mean |Q|`` over the batch (Fujimoto and Gu 2021, arXiv 2106.06860).
+def scaled_policy_loss(loss: Float[Array, "*batch"], mean_q: Float[Array, ""]) -> Float[Array, "*batch"]:
+    """``loss / mean |Q|``, given the mean over the batch (Fujimoto and Gu 2021, arXiv 2106.06860).
 
     A loss ``-Q`` becomes independent of the scale of rewards. No gradient reaches the divisor, which is at least 1e-6.
     """
-    return loss / jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(q))), 1e-6)
+    return loss / jnp.maximum(jax.lax.stop_gradient(mean_q), 1e-6)
 
 
 def smoothed_action(

@@ -482,9 +482,10 @@ def _check_map(recording: Recording) -> Finding:
     if not recording.features:
         return None
     points = np.concatenate([feature.points for feature in recording.features])
-    far = np.flatnonzero(~(np.abs(points - _ego_position(recording)).max(axis=1) <= EXTENT_M))
-    if not len(far):
+    is_near = np.abs(points - _ego_position(recording)) <= EXTENT_M
+    if is_near.all():
         return None
+    far = np.flatnonzero(~is_near.all(axis=1))
     ends = np.cumsum([len(feature.points) for feature in recording.features])
     feature = recording.features[int(np.searchsorted(ends, far[0], side="right"))]
     if not np.isfinite(points[far[0]]).all():

@@ -89,6 +89,11 @@ def _members(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
     return result
 
 
+def nonzero(mask: Bool[np.ndarray, "*axis"]) -> tuple[Int[np.ndarray, " entry"], ...]:
+    """Indices of the true entries by axis: ``np.nonzero``, which takes several times as long for two axes or more."""
+    return np.unravel_index(mask.ravel().nonzero()[0], mask.shape)
+
+
 class LightState(enum.IntEnum):
     """State of a traffic light for one lane, numbered as in WOMD; -1 unobserved."""
 

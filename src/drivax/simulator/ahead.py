@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from drivax import kernels
 from drivax.geometry.boxes import COS, LENGTH, WIDTH, X
 from drivax.geometry.vectors import norm, rotate
-from drivax.kernels.following import look_ahead
+from drivax.kernels.bindings import Agents, look_ahead
 from drivax.scenario.bank.columns import LightRow, RouteColumn
 from drivax.scenario.bank.queries import LEVEL_M, route_ahead
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank, Vector
@@ -89,7 +89,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 def _ahead_natively(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: Scalar) -> Ahead:
     """Return the values of :func:`ahead`."""
     maps = (bank.routes, bank.route_points, bank.light_line)
-    agents = (frame.box, frame.velocity, frame.z, frame.valid)
+    agents = Agents(frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
     arc = jnp.asarray(LightRow.ARC + bank.ego_number(context.row), jnp.int32)
     speed = context.history[-1, MOTION_SPEED]
     places = (context.slot, context.index, context.row, arc)

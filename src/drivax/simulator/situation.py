@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax import kernels
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, root, wrap
-from drivax.kernels.contacts import Agents, measure_contacts
+from drivax.kernels.bindings import Agents, measure_contacts
 from drivax.scenario.bank import queries
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank

@@ -22,8 +22,8 @@ from drivax import kernels
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.learning.policies import find_traffic
+from drivax.metrics.catalogue import MetricNames
 from drivax.metrics.episode import episode_add, episode_metrics
-from drivax.metrics.selection import MetricNames
 from drivax.planners.simple import IdmPlanner
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank

@@ -84,7 +84,7 @@ class Generation:
             bits: only workers write the same bytes on any x86-64 processor.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
-        egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.egos``).
+        egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.assemble``).
         split: Percentages of train/validation/test, as 80/10/10, for the lists in ``splits/``, by map; None: no lists.
         overwrite: Replace an existing scenario set.
         world: Settings of the world.

@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, corners, passage
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
-from drivax.scenario.schema import AgentKind
+from drivax.scenario.schema import AgentKind, nonzero
 
 #: Speed below which noise decreases, m/s, and its share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
@@ -113,7 +113,7 @@ def visible(
     distance = np.hypot(offset[..., 0], offset[..., 1])
     in_range = valid & valid[:1] & (distance <= config.range_m)
     in_range[0] = False
-    target, step = np.nonzero(in_range)
+    target, step = nonzero(in_range)
     is_visible = np.zeros(valid.shape, bool)
     is_visible[0] = valid[0]
     if not len(target):
@@ -158,7 +158,7 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
         reach += length[batch]
         may_cut &= ahead < reach
         may_cut &= near_rows[:, None] != targets
-        occluder, ray = np.nonzero(may_cut)
+        occluder, ray = nonzero(may_cut)
         pairs.append((ray + first, near_rows[occluder]))
     ray, occluder = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return ray, occluder
@@ -198,8 +198,8 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     deviations = (config.along_m, config.across_m, config.heading_rad, config.speed_mps)
     correlations = (config.position_correlation,) * 2 + (config.heading_correlation, config.speed_correlation)
     along, across, turn, speed_error = (
-        config.level * sigma * share * _jitter(tracks.valid.shape, correlation, rng)
-        for sigma, correlation in zip(deviations, correlations, strict=True)
+        config.level * sigma * share * jitter
+        for sigma, jitter in zip(deviations, _jitter(tracks.valid.shape, correlations, rng), strict=True)
     )
     heading = np.where(tracks.valid, wrap(tracks.heading + turn), 0.0)
     # Standing users stay at speed 0, and moving ones do not reverse.
@@ -215,12 +215,13 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
 
 
 def _jitter(
-    shape: tuple[int, ...], correlation: float, rng: np.random.Generator
-) -> Float64[np.ndarray, "track time"]:
+    shape: tuple[int, ...], correlations: tuple[float, ...], rng: np.random.Generator
+) -> Float64[np.ndarray, "correlation track time"]:
     """Draw unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""
-    noise = np.ascontiguousarray(rng.normal(size=shape).T)
-    noise[1:] *= np.sqrt(1.0 - correlation**2)
+    noise = np.ascontiguousarray(np.moveaxis(rng.normal(size=(len(correlations), *shape)), -1, 0))
+    noise[1:] *= np.array([math.sqrt(1.0 - c**2) for c in correlations])[:, None]
+    factor = np.array(correlations)[:, None]
     # scipy.signal computes the same, but takes longer to import than to generate several scenarios.
-    for before, now in pairwise(noise if correlation else ()):
-        now += correlation * before
-    return np.clip(np.ascontiguousarray(noise.T), -_MAX_SIGMA, _MAX_SIGMA)
+    for before, now in pairwise(noise):
+        now += factor * before
+    return np.clip(np.ascontiguousarray(np.moveaxis(noise, 0, -1)), -_MAX_SIGMA, _MAX_SIGMA)

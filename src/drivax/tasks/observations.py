@@ -20,7 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax import kernels
 from drivax.errors import UsageError, did_you_mean
-from drivax.kernels.observations import Ego, observe_agents, observe_road, observe_route
+from drivax.kernels.bindings import Ego, observe_agents, observe_road, observe_route
+from drivax.plugins import check_unique, name_of
 from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -30,7 +31,6 @@ from drivax.simulator.lights import is_red, is_yellow
 from drivax.simulator.types import HISTORY, MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 from drivax.tasks import features
 from drivax.tasks.features import COLUMNS, PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Features, Frames, View
-from drivax.tasks.own import check_unique, name_of
 from drivax.tasks.perception import (
     LIGHT_NOISE_STREAM,
     ROAD_NOISE_STREAM,

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from drivax.plugins import check_unique, name_of
 from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import FARTHEST_GAP_M, TTC_HORIZON_S
 from drivax.simulator.situation import LONGEST_GAP_S
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Surroundings
-from drivax.tasks.own import check_unique, name_of
 
 Term = Callable[[Facts, Facts, Surroundings], Scalar]
 

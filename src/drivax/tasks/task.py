@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
+from drivax.metrics.catalogue import MetricNames, select_metrics
 from drivax.metrics.episode import Episode, episode_add, episode_start
-from drivax.metrics.selection import MetricNames, select_metrics
+from drivax.plugins import check_unique
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.types import (
     Action,
@@ -32,7 +33,6 @@ from drivax.tasks.conditions import (
 )
 from drivax.tasks.features import Frames
 from drivax.tasks.observations import Observation, ObservationConfig, observe
-from drivax.tasks.own import check_unique
 from drivax.tasks.rewards import RewardConfig
 
 #: Largest number of steps of a decision.

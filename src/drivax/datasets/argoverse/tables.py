@@ -100,13 +100,13 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
         if read_head(path, 4) == PARQUET_MAGIC:
             unpacked_size.check_footer(source)
             file = pq.ParquetFile(source)
-            schema, metadata = file.schema_arrow, file.metadata
+            schema, places = file.schema_arrow, file.schema
             names = _check(schema, columns, optional)
-            groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-            unpacked_size.check_pages(source, groups, names)
+            read = [number for number in range(len(places)) if places.column(number).path in names]
+            unpacked_size.check_pages(source, read)
             # Text stays in dictionaries: a text of a megabyte may be that of all rows.
             texts = [name for name in names if columns[name] == "text"]
-            file = pq.ParquetFile(source, metadata=metadata, read_dictionary=texts)
+            file = pq.ParquetFile(source, metadata=file.metadata, read_dictionary=texts)
             table = file.read(columns=names, use_threads=False)
         else:
             # The file is read as the stream in it: its footer may point elsewhere.

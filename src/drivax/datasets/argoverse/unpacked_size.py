@@ -7,7 +7,7 @@ protocol; Apache Arrow, ``Message.fbs`` in FlatBuffers, of which a feather file 
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from drivax.files import format_bytes
@@ -22,7 +22,9 @@ _MOST_PARTS = 1 << 14
 #: Encodings of parquet pages: all but deltas of texts (7), which repeat the beginning of the text before.
 _ENCODINGS = (0, 2, 3, 4, 5, 6, 8, 9)
 #: Compact protocol: kinds of values, and the fields of a page header that hold the header of its content.
-_TRUE, _FALSE, _BYTE, _I32, _I64, _DOUBLE, _BINARY, _STRUCT = 1, 2, 3, 5, 6, 7, 8, 12
+_TRUE, _FALSE, _BYTE, _I32, _I64, _DOUBLE, _BINARY, _LIST, _STRUCT = (
+    1, 2, 3, 5, 6, 7, 8, 9, 12,
+)  # fmt: skip
 _DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
 #: Arrow streams: where they begin in a file, what precedes a message, and kinds of messages.
 _STREAM, _CONTINUES = 8, 0xFFFFFFFF
@@ -35,21 +37,30 @@ def check_footer(source: Any) -> None:
     Raises:
         Exception: Of ``reading.DAMAGE``, as of all functions of this module.
     """
-    source.seek(max(source.size() - 8, 0))
-    (length,) = struct.unpack("<I", source.read(8)[:4])
-    if length > _LONGEST_FOOTER:
+    if (length := _footer_length(source)) > _LONGEST_FOOTER:
         raise ValueError(f"a footer of {format_bytes(length)}")
     source.seek(0)
 
 
-def check_pages(source: Any, groups: Sequence[Any], names: Collection[str]) -> None:
-    """Refuse a parquet file if some columns have too many rows or unpack to too much; ``groups`` are its row groups."""
-    room, rows = _Room(), sum(group.num_rows for group in groups)
+def _footer_length(source: Any) -> int:
+    source.seek(max(source.size() - 8, 0))
+    return struct.unpack("<I", source.read(8)[:4])[0]
+
+
+def check_pages(source: Any, columns: Sequence[int]) -> None:
+    """Refuse a parquet file if some columns, given by their place, have too many rows or unpack to too much.
+
+    The footer is read here: pyarrow's own objects abort the process if its sizes contradict its schema.
+    """
+    length = _footer_length(source)
+    source.seek(source.size() - 8 - length)
+    footer, _ = _read_struct(source.read(length), 0)
+    groups = footer[4, _LIST]
+    room, rows = _Room(), sum(group[3, _I64] for group in groups)
     room.take(rows, 0)
     groups = groups if rows else []  # the columns of empty files have no place
-    columns = (group.column(number) for group in groups for number in range(group.num_columns))
     previous_end = 0
-    for start, end in sorted(_extent(column) for column in columns if column.path_in_schema in names):
+    for start, end in sorted(_extent(group[1, _LIST][number]) for group in groups for number in columns):
         if not 0 <= start <= end <= source.size():
             raise ValueError("a column outside the file")
         if start < previous_end:  # Row groups that share their pages would repeat them.
@@ -60,11 +71,14 @@ def check_pages(source: Any, groups: Sequence[Any], names: Collection[str]) -> N
     source.seek(0)
 
 
-def _extent(column: Any) -> tuple[int, int]:
+def _extent(column: Mapping[tuple[int, int], Any]) -> tuple[int, int]:
     """Return the first byte of a column of a row group, and the one after its last."""
-    start = column.data_page_offset
-    start = min(start, column.dictionary_page_offset) if column.has_dictionary_page else start
-    return start, start + column.total_compressed_size
+    described = column[3, _STRUCT]
+    start = described[9, _I64]
+    start = min(
+        start, described.get((11, _I64), start)
+    )  # the page of a dictionary comes before those of data
+    return start, start + described[7, _I64]
 
 
 def check_messages(source: Any) -> None:
@@ -87,8 +101,8 @@ def check_messages(source: Any) -> None:
             _check_batch(source, header, content, body, room, kind == _RECORD_BATCH)
         elif kind != _SCHEMA:
             raise ValueError(f"a message of kind {kind}")
-        if (size := _scalar(header, message, 3, "<q")) < 0:
-            raise ValueError("a message of negative length")
+        if not 0 <= (size := _scalar(header, message, 3, "<q")) <= source.size() - body:
+            raise ValueError("a message outside the file")
         position = body + size
     source.seek(_STREAM)
 
@@ -135,7 +149,7 @@ def _check_page(source: Any, start: int, room: _Room) -> int:
     return length + size
 
 
-def _read_struct(data: bytes, position: int, depth: int = 4) -> tuple[dict[tuple[int, int], Any], int]:
+def _read_struct(data: bytes, position: int, depth: int = 8) -> tuple[dict[tuple[int, int], Any], int]:
     """Read a structure of the compact protocol: its fields by number and kind, and the position after it.
 
     As for pyarrow, a field of an unexpected kind is another field, and the last of several counts.
@@ -169,7 +183,21 @@ def _read_value(data: bytes, position: int, kind: int, depth: int) -> tuple[Any,
         return None, position + length
     if kind == _STRUCT:
         return _read_struct(data, position, depth - 1)
-    raise ValueError(f"a page header with a value of kind {kind}")
+    if kind == _LIST:
+        return _read_list(data, position, depth)
+    raise ValueError(f"a header with a value of kind {kind}")
+
+
+def _read_list(data: bytes, position: int, depth: int) -> tuple[list[Any], int]:
+    count, kind = data[position] >> 4, data[position] & 15
+    position += 1
+    if count == 15:
+        count, position = _read_varint(data, position)
+    values: list[Any] = []
+    for _ in range(count):  # Each takes a byte or more, also truth values, which are bytes here.
+        value, position = _read_value(data, position, _BYTE if kind in (_TRUE, _FALSE) else kind, depth)
+        values.append(value)
+    return values, position
 
 
 def _read_varint(data: bytes, position: int) -> tuple[int, int]:

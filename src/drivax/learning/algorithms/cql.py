@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -14,9 +15,16 @@ from jaxtyping import Array, Float
 
 from drivax.checks import check_above_zero, check_at_least, check_at_most
 from drivax.errors import UsageError
-from drivax.learning.algorithms.off_policy import Trained, q_logs, squared_error, target_entropy
+from drivax.learning.algorithms.off_policy import (
+    Trained,
+    q_logs,
+    sample_each,
+    squared_error,
+    target_entropy,
+)
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
+from drivax.learning.program import mean_over_devices
 from drivax.learning.replay import Transitions
 from drivax.networks.distributions import Distribution
 from drivax.rl.equations import conservative_penalty, penalty_weight_loss, scaled_policy_loss, td_target
@@ -98,27 +106,27 @@ class Cql(Offline[CqlConfig]):
         return super().optimisers() | {name: optax.adam(rates[name]) for name in self.scalars()}
 
     def loss(
-        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, key: Array
+        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
         """Return the sum of TD errors, penalty, and the losses of policy, temperature and multiplier."""
-        critic_key, policy_key = jax.random.split(key)
-        critic, critic_logs = self._penalised_critic_loss(trained, target, batch, critic_key)
-        policy, policy_logs = self._policy_loss(trained, policy_batch, policy_key)
+        policy_keys, *critic_keys = jax.vmap(partial(jax.random.split, num=5), out_axes=1)(keys)
+        critic, critic_logs = self._penalised_critic_loss(trained, target, batch, critic_keys)
+        policy, policy_logs = self._policy_loss(trained, policy_batch, policy_keys)
         return critic + policy, critic_logs | policy_logs
 
     def _penalised_critic_loss(
-        self, trained: Trained, target: Any, batch: Transitions, key: Array
+        self, trained: Trained, target: Any, batch: Transitions, keys: Sequence[Array]
     ) -> tuple[Array, dict[str, Array]]:
-        next_key, sample_key = jax.random.split(key)
+        next_keys, *sample_keys = keys
         parameters = jax.lax.stop_gradient(trained["policy"])
         next_policy = self.distribution(parameters, batch.next_observation)
-        next_action = next_policy.action(_samples(next_policy, next_key, self.config.backup_actions))
+        next_action = next_policy.action(_samples(next_policy, next_keys, self.config.backup_actions))
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
         next_value = jnp.max(jnp.min(next_q, axis=0), axis=0)
         td = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         policy = self.distribution(parameters, batch.observation)
-        action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_key)
+        action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_keys)
         # In one call, so that each observation is encoded and differentiated once.
         actions = jnp.concatenate([batch.action[None], action])
         q_values = self.q_values(trained["critic"], batch.observation, actions)
@@ -136,17 +144,22 @@ class Cql(Offline[CqlConfig]):
         }
 
     def _penalty_actions(
-        self, policy: Distribution, next_policy: Distribution, logged: Float[Array, "B D"], key: Array
+        self,
+        policy: Distribution,
+        next_policy: Distribution,
+        logged: Float[Array, "B D"],
+        keys: Sequence[Array],
     ) -> tuple[Float[Array, "K B D"], Float[Array, "K B"]]:
         """Return the penalty's actions and their log-densities, 0 without importance weights."""
         config = self.config
-        uniform_key, policy_key, next_key = jax.random.split(key, 3)
-        shape = (config.actions, *logged.shape)
-        actions = [jax.random.uniform(uniform_key, shape, minval=-1.0)]
-        densities = [jnp.full(shape[:-1], -logged.shape[-1] * math.log(2.0))]
-        sources = ((policy, policy_key), (next_policy, next_key))
-        for distribution, sample_key in sources[: 2 if config.next_actions else 1]:
-            raw_actions = _samples(distribution, sample_key, config.actions)
+        uniform_keys, policy_keys, next_keys = keys
+        size, dimensions = logged.shape
+        draw = partial(jax.random.uniform, shape=(config.actions, dimensions), minval=-1.0)
+        actions = [jax.vmap(draw, out_axes=1)(uniform_keys)]
+        densities = [jnp.full((config.actions, size), -dimensions * math.log(2.0))]
+        sources = ((policy, policy_keys), (next_policy, next_keys))
+        for distribution, sample_keys in sources[: 2 if config.next_actions else 1]:
+            raw_actions = _samples(distribution, sample_keys, config.actions)
             actions.append(distribution.action(raw_actions))
             densities.append(jax.vmap(distribution.log_prob)(raw_actions))
         if config.importance:
@@ -163,14 +176,15 @@ class Cql(Offline[CqlConfig]):
         return jax.lax.stop_gradient(jnp.exp(log_weight)), loss
 
     def _policy_loss(
-        self, trained: Trained, policy_batch: PolicyBatch, key: Array
+        self, trained: Trained, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
         observation, expert = policy_batch
-        actor = self.soft_actor(trained, observation, self.target_entropy, key)
+        actor = self.soft_actor(trained, observation, self.target_entropy, keys)
         error = actor.policy.mode() - expert
         total = jnp.mean(actor.loss)
         if self.config.imitation:
-            scaled = jnp.mean(scaled_policy_loss(actor.loss, jnp.min(actor.q_values, axis=0)))
+            mean_q = mean_over_devices(jnp.abs(jnp.min(actor.q_values, axis=0)))
+            scaled = jnp.mean(scaled_policy_loss(actor.loss, mean_q))
             total = scaled + self.config.imitation * jnp.mean(error**2)
         return total + actor.temperature_loss, actor.logs | {
             "policy": total,
@@ -179,6 +193,8 @@ class Cql(Offline[CqlConfig]):
         }
 
 
-def _samples(distribution: Distribution, key: Array, count: int) -> Float[Array, "count ..."]:
-    """Draw ``count`` raw actions along a leading axis."""
-    return jax.vmap(distribution.sample)(jax.random.split(key, count))
+def _samples(policy: Distribution, keys: Array, count: int) -> Float[Array, "count B raw"]:
+    """Draw ``count`` raw actions from each distribution, with a key for each."""
+    return jax.vmap(partial(sample_each, policy))(
+        jax.vmap(partial(jax.random.split, num=count), out_axes=1)(keys)
+    )

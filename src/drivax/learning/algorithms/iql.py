@@ -66,7 +66,7 @@ class Iql(Offline[IqlConfig]):
         return super().optimisers() | {"value": self.adam(self.config.critic_rate)}
 
     def loss(
-        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, key: Array
+        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
         """Return the sum of expectile regression, the critics' loss, and advantage-weighted imitation."""
         config, (observation, expert) = self.config, policy_batch

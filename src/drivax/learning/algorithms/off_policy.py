@@ -127,6 +127,8 @@ class OffPolicy(Generic[Config]):
     #: Map trained parameters, target networks and a batch to the sum of all losses and values to log; the gradient of
     #: each loss reaches only its own parameters.
     loss: Callable[..., tuple[Array, dict[str, Array]]]
+    #: Maps trained parameters, target networks and a batch to values to log, and the gradient of the loss.
+    gradient: Callable[..., tuple[dict[str, Array], Any]]
 
     def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:
         """Take a gradient step of :meth:`loss` on a batch, then move the target networks."""
@@ -139,13 +141,6 @@ class OffPolicy(Generic[Config]):
         online = {name: trained[name] for name in self.targets}
         return (trained, polyak(target, online, self.config.tau), optimiser), logs
 
-    def gradient(
-        self, trained: Trained, target: dict[str, Any], *batch: Any
-    ) -> tuple[dict[str, Array], Trained]:
-        """Return values to log, and the gradient of :meth:`loss`."""
-        gradient, logs = jax.grad(self.loss, has_aux=True)(trained, target, *batch)
-        return logs, gradient
-
     def critic_loss(
         self, trained: Trained, batch: Transitions, next_value: Float[Array, " B"]
     ) -> tuple[Float[Array, ""], Float[Array, "2 B"]]:
@@ -155,15 +150,12 @@ class OffPolicy(Generic[Config]):
         return squared_error(q, target), q
 
     def soft_actor(
-        self, trained: Trained, observation: dict[str, Array], entropy: float, key: Array
+        self, trained: Trained, observation: dict[str, Array], entropy: float, keys: Array
     ) -> SoftActor:
-        """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy.
-
-        ``key`` is a single key for the batch, or an array with a key per sample.
-        """
+        """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy."""
         temperature = jnp.exp(trained["log_temperature"])
         policy = self.distribution(trained["policy"], observation)
-        raw_action = sample_each(policy, key) if key.ndim else policy.sample(key)
+        raw_action = sample_each(policy, keys)
         log_prob = policy.log_prob(raw_action)
         critic = jax.lax.stop_gradient(trained["critic"])
         q_values = self.q_values(critic, observation, policy.action(raw_action))

@@ -24,7 +24,7 @@ from drivax.learning.algorithms.off_policy import (
     reduce_over_updates,
     squared_error,
 )
-from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
+from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam, mean_gradients
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
@@ -35,7 +35,7 @@ from drivax.learning.experience import (
     sample_steps,
     transitions,
 )
-from drivax.learning.program import shard_axis
+from drivax.learning.program import map_over_devices
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import REPARAMETRISED, Actions
@@ -220,7 +220,7 @@ class Offline(OffPolicy[Config]):
     """An offline algorithm in one environment.
 
     :meth:`loss` takes the steps for policy evaluation, those for policy improvement (the same unless weights are for
-    the policy alone), and a key.
+    the policy alone), and a key for each step. It is a mean over steps, of which devices take equal shares.
     """
 
     def __init__(self, config: Config, environment: Environment, data: Any, iterations: int) -> None:
@@ -274,7 +274,8 @@ class Offline(OffPolicy[Config]):
 
         def update(carry: Carry, key: Array) -> tuple[Carry, dict[str, Array]]:
             draw_key, loss_key = jax.random.split(key)
-            return self.update_networks(carry, *self._draw(data, draw_key), loss_key)
+            loss_keys = jax.random.split(loss_key, self.config.batch)
+            return self.update_networks(carry, *self._draw(data, draw_key), loss_keys)
 
         first = ({"policy": state.parameters, **state.rest}, state.target, state.optimiser)
         keys = jax.random.split(update_key, self.config.updates)
@@ -284,16 +285,31 @@ class Offline(OffPolicy[Config]):
         )
         return after, reduce_over_updates(logs) | data.sizes()
 
-    def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
-        """Draw the steps for policy evaluation and those for policy improvement."""
+    def gradient(
+        self, trained: Trained, target: dict[str, Any], *batch: Any
+    ) -> tuple[dict[str, Array], Trained]:
+        """Return values to log, and the gradient of :meth:`loss`; ``batch`` is as :meth:`_draw` returns, and keys."""
+
+        def loss(trained: Trained, samples: Any) -> tuple[Array, dict[str, Array]]:
+            transitions, policy_batch, keys = samples
+            if policy_batch is None:
+                policy_batch = transitions.observation, transitions.action
+            return self.loss(trained, target, transitions, policy_batch, keys)
+
+        # In a single chunk, because losses may be scaled by a mean over the batch.
+        return mean_gradients(loss, trained, jax.tree.map(lambda leaf: leaf[None], batch))
+
+    def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch | None]:
+        """Draw the steps for policy evaluation, and those for policy improvement, None: the same."""
         environment, count = require_log(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
         index = sample_steps(data.critic, critic_key, count)
-        batch = shard_axis(transitions(environment, data, index, self.config.gamma), axis=0)
+        observe = partial(transitions, environment, gamma=self.config.gamma)
+        batch = map_over_devices(observe, data, index)
         if data.policy is None:
-            return batch, (batch.observation, batch.action)
-        drawn = expert_actions(environment, data, sample_steps(data.policy, policy_key, count))
-        observation, action, _ = shard_axis(drawn, axis=0)
+            return batch, None
+        index = sample_steps(data.policy, policy_key, count)
+        observation, action, _ = map_over_devices(partial(expert_actions, environment), data, index)
         return batch, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:

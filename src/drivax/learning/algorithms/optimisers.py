@@ -1,8 +1,14 @@
-"""Gradients accumulated over chunks, and Adam with clipping and a linear schedule, for all algorithms."""
+"""Gradients accumulated over chunks, Adam with clipping and a linear schedule, and averages of parameters.
+
+The average is validated and exported in place of the parameters that are trained. States of algorithms with an average
+have fields ``parameters`` (of the planner), ``trained`` (None without an average) and ``iteration``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -72,6 +78,20 @@ def sum_gradients(
     return jax.lax.optimization_barrier(sum_over_devices(sum_chunks, *inputs, axis=1))
 
 
+def mean_gradients(
+    loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
+) -> tuple[dict[str, Array], Any]:
+    """Return logs and gradient as :func:`sum_gradients`, of a loss and logs that are means over samples."""
+    count = math.prod(jax.tree.leaves(samples)[0].shape[:2])
+
+    def share_of_loss(parameters: Any, chunk: Any) -> tuple[Array, dict[str, Array]]:
+        share = len(jax.tree.leaves(chunk)[0]) / count
+        value, logs = loss(parameters, chunk)
+        return share * value, {n: x if is_largest(n) else share * x for n, x in logs.items()}
+
+    return sum_gradients(share_of_loss, parameters, samples)
+
+
 def _combine(sums: tuple[dict[str, Array], Any], values: Any) -> tuple[dict[str, Array], Any]:
     """Return the sums of logs and gradients, and of logs ``largest_*`` the maxima."""
     logs, gradient = jax.tree.map(jnp.add, sums, values)
@@ -130,3 +150,30 @@ def check_decay_share(share: float) -> None:
     """Raise UsageError if the share of a run over which a rate decays is outside (0, 1]."""
     if not 0.0 < share <= 1.0:
         raise UsageError(f"decay_share is {share}", cure="use more than 0 and at most 1")
+
+
+def check_average(decay: float) -> None:
+    """Raise UsageError if the decay of an average is outside [0, 1)."""
+    if not 0.0 <= decay < 1.0:
+        raise UsageError(f"average is {decay}", cure="use 0 or more, and less than 1")
+
+
+def unless_first(state: Any, parameters: Any) -> Any:
+    """Return ``parameters``; before the first iteration those of the planner, which pretraining may have set."""
+    return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
+
+
+def trained_parameters(state: Any) -> Any:
+    """Return the parameters that are trained."""
+    return state.parameters if state.trained is None else unless_first(state, state.trained)
+
+
+def average(state: Any, trained: Any, decay: float) -> dict[str, Any]:
+    """Return ``parameters`` and ``trained`` after an iteration that begins in ``state`` and ends with ``trained``.
+
+    The average is the mean over all iterations for the first ``1 / (1 - decay)`` of them, then exponential.
+    """
+    if state.trained is None:
+        return {"parameters": trained, "trained": None}
+    rate = jnp.maximum(1.0 - decay, 1.0 / (state.iteration + 1))
+    return {"parameters": optax.incremental_update(trained, state.parameters, rate), "trained": trained}

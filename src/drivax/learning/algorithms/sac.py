@@ -25,9 +25,16 @@ from drivax.checks import (
 )
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
-from drivax.learning.algorithms.averaging import average, check_average, trained_parameters
 from drivax.learning.algorithms.off_policy import Carry, OffPolicy, q_logs, sample_each, target_entropy
-from drivax.learning.algorithms.optimisers import add_auxiliary, clipped_adam, in_chunks, sum_gradients
+from drivax.learning.algorithms.optimisers import (
+    add_auxiliary,
+    average,
+    check_average,
+    clipped_adam,
+    in_chunks,
+    mean_gradients,
+    trained_parameters,
+)
 from drivax.learning.environment import (
     Environment,
     Environments,
@@ -323,21 +330,18 @@ class Sac(OffPolicy[SacConfig]):
     def gradient(
         self, trained: SacParameters, target: dict[str, Any], *batch: Any
     ) -> tuple[dict[str, Array], SacParameters]:
-        """Return values to log, and the sum of the gradients of :meth:`loss`, in chunks, and of the auxiliary loss.
+        """Return values to log, and the gradient of :meth:`loss`, in chunks, plus that of the auxiliary loss.
 
         ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
         """
         transitions, key, auxiliary_loss = batch
         key, auxiliary_key = jax.random.split(key)
-        count = len(transitions.reward)
 
-        def share_of_loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
-            share = len(samples[0].reward) / count
-            loss, logs = self.loss(trained, target, *samples)
-            return share * loss, {n: x if is_largest(n) else share * x for n, x in logs.items()}
+        def loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
+            return self.loss(trained, target, *samples)
 
-        samples = in_chunks((transitions, jax.random.split(key, (count, 2))))
-        logs, gradient = sum_gradients(share_of_loss, trained, samples)
+        samples = in_chunks((transitions, jax.random.split(key, (len(transitions.reward), 2))))
+        logs, gradient = mean_gradients(loss, trained, samples)
         logs, policy = add_auxiliary(auxiliary_loss, trained.policy, auxiliary_key, logs, gradient.policy)
         return logs, replace(gradient, policy=policy)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -15,6 +16,7 @@ from drivax.checks import check_at_least
 from drivax.learning.algorithms.off_policy import Trained, q_logs
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
+from drivax.learning.program import mean_over_devices
 from drivax.learning.replay import Transitions
 from drivax.rl.equations import scaled_policy_loss, smoothed_action
 
@@ -63,12 +65,12 @@ class Td3Bc(Offline[Td3BcConfig]):
         return super().optimisers() | {"policy": optax.conditionally_mask(policy, is_due)}
 
     def loss(
-        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, key: Array
+        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
         """Return the critics' loss, minus the first critic's scaled value of the policy's action, plus imitation."""
         config = self.config
         next_action = self.distribution(target["policy"], batch.next_observation).mode()
-        noise = config.noise * jax.random.normal(key, next_action.shape)
+        noise = config.noise * jax.vmap(partial(jax.random.normal, shape=next_action.shape[1:]))(keys)
         next_action = smoothed_action(next_action, noise, config.noise_bound)
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
         critic_loss, q = self.critic_loss(trained, batch, jnp.min(next_q, axis=0))
@@ -78,7 +80,10 @@ class Td3Bc(Offline[Td3BcConfig]):
         policy_q = self.q_values(jax.lax.stop_gradient(trained["critic"]), observation, action)[0]
         error = action - expert
         imitation = jnp.mean(error**2)
-        policy = config.q_weight * jnp.mean(scaled_policy_loss(-policy_q, policy_q)) + imitation
+        policy = (
+            config.q_weight * jnp.mean(scaled_policy_loss(-policy_q, mean_over_devices(jnp.abs(policy_q))))
+            + imitation
+        )
         return critic_loss + policy, {
             "critic": critic_loss,
             "policy": policy,

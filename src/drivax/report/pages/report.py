@@ -1,4 +1,8 @@
-"""One self-contained HTML page from run folders: tables with intervals, all episodes, rollouts, learning curves."""
+"""Report of run folders: one self-contained HTML page, and its tables as files.
+
+The page has tables with intervals, all episodes, rollouts and learning curves. Tables of evaluations become CSV (with
+all digits), Markdown and LaTeX files.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation import result_tables
-from drivax.evaluation.episode_table import NOT_SUMMARISED, RATES, EpisodeTable, ScenarioKey, Tags
+from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES, EpisodeTable, ScenarioKey, Tags
 from drivax.evaluation.pairing import comparable, mismatch
-from drivax.files import check_output, write_text
+from drivax.files import check_output, inside, write_text
+from drivax.metrics.catalogue import METRICS, SETS
 from drivax.report.charts import curve_sections, distribution_charts
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, outcome, rollouts_of, sort_worst_first
 from drivax.report.pages.page import (
@@ -30,13 +35,18 @@ from drivax.report.pages.page import (
     section,
 )
 from drivax.report.pictures.player_data import pack_episode
-from drivax.report.runs import Training, read_runs
-from drivax.report.table_files import strata_tables, transfer_tables
-from drivax.table import bounds, number, suffix
+from drivax.report.runs import Training, read_evaluations, read_runs
+from drivax.table import Table, bounds, number, suffix
 
 EPISODES = 12
 #: Selected episodes, and their data for the player.
 PackedEpisodes = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
+#: Columns of the tables by tag, few enough for a page.
+KEY_METRICS = (
+    "success", "accuracy", "collision", "at_fault_collision", "offroad", "red_light", "progress_ratio", "vmax_score",
+)  # fmt: skip
+#: Metrics of a transfer matrix.
+TRANSFER_METRICS = ("success", "vmax_score")
 
 
 def write_report(
@@ -376,3 +386,93 @@ def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
             indices = [[index_of[word] for word in words] for words in values]
             columns.append({"name": name, "words": distinct, "of": indices})
     return columns
+
+
+def write_tables(
+    runs: Sequence[Path], out: Path, data: Path | None = None, overwrite: bool = False, metrics: Sequence[str] = ()
+) -> list[Path]:  # fmt: skip
+    """Write every table of a report into a folder as ``.csv``, ``.md`` and ``.tex``, and return the files.
+
+    The tables are ``results``, ``differences`` (several runs; columns for those that are comparable with the policy),
+    ``collisions`` (known kinds of collision), ``by-TAG`` (:func:`strata_tables`) and ``transfer-METRIC`` (runs on
+    several data sets).
+
+    Args:
+        runs: Run folders; the last evaluation is the policy.
+        out: Folder of the tables.
+        data: Path of the policy's scenario set, if it has moved.
+        overwrite: Replace existing files.
+        metrics: Extra columns of ``episodes.csv``, or sets of metrics, for ``results``, ``differences`` and ``by-TAG``.
+
+    Raises:
+        DataError: A run folder or the scenario set is missing or damaged, the set is not the evaluated one, or a file
+            in ``out`` is a symbolic link.
+        UsageError: A file exists, no run is an evaluation, or no run has one of the metrics.
+    """
+    texts = {}
+    for table in _tables(read_evaluations(runs), data, metrics):
+        formats = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
+        texts |= {f"{table.name}.{ending}": text for ending, text in formats.items()}
+    files = {inside(out, name): text for name, text in texts.items()}
+    for file in files:
+        check_output(file, overwrite)
+    for file, text in files.items():
+        write_text(file, text)
+    return list(files)
+
+
+def select_metrics(runs: Sequence[EpisodeTable], extra: Sequence[str] = ()) -> list[str]:
+    """Return the metrics of the files: headline metrics, progress in metres, user-defined metrics, and ``extra``.
+
+    ``extra`` has names of metrics and of sets of metrics. Runs without any of these metrics have all of theirs.
+
+    Raises:
+        UsageError: ``extra`` names no set, and no metric of which a run has a mean.
+    """
+    names = result_tables.sort_metrics(result_tables.metric_names(runs))
+    selected = {"progress"}
+    for entry in extra:
+        if entry not in SETS and entry not in names:
+            raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, [*SETS, *names]))
+        selected.update(SETS.get(entry, (entry,)))
+    headline = result_tables.headline_names(names)
+    others = [name for name in names if name in selected or name not in (*METRICS, *ADDED)]
+    return [*headline, *(name for name in others if name not in headline)] or names
+
+
+def _tables(runs: Sequence[EpisodeTable], data: Path | None, extra: Sequence[str]) -> list[Table]:
+    """Return all tables in the order of the files."""
+    default_metrics, metrics = select_metrics(runs), select_metrics(runs, extra)
+    results = [result_tables.results_table(runs, metrics)]
+    if len(runs) > 1:
+        others = [run for run in runs[:-1] if comparable(runs[-1], run)]
+        results.append(result_tables.differences_table(runs[-1], others, metrics))
+    if any("collision_type" in run.metrics for run in runs):
+        results.append(result_tables.collisions_table(runs))
+    extra_metrics = [name for name in metrics if name not in default_metrics]
+    results += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), extra_metrics)
+    return results + transfer_tables(runs)
+
+
+def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, extra: Sequence[str] = ()) -> list[Table]:
+    """Return a table for each tag of ``result_tables.STRATA`` that the scenarios have, of the runs on these scenarios.
+
+    Columns are :data:`KEY_METRICS` and ``extra``.
+    """
+    runs = [run for run in runs if any(key in tags for key in run.scenarios)]
+    tag_names = {name for scenario_tags in tags.values() for name in scenario_tags}
+    names = dict.fromkeys((*KEY_METRICS, *extra))
+    metrics = [name for name in names if any(name in run.metrics for run in runs)]
+    strata = [tag for tag in result_tables.STRATA if tag in tag_names]
+    return [result_tables.strata_table(runs, tags, tag, metrics) for tag in strata]
+
+
+def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
+    """Return a matrix of training and evaluation data for each defined metric of :data:`TRANSFER_METRICS`.
+
+    There is no table if all runs share one set.
+    """
+    if len({result_tables.set_key(run.data) for run in runs}) < 2:
+        return []
+    metrics = [name for name in TRANSFER_METRICS if any(result_tables.summarise(run, name).n for run in runs)]
+    return [result_tables.transfer_table(runs, name) for name in metrics]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax import kernels
 from drivax.geometry.vectors import norm, root
-from drivax.kernels import roads
+from drivax.kernels import bindings
 from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn, StrandColumn
 from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
@@ -181,8 +181,8 @@ def around_lanes(
     highest limit, lanes of the corridor of the route ``row`` before others if it is ``routed``. Without such lanes it
     drives the nearest within 30 degrees, else the nearest within 90 degrees.
     """
-    if roads.supports(_lane_grid(bank), points, centre, heading, z):
-        return _native_lanes(bank, index, roads.Box(centre, heading, points, z), routed, row)
+    if bindings.supports_grid(_lane_grid(bank), points, centre, heading, z):
+        return _native_lanes(bank, index, bindings.Box(centre, heading, points, z), routed, row)
     return _xla_lanes(bank, index, centre, heading, points, z, routed, row)
 
 
@@ -243,10 +243,10 @@ def _xla_lanes(
 
 
 def _native_lanes(
-    bank: ScenarioBank, index: Integer, box: roads.Box, routed: bool | Bool[Array, ""], row: Any
+    bank: ScenarioBank, index: Integer, box: bindings.Box, routed: bool | Bool[Array, ""], row: Any
 ) -> LaneHits:
     """Return :func:`around_lanes` by the native kernel."""
-    lanes = roads.query_lanes(
+    lanes = bindings.query_lanes(
         _lane_grid(bank), bank.map_box, jnp.asarray(index, jnp.int32), box,
         jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), _LANE_RULES,
     )  # fmt: skip
@@ -335,7 +335,7 @@ def offroad_distance(
     the distance is then plus or minus the cut-off.
     """
     query = _xla_offroad_distance
-    if roads.supports(_edge_grid(bank), points, centre, z):
+    if bindings.supports_grid(_edge_grid(bank), points, centre, z):
         query = kernels.with_reference(_native_offroad_distance, query)
     return query(bank, index, centre, points, points_near_lane, z)
 
@@ -358,20 +358,20 @@ def _native_offroad_distance(
     points_near_lane: Bool[Array, "4"], z: Scalar,
 ) -> Float[Array, "4"]:  # fmt: skip
     """Return :func:`offroad_distance` by the native kernel."""
-    return roads.query_edges(
+    return bindings.query_edges(
         _edge_grid(bank), bank.grid_side, jnp.asarray(index, jnp.int32), centre, points, points_near_lane, z,
         _EDGE_RULES,
     )  # fmt: skip
 
 
-def _edge_grid(bank: ScenarioBank) -> roads.SegmentGrid:
-    return roads.SegmentGrid(
+def _edge_grid(bank: ScenarioBank) -> bindings.SegmentGrid:
+    return bindings.SegmentGrid(
         bank.edges, bank.grid_edge, bank.grid_origin, bank.cell_m, bank.edge_run, bank.long_ego
     )
 
 
-def _lane_grid(bank: ScenarioBank) -> roads.SegmentGrid:
-    return roads.SegmentGrid(
+def _lane_grid(bank: ScenarioBank) -> bindings.SegmentGrid:
+    return bindings.SegmentGrid(
         bank.lanes, bank.grid_lane, bank.grid_origin, bank.cell_m, bank.lane_run, bank.long_ego
     )
 

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.errors import DataError
-from drivax.scenario.build.egos import FurtherEgo, further_egos
 from drivax.scenario.build.grid import EDGE_BLOCK, LANE_BLOCK, GridSegments, arrange, cell_sides, ringed_cells
 from drivax.scenario.build.lanes import (
     LaneGraph,
@@ -25,7 +24,7 @@ from drivax.scenario.build.lanes import (
     place_stops,
     select,
 )
-from drivax.scenario.build.routes import EgoLog, Intent, Route, RouteSet, RouteStyle, find_routes
+from drivax.scenario.build.routes import STANDS_M, EgoLog, Intent, Route, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import (
     RoadLines,
     RoadRows,
@@ -50,11 +49,13 @@ from drivax.scenario.recording import Recording, check, differentiate, plausible
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
+    CURRENT_STEP,
     EDGE_KINDS,
     LANE_KINDS,
     LEAST_STEPS,
     LINE_KINDS,
     NAMES,
+    AgentKind,
     Capacity,
     Flag,
     RoadKind,
@@ -95,6 +96,9 @@ _FEATURE_GROUPS = {
     "lane": LANE_KINDS, "road_line": LINE_KINDS, "road_edge": EDGE_KINDS, "crosswalk": (RoadKind.CROSSWALK,),
     "speed_bump": (RoadKind.SPEED_BUMP,), "stop_sign": (RoadKind.STOP_SIGN,), "driveway": (RoadKind.DRIVEWAY,),
 }  # fmt: skip
+#: Logs of further egos end where they leave the box of the recorded ego's log, widened by this; the stored map reaches
+#: 20 m further.
+_KNOWN_M = 80.0
 
 
 @dataclass(frozen=True)
@@ -216,8 +220,41 @@ def _further_egos(
     """Return up to ``most`` egos next to the recorded one, with routes from ``find``, without an intended route."""
     return [
         FurtherEgo(slot, last, find(ego_log(tracks, log.current, int(moving[slot]), last), Intent()))
-        for slot, last in further_egos(tracks, moving, log, most)
+        for slot, last in _select_egos(tracks, moving, log, most)
     ]
+
+
+@dataclass(frozen=True)
+class FurtherEgo:
+    """A further ego: its slot, the last step of its unbroken log, and its routes, of which the first is stored."""
+
+    slot: int
+    last: int
+    routes: RouteSet
+
+
+def _select_egos(
+    tracks: LocalTracks, moving: Int[Array, " slot"], log: EgoLog, most: int
+) -> list[tuple[int, int]]:
+    """Return slot and last step of up to ``most`` vehicles, the nearest to the recorded ego first.
+
+    From the current step on, their log lasts 2 s or more and leads more than 2 m away. It ends at the first gap, or
+    where it leaves the box of ``_KNOWN_M``. ``moving`` holds the track of every slot, ``log`` is the recorded ego's.
+    """
+    if most < 1:
+        return []
+    now, path = log.current, log.positions[:, :2]
+    xy, valid = tracks.xyz[moving, now:, :2], tracks.valid[moving, now:]
+    low, high = path.min(axis=0) - _KNOWN_M, path.max(axis=0) + _KNOWN_M
+    unbroken = np.logical_and.accumulate(valid & ((xy >= low) & (xy <= high)).all(axis=2), axis=1)
+    steps = unbroken.sum(axis=1)
+    travel = np.where(unbroken, np.hypot(*np.moveaxis(xy - xy[:, :1], -1, 0)), 0.0).max(axis=1)
+    eligible = (steps >= LEAST_STEPS - CURRENT_STEP) & (travel > STANDS_M)
+    eligible &= (tracks.kind[moving] == AgentKind.VEHICLE) & (moving != tracks.ego)
+    slots = np.flatnonzero(eligible)
+    distance = np.hypot(*(xy[slots, 0] - log.xyz[now, :2]).T)
+    chosen = slots[np.argsort(distance, kind="stable")[:most]]
+    return [(int(slot), now + int(steps[slot]) - 1) for slot in chosen]
 
 
 def _lanes_of(routes: Sequence[Route]) -> Int[Array, " route_lane"]:

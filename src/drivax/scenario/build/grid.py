@@ -224,11 +224,12 @@ def _nearest_sides(side_grid: Grid, edges: Segments) -> tuple[Int[Array, " cell"
     base = np.floor((a + b) / (2 * width)).astype(np.int64)
     low, (columns, rows) = base.min(axis=0) - reach, (np.ptp(base, axis=0) + 2 * reach + 1).tolist()
     segment, near_cell, nearest = _nearest_pairs(a, b, base, low, (rows, columns), width)
-    u = b[segment] - a[segment]
-    w = (np.stack((near_cell % columns, near_cell // columns), axis=-1) + low + 0.5) * width - a[segment]
-    length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
-    along = (u * w).sum(axis=1) / length**2
-    left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
+    (begin_x, begin_y), (u_x, u_y) = a.take(segment, axis=0).T, (b - a).take(segment, axis=0).T
+    w_x = (near_cell % columns + low[0] + 0.5) * width - begin_x
+    w_y = (near_cell // columns + low[1] + 0.5) * width - begin_y
+    length = np.maximum(np.hypot(u_x, u_y), 1e-6)
+    along = (u_x * w_x + u_y * w_y) / length**2
+    left = (u_x * w_y - u_y * w_x) / length
     begins, ends = _open_ends(a, b)
     past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
@@ -252,18 +253,18 @@ def _nearest_pairs(
     ``base`` is the column and row of each segment's midpoint, ``low`` the first column and row.
     """
     steps = np.arange(-int(np.ceil(_REACH_M / width)), int(np.ceil(_REACH_M / width)) + 1)
-    index = (base - low) @ np.array([1, shape[1]])
+    index, window = (base - low) @ np.array([1, shape[1]]), (shape[1] * steps[:, None] + steps).ravel()
     nearest, pairs = np.full(shape[0] * shape[1], np.inf), []
     # Blocks keep the tables in the processor's cache.
     for first in range(0, len(a), _BLOCK):
         block = slice(first, first + _BLOCK)
-        cell = index[block, None, None] + (shape[1] * steps[:, None] + steps)
+        cell = index[block, None] + window
         x, y = (((base[block, axis, None] + steps) + 0.5) * width for axis in (0, 1))
-        squared = _squared_distances(x, y, a[block], b[block])
-        nearer = squared < nearest.take(cell)
-        np.minimum.at(nearest, cell[nearer], squared[nearer])
-        near = np.nonzero(squared <= _almost(nearest.take(cell)))
-        pairs.append((near[0] + first, cell[near], squared[near]))
+        squared = _squared_distances(x, y, a[block], b[block]).reshape(cell.shape)
+        nearer = (squared < nearest.take(cell)).ravel().nonzero()[0]
+        np.minimum.at(nearest, cell.take(nearer), squared.take(nearer))
+        near = (squared <= _almost(nearest.take(cell))).ravel().nonzero()[0]
+        pairs.append((near // len(window) + first, cell.take(near), squared.take(near)))
     segment, cell, squared = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     # All segments that are nearest up to rounding: at a vertex there are two.
     keep = squared <= _almost(nearest[cell])

@@ -16,7 +16,7 @@ from drivax.geometry.polylines import Polylines, left_normals, point_to_segment
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box, path_distance, plausible_limit
 from drivax.scenario.recording import Light, MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
+from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among, nonzero
 
 Array = np.ndarray[Any, Any]
 
@@ -358,8 +358,8 @@ class LaneSegments:
         distance, s = np.full(shape, np.inf), np.zeros(shape)
         in_reach = np.abs(xyz[:, :1] - segments.a[:, 0]) <= most
         in_reach &= np.abs(xyz[:, 1:2] - segments.a[:, 1]) <= most
-        pose, row = in_reach.nonzero()
-        a, b = segments.a[row], segments.b[row]
+        pose, row = nonzero(in_reach)
+        a, b = segments.a.take(row, axis=0), segments.b.take(row, axis=0)
         separation, along = point_to_segment(xyz[pose, :2], a[:, :2], b[:, :2])
         z = a[:, 2] + along * (b[:, 2] - a[:, 2])
         is_excluded = np.abs(wrap(self.heading[row] - heading[pose])) > turn_rad

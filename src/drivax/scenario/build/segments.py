@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,15 @@ from jaxtyping import Bool, Float, Int
 from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind, among
+from drivax.scenario.schema import (
+    CAR_LANE_KINDS,
+    EDGE_KINDS,
+    LANE_KINDS,
+    POLYGON_KINDS,
+    RoadKind,
+    among,
+    nonzero,
+)
 
 Array = np.ndarray[Any, Any]
 
@@ -30,6 +38,8 @@ _LEAST_LENGTH_M = 1e-3
 MOST_LIMIT_MPS = 100.0
 #: Longest piece of road, and fewest pieces of a closed ring: a single piece would end where it begins.
 PIECE_M, RING_PIECES = 10.0, 4
+#: Points whose distance from a path is computed at once.
+_BLOCK = 512
 #: Pieces rank by rings of this width around the log of the ego.
 RING_M = 50.0
 
@@ -69,15 +79,18 @@ class Segments:
 
     def take(self, rows: Array) -> Segments:
         """Select segments by indices or a mask."""
-        return Segments(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
+        rows = rows.nonzero()[0] if rows.dtype == bool else rows
+        return Segments(
+            **{name: getattr(self, name).take(rows, axis=0) for name in self.__dataclass_fields__}
+        )
 
-    @property
+    @cached_property
     def middle(self) -> Float[Array, "segment 2"]:
         """Midpoints in the plane of the end points rounded to float32."""
         ends = self.a[:, :2].astype(np.float32), self.b[:, :2].astype(np.float32)
         return ((ends[0] + ends[1]) * np.float32(0.5)).astype(np.float64)
 
-    @property
+    @cached_property
     def block(self) -> Int[Array, " segment"]:
         """Storage block: 0 road edge, 1 car lane, 2 the rest."""
         is_edge = among(self.kind, EDGE_KINDS)
@@ -129,18 +142,20 @@ def _drop_short(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " p
 def cut(roads: RoadLines) -> Segments:
     """Simplify polylines to 5 cm and cut them into segments of at most 4 m, in order."""
     keep = simplify(roads.lines, TOLERANCE_M, Z_WEIGHT)
-    points, arc, line = roads.lines.points[keep], roads.arc[keep], roads.lines.row[keep]
-    inner = line[1:] == line[:-1]
-    a, b = points[:-1][inner], points[1:][inner]
+    rows = keep.nonzero()[0]
+    points, arc, line = roads.lines.points.take(rows, axis=0), roads.arc[rows], roads.lines.row[rows]
+    inner = (line[1:] == line[:-1]).nonzero()[0]
+    a, b = points.take(inner, axis=0), points.take(inner + 1, axis=0)
     s, span, line = arc[:-1][inner], np.diff(arc)[inner], line[:-1][inner]
     pieces = cut_counts(np.hypot(*(b - a)[:, :2].T), LONGEST_M)
     owner = np.repeat(np.arange(len(a)), pieces)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     low, high = number / pieces[owner], (number + 1) / pieces[owner]
-    step = (b - a)[owner]
+    begin, step = a.take(owner, axis=0), (b - a).take(owner, axis=0)
+    is_last = (number + 1 == pieces[owner])[:, None]
     return Segments(
-        a=a[owner] + low[:, None] * step,
-        b=np.where((number + 1 == pieces[owner])[:, None], b[owner], a[owner] + high[:, None] * step),
+        a=begin + low[:, None] * step,
+        b=np.where(is_last, b.take(owner, axis=0), begin + high[:, None] * step),
         kind=roads.kind[line[owner]],
         polyline=line[owner],
         feature=roads.feature[line[owner]],
@@ -152,8 +167,13 @@ def cut(roads: RoadLines) -> Segments:
 def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> Float[Array, " point"]:
     """Distance of points from the nearest point of ``path``, metres; infinite for an empty path."""
     best = np.full(len(xy), np.inf)
-    for x, y in path:
-        np.minimum(best, np.hypot(xy[:, 0] - x, xy[:, 1] - y), out=best)
+    # Blocks keep the tables in the processor's cache.
+    for first in range(0, len(xy), _BLOCK):
+        x, y = (np.subtract.outer(path[:, axis], xy[first : first + _BLOCK, axis]) for axis in (0, 1))
+        squared = x * x + y * y
+        # np.hypot is slow: call it only for the nearest points up to rounding.
+        near = nonzero(~(squared > squared.min(axis=0, initial=np.inf) * (1 + 1e-12)))
+        np.minimum.at(best, near[1] + first, np.hypot(x[near], y[near]))
     return best
 
 
@@ -230,10 +250,11 @@ def road_rows(
     order = rank(group, path_distance(middle, path))[:most]
     overflow = +Counter(road_rows=len(owner) - len(order))
     owner, begin, span, middle, kind = owner[order], begin[order], span[order], middle[order], kind[order]
-    angle = _angle(roads, owner, begin, begin + span)
+    start, end = roads.lines.at(owner, begin), roads.lines.at(owner, begin + span)
+    angle = _angle(start, end)
     # Curvature is the turn from the first third to the last, over the distance of their middles.
-    first = _angle(roads, owner, begin, begin + span / 3)
-    last = _angle(roads, owner, begin + span * 2 / 3, begin + span)
+    first = _angle(start, roads.lines.at(owner, begin + span / 3))
+    last = _angle(roads.lines.at(owner, begin + span * 2 / 3), end)
     turn = wrap(last - first)
     limits = np.array([plausible_limit(feature) for feature in features], dtype=np.float64)
     return RoadRows(
@@ -248,10 +269,10 @@ def road_rows(
     )
 
 
-def _angle(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Array, " row"]:
-    """Angle of the chord between two arc lengths of each polyline."""
-    chord = roads.lines.at(line, end) - roads.lines.at(line, begin)
-    return np.arctan2(chord[..., 1], chord[..., 0])
+def _angle(begin: Float[Array, "row 3"], end: Float[Array, "row 3"]) -> Float[Array, " row"]:
+    """Angle of each chord."""
+    chord = end - begin
+    return np.arctan2(chord[:, 1], chord[:, 0])
 
 
 def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array, " row"]:

@@ -35,8 +35,8 @@ DEFAULT_SIZES = {
     AgentKind.CYCLIST: (1.8, 0.6, 1.7), AgentKind.OTHER: (1.0, 1.0, 1.0), AgentKind.STATIC: (0.5, 0.5, 1.0),
 }  # fmt: skip
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
-#: Larger measurements of a size are ignored.
-MOST_SIZE_M = 100.0
+#: Smaller and larger measurements of a size are ignored.
+LEAST_SIZE_M, MOST_SIZE_M = 1e-3, 100.0
 #: Sort keys, larger than all distances: of tracks that are never valid with the ego, and the lead of preferred ones.
 _UNRELATED_M, _PREFERENCE_M = 1e6, 1e7
 
@@ -63,7 +63,7 @@ class LocalTracks:
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
     """Move tracks into the local frame and give every track one box size.
 
-    Length, width and height are each the median of the valid measurements between 0 and 100 m, since sizes of one
+    Length, width and height are each the median of the valid measurements from 1 mm to 100 m, since sizes of one
     object vary by metres in public data; without any, that of :data:`DEFAULT_EGO_SIZE` (ego) or :data:`DEFAULT_SIZES`.
     """
     valid, mask = tracks.valid, tracks.valid[..., None]
@@ -77,7 +77,7 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], Bool[Array, " track"]]:
     """Median box size of every track, and the mask of those with a default length, width or height."""
     sizes = np.nan_to_num(tracks.size)
-    is_plausible = tracks.valid[..., None] & (sizes > 0.0) & (sizes <= MOST_SIZE_M)
+    is_plausible = tracks.valid[..., None] & (sizes >= LEAST_SIZE_M) & (sizes <= MOST_SIZE_M)
     size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(is_plausible, 1, 2))
     default = np.array([DEFAULT_SIZES[AgentKind(kind)] for kind in tracks.kind]).reshape(-1, 3)
     default[ego] = DEFAULT_EGO_SIZE

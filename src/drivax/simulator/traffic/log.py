@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from drivax.kernels.frame import read_frame
+from drivax.kernels.bindings import read_frame
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.schema import DT_S
@@ -113,9 +113,9 @@ def present_frame(bank: ScenarioBank, context: AgentContext, driven: AgentContex
     motion, slot = driven.history[0, -1], driven.slot[0]
     heading = motion[MOTION_HEADING]
     direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-    box, velocity, z, *others = read_frame(logs, context.index, context.step, slot, motion, direction)
-    is_driven = (jnp.arange(len(z)) == slot) & (slot < bank.agents.shape[2])
-    return Frame(box, velocity, jnp.where(is_driven, driven.z[0], z), *others)
+    agents, lights = read_frame(logs, context.index, context.step, slot, motion, direction)
+    is_driven = (jnp.arange(len(agents.z)) == slot) & (slot < bank.agents.shape[2])
+    return Frame(*agents._replace(z=jnp.where(is_driven, driven.z[0], agents.z)), lights)
 
 
 def alone(context: AgentContext) -> AgentContext:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import overlap, time_to_overlap
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, nonzero
 from drivax.synthetic.events.actors import user_trajectory
 from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.events.kinds import StagedEvent
@@ -88,7 +88,7 @@ def first_blocked_station(view: EgoView, adversary: ScriptedUser, step: int) -> 
     ego = boxes(xy, track.heading[begin:], size)
     reach = (math.hypot(*size) + math.hypot(*adversary.size_m[:2])) / 2
     squared_m2 = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
-    time, index = np.nonzero((squared_m2 < reach**2) & adversary.valid[step : last + 1, None])
+    time, index = nonzero((squared_m2 < reach**2) & adversary.valid[step : last + 1, None])
     hit = overlap(ego[index], box[time])
     result = np.full(len(box), math.inf)
     np.minimum.at(result, time[hit], station[index[hit]])
@@ -181,7 +181,7 @@ def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
     headings = motion.heading[rows][:, moves]
     is_crossing = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
-    row, step = np.nonzero(motion.valid[rows][:, moves] & is_crossing & (gap < _NEAR_M**2))
+    row, step = nonzero(motion.valid[rows][:, moves] & is_crossing & (gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSING_MARGIN_M
     other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
     hit = overlap(actor_boxes(extra)[moves[step]], other)
@@ -208,7 +208,7 @@ def enter_when_clear(
     is_kept = ~np.isin(np.arange(len(motion.kind)), removed)[users, None]
     valid = motion.valid[users, :end] & extra.valid[:end] & is_kept
     is_near = np.sum((other[..., :2] - box[..., :2]) ** 2, axis=-1) < _NEAR_M**2
-    user, step = np.nonzero(valid & is_near)
+    user, step = nonzero(valid & is_near)
     forward = box[0, step, 2:4] * np.where(extra.speed[step] < 0, -1.0, 1.0)[:, None]
     is_ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
     is_pedestrian = motion.kind[users][user] == AgentKind.PEDESTRIAN

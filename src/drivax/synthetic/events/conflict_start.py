@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
 from drivax.geometry.boxes import overlap
-from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
+from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, nonzero
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.events.adversary import boxes
 from drivax.synthetic.roads.network import Control, RoadNetwork
@@ -143,7 +143,7 @@ def _hits(
     near, far, right, left = extent
     is_close = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
     from_behind |= is_close & ((near + far) / 2 <= at - half)
-    user, start = np.nonzero(is_close & ~from_behind)
+    user, start = nonzero(is_close & ~from_behind)
     result = np.zeros(len(at), bool)
     if not len(user):
         return result

@@ -62,11 +62,12 @@ class Track:
         self, xy: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Stations and lateral offsets (left positive) of points."""
-        rel = xy[:, None] - self.xy
-        index = np.argmin(np.sum(rel**2, axis=-1), axis=1)
-        rel = rel[np.arange(len(xy)), index]
+        x, y = (np.subtract.outer(xy[:, axis], self.xy[:, axis]) for axis in (0, 1))
+        index = np.argmin(x**2 + y**2, axis=1)
+        nearest = np.arange(len(xy)), index
+        x, y = x[nearest], y[nearest]
         cos, sin = np.cos(self.heading[index]), np.sin(self.heading[index])
-        return STEP_M * index + rel[:, 0] * cos + rel[:, 1] * sin, rel[:, 1] * cos - rel[:, 0] * sin
+        return STEP_M * index + x * cos + y * sin, y * cos - x * sin
 
 
 def ego_track(motion: Motion) -> Track:
@@ -146,10 +147,13 @@ class EgoView:
         """Lane of ego at a station (-1: none), the route's where several coincide."""
         xy, heading = self.track.place(station)
         points, headings, lane = self._lane_points
-        gap = np.hypot(*(points - xy).T)
-        is_near = (gap < 2.0) & (np.cos(headings - heading) > 0.8)
+        dx, dy = (points - xy).T
+        near = np.flatnonzero(dx * dx + dy * dy < 4.1)
+        gap = np.hypot(dx[near], dy[near])
+        is_near = (gap < 2.0) & (np.cos(headings[near] - heading) > 0.8)
         if not is_near.any():
             return -1
+        lane = lane[near]
         is_on_route = is_near & np.isin(lane, self.roles.route)
         is_candidate = is_on_route if is_on_route.any() else is_near
         return int(lane[is_candidate][np.argmin(gap[is_candidate])])

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from drivax.geometry.boxes import corners, overlap
 from drivax.geometry.polylines import left_normals
 from drivax.geometry.vectors import wrap
-from drivax.scenario.schema import DT_S
+from drivax.scenario.schema import DT_S, nonzero
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
@@ -112,7 +112,7 @@ def shift_path(
 
 def _speeds(curve: Curve, limit_mps: _Points, drivers: Drivers) -> tuple[_Points, _Points]:
     """Return the preferred speeds of ego along a curve, and the largest ones in bends."""
-    curvature, no_lanes = mean_curvature(curve, SPACING_M), np.full((len(limit_mps), 1), -1)
+    curvature, no_lanes = mean_curvature(curve, SPACING_M), np.full((len(limit_mps), 1), -1, np.int32)
     path = Path(curve, SPACING_M, curvature, limit_mps, (), no_lanes, np.zeros((len(limit_mps), 1)))
     driver = drivers.speed_factor[0], drivers.lateral_mps2[0], drivers.slowing_mps2[0]
     bend = np.maximum(np.abs(curvature), 1e-6)
@@ -187,11 +187,11 @@ def _box_conflicts(
     """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
     reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
-    user, step = np.nonzero(valid & _is_near_path(others, ego, reach))
+    user, step = nonzero(valid & _is_near_path(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
     xy = others[user, step, :2]
     gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
-    entry, block = np.nonzero(gap < reach[user, None] ** 2)
+    entry, block = nonzero(gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     entry = np.repeat(entry, _STRIDE)
     is_inside = (point >= 0) & (point < len(ego))

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import corners, overlap
 from drivax.geometry.vectors import wrap
-from drivax.scenario.schema import DT_S, AgentKind
+from drivax.scenario.schema import DT_S, AgentKind, nonzero
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import Path
@@ -134,7 +134,7 @@ def first_overlap_step(
     dx, dy = (box[first, :, axis] - box[second, :, axis] for axis in (0, 1))
     gap = dx * dx + dy * dy
     near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
-    index, time = np.nonzero(near)
+    index, time = nonzero(near)
     hit = overlap(box[first[index], time], box[second[index], time])
     result = np.full((len(box), len(box)), box.shape[1])
     np.minimum.at(result, (first[index[hit]], second[index[hit]]), time[hit])
@@ -146,16 +146,17 @@ def inside(
 ) -> Bool[np.ndarray, " point"]:
     """Mask of points inside the area bounded by closed rings (even-odd rule, exact)."""
     crossings = np.zeros(len(points), int)
-    x, y = points[:, 0, None], points[:, 1, None]
+    x, y = points.T.copy()
     for ring in rings:
         a, b = ring, np.roll(ring, -1, axis=0)
         near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
         # Rays to the right meet only sides at the height of a point that reach beyond the leftmost one.
         keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
         (ax, ay), (bx, by) = a[keep].T, b[keep].T
-        across = (ay > y) != (by > y)
-        side = (bx - ax) * (y - ay) - (x - ax) * (by - ay)
-        crossings += np.sum(across & ((side > 0) == (by > ay)), axis=1)
+        point, k = nonzero((ay > y[:, None]) != (by > y[:, None]))
+        (ax, ay), (bx, by), x_of, y_of = (ax[k], ay[k]), (bx[k], by[k]), x[point], y[point]
+        side = (bx - ax) * (y_of - ay) - (x_of - ax) * (by - ay)
+        crossings += np.bincount(point[(side > 0) == (by > ay)], minlength=len(points))
     return crossings % 2 == 1
 
 
@@ -260,10 +261,17 @@ def against_traffic(
     points, course = points[near], course[near]
     if not len(points):
         return np.zeros(len(xy), bool)
-    gap = np.hypot(xy[:, None, 0] - points[:, 0], xy[:, None, 1] - points[:, 1])
-    against = np.cos(heading[:, None] - course) < math.cos(math.radians(135.0))
-    opposed = np.where(against, gap, np.inf).min(axis=1)
-    return opposed < np.where(against, np.inf, gap).min(axis=1) - _AMBIGUITY_M
+    dx, dy = (np.subtract.outer(xy[:, axis], points[:, axis]) for axis in (0, 1))
+    squared = dx * dx + dy * dy
+    # Only points that are at most this much further away than the nearest one decide.
+    most = np.sqrt(squared.min(axis=1)) + _AMBIGUITY_M + 1e-3
+    place, point = nonzero(squared <= (most * most)[:, None])
+    gap = np.hypot(dx[place, point], dy[place, point])
+    against = np.cos(heading[place] - course[point]) < math.cos(math.radians(135.0))
+    opposed, other = np.full((2, len(xy)), np.inf)
+    np.minimum.at(opposed, place[against], gap[against])
+    np.minimum.at(other, place[~against], gap[~against])
+    return opposed < other - _AMBIGUITY_M
 
 
 def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float64
@@ -149,12 +149,14 @@ def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 
 def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, start: Pose) -> Curve:
     """Integrate curvature (1/m, one value per sample) to a curve by the midpoint rule."""
-    turns = (curvature[1:] + curvature[:-1]) * (step_m / 2)
-    heading = start.heading + np.concatenate([[0.0], np.cumsum(turns)])
+    heading, xy = np.zeros(len(curvature)), np.zeros((len(curvature), 2))
+    np.cumsum((curvature[1:] + curvature[:-1]) * (step_m / 2), out=heading[1:])
+    heading += start.heading
     middle = (heading[1:] + heading[:-1]) / 2
-    steps = step_m * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-    origin = np.array([[start.x, start.y]])
-    return Curve(np.concatenate([origin, origin + np.cumsum(steps, axis=0)]), heading)
+    np.cumsum(step_m * np.cos(middle), out=xy[1:, 0])
+    np.cumsum(step_m * np.sin(middle), out=xy[1:, 1])
+    xy += (start.x, start.y)
+    return Curve(xy, heading)
 
 
 def straight(start: Pose, length_m: float) -> Curve:
@@ -193,20 +195,26 @@ def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Cu
     The tangents of both ends meet at the corner, ``tangent_m`` after the start and before the end; ``easing`` is the
     share of the length in each of the two clothoids.
     """
-
-    def shape(count: int, length_m: float, at: Pose) -> Curve:
-        share = np.linspace(0.0, 1.0, count)
-        ramp = np.minimum(1.0, np.minimum(share, 1.0 - share) / easing)
-        curvature = ramp * (angle / float(np.trapezoid(ramp, share)) / length_m)
-        return from_curvature(curvature, length_m / (count - 1), at)
-
-    unit = shape(513, 1.0, Pose(0.0, 0.0, 0.0))
-    unit_tangent = math.hypot(*unit.xy[-1]) / 2 / math.cos(angle / 2)
-    length = tangent_m / unit_tangent
+    length = tangent_m / _unit_tangent(angle, easing)
     # Integrate at an eighth of the step: the end meets the tangent point within 2 mm.
     count = 8 * max(4, math.ceil(length / STEP_M))
-    fine = shape(count + 1, length, start)
+    fine = _eased_bend(start, angle, length, easing, count + 1)
     return Curve(fine.xy[::8], fine.heading[::8])
+
+
+def _eased_bend(start: Pose, angle: float, length_m: float, easing: float, count: int) -> Curve:
+    """Bend of :func:`turn` of a length, with a number of samples."""
+    share = np.linspace(0.0, 1.0, count)
+    ramp = np.minimum(1.0, np.minimum(share, 1.0 - share) / easing)
+    curvature = ramp * (angle / float(np.trapezoid(ramp, share)) / length_m)
+    return from_curvature(curvature, length_m / (count - 1), start)
+
+
+@lru_cache(maxsize=256)
+def _unit_tangent(angle: float, easing: float) -> float:
+    """Length of the tangents of a bend of unit length; the bends of a junction often have equal angles."""
+    unit = _eased_bend(Pose(0.0, 0.0, 0.0), angle, 1.0, easing, 513)
+    return math.hypot(*unit.xy[-1]) / 2 / math.cos(angle / 2)
 
 
 def quintic(start: Pose, end: Pose) -> Curve:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, wraps
@@ -189,20 +190,22 @@ def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
     is_apart = is_apart | is_apart.T
     for (i, a), (k, b) in combinations(enumerate(connectors), 2):
         if not is_apart[i, k] and set(lanes[a].predecessors).isdisjoint(lanes[b].predecessors):
-            gaps = _distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
-            result[a, b] = result[b, a] = gaps.min() < CLEARANCE_M
+            squared = _squared_distances(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2])
+            result[a, b] = result[b, a] = math.sqrt(squared.min()) < CLEARANCE_M
     return result
 
 
 def _shared_length(a: Curve, b: Curve) -> float:
     """Return the distance along ``a`` over which it shares space with ``b``, m."""
-    is_clear = _distances(a.xy, b.xy).min(axis=1) > CLEARANCE_M
+    is_clear = np.sqrt(_squared_distances(a.xy, b.xy).min(axis=1)) > CLEARANCE_M
     return float(a.arc_m[int(np.argmax(is_clear)) if is_clear.any() else -1])
 
 
-def _distances(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> Float64[np.ndarray, "a b"]:
+def _squared_distances(
+    a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]
+) -> Float64[np.ndarray, "a b"]:
     dx, dy = (np.subtract.outer(a[:, k], b[:, k]) for k in (0, 1))
-    return np.sqrt(dx * dx + dy * dy)
+    return dx * dx + dy * dy
 
 
 @dataclass

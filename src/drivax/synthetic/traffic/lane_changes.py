@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.scenario.schema import RoadKind
+from drivax.scenario.schema import RoadKind, nonzero
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.network import RoadNetwork, per_roads
 from drivax.synthetic.traffic.obstacles import Boxes
@@ -328,7 +328,7 @@ class LaneChanges:
         rows = self._worlds.rows[world]
         is_candidate = (occupancy.chain.take(rows, axis=0) == chain[:, None, None]) & (rows >= 0)[..., None]
         is_candidate[rows == vehicles[:, None]] = False
-        candidate, place, slot = is_candidate.nonzero()
+        candidate, place, slot = nonzero(is_candidate)
         separation = occupancy.position_m[rows[candidate, place], slot] - position[candidate]
         half_of_column = self._half_of_column[world]
         neighbours = []

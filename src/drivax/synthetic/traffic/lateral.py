@@ -64,8 +64,8 @@ def displace_path(
     position = np.linspace(0.0, new[-1], count)
     source = np.interp(position, new, old)
     index = np.rint(source / step).astype(int)
-    lane = path.lane[index]
-    lane_m = path.lane_m[index] + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
+    lane = path.lane.take(index, axis=0)
+    lane_m = path.lane_m.take(index, axis=0) + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _enter_span(span, source, lane, lane_m)
     new_curve, step = interpolate_curve(new_curve, new, position), float(new[-1]) / (count - 1)
@@ -136,8 +136,8 @@ def project_on_path(path: Path, xy: _Point, near_m: float | None = None) -> tupl
     if near_m is not None:
         first = max(0, int((near_m - 30.0) / path.step_m))
         last = max(first + 2, int((near_m + 30.0) / path.step_m))
-    gap = xy - path.curve.xy[first:last]
-    index = first + int(np.argmin(np.sum(gap**2, axis=1)))
+    gap_x, gap_y = (xy - path.curve.xy[first:last]).T
+    index = first + int(np.argmin(gap_x**2 + gap_y**2))
     heading = float(path.curve.heading[index])
     dx, dy = xy - path.curve.xy[index]
     along = dx * math.cos(heading) + dy * math.sin(heading)

@@ -25,12 +25,11 @@ class Leaders:
     def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
         self._worlds = worlds
         self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
-        self._rows = np.arange(len(self._half_m))
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
         # Half the width of the widest car that may pass a cyclist in the middle of each lane (below 4.8 m: none may).
         widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
         self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
-        self._nearest = np.full(len(self._rows), np.inf), np.zeros(len(self._rows), int)
+        self._nearest = np.full(len(worlds.world), np.inf), np.zeros(len(worlds.world), int)
 
     def find(
         self, tables: PathTables, at_m: PerVehicle, active: VehicleMask
@@ -63,13 +62,16 @@ class Leaders:
         if self._any_cyclist:
             # Cyclists are overtaken within lanes that are wide enough.
             is_ahead &= ~self._cyclist[ahead] | (self._passing_half_m[lane[slot]] < self._half_width_m[row])
-        gap = np.full(index.shape, np.inf)
-        gap_m = position - self._half_m[ahead] - own_m - self._half_m[row]
-        gap.put(pair[is_ahead], gap_m[is_ahead])
-        nearest = gap.argmin(axis=1)
-        result = gap[self._rows, nearest], vehicle[entry][world, nearest]
+        k = is_ahead.nonzero()[0]
+        row, ahead = row[k], ahead[k]
+        gap_m = position[k] - self._half_m[ahead] - own_m[k] - self._half_m[row]
+        gap, leader = np.full(len(world), np.inf), vehicle[entry[:, 0]][world]
+        np.minimum.at(gap, row, gap_m)
+        # The first of several nearest vehicles is entered last.
+        nearest = (gap_m == gap[row]).nonzero()[0][::-1]
+        leader[row[nearest]] = ahead[nearest]
         empty = (entry[:, 0] < 0)[world]
-        for values, last in zip(result, self._nearest, strict=True):
-            values[empty] = last[empty]
-        self._nearest = result
-        return result
+        if empty.any():
+            gap[empty], leader[empty] = (last[empty] for last in self._nearest)
+        self._nearest = gap, leader
+        return self._nearest

@@ -88,7 +88,7 @@ def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, 
         near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
     window = rough[:, None] + np.arange(-8, 9)
     window = np.minimum(np.maximum(window, 0), len(path.curve.xy) - 1)
-    fine = _squared_distance(boxes.xy[near, None], path.curve.xy[window])
+    fine = _squared_distance(boxes.xy[near, None], path.curve.xy.take(window, axis=0))
     index = window[np.arange(len(near)), fine.argmin(axis=1)]
     position, lateral, angle = _relative_poses(boxes, near, path.curve.xy[index], path.curve.heading[index])
     length, width = _half_extents(boxes.size_m[near], angle)
@@ -111,7 +111,7 @@ def _relative_poses(
     boxes: Boxes, rows: _Indices, xy: Float64[np.ndarray, "k 2"], heading: _Values
 ) -> tuple[_Values, _Values, _Values]:
     """Return the positions of boxes ahead and to the left of poses, and their relative headings."""
-    dx, dy = (boxes.xy[rows] - xy).T
+    dx, dy = (boxes.xy.take(rows, axis=0) - xy).T
     cos, sin = np.cos(heading), np.sin(heading)
     return dx * cos + dy * sin, dy * cos - dx * sin, boxes.heading[rows] - heading
 
@@ -188,10 +188,10 @@ def nearest_obstacles(
     viewer, user = _nearby_pairs(tables.worlds, vehicles, users, by_world, active)
     if not len(viewer):
         return gap, speed
-    pose, sample_m, squared_gap = _nearest_samples(tables, at_m, viewer, users.xy[user])
+    pose, sample_m, squared_gap = _nearest_samples(tables, at_m, viewer, users.xy.take(user, axis=0))
     # Ignore users at least 8 m from all samples ahead.
     k = (squared_gap < 64.0).nonzero()[0]
-    viewer, user, pose, sample_m = viewer[k], user[k], pose[k], sample_m[k]
+    viewer, user, pose, sample_m = viewer[k], user[k], pose.take(k, axis=0), sample_m[k]
     position, left, relative_heading = _relative_poses(users, user, pose[:, :2], pose[:, 2])
     position = position + sample_m
     length, width = _half_extents(users.size_m[user], relative_heading)

@@ -142,7 +142,7 @@ class PathTables:
         self._first[row], self._sample_count = self._sample_count, self._sample_count + n
         self.table[samples, :2], self.table[samples, 2] = path.curve.xy, path.curve.heading
         self.table[samples, 3] = driver_profile(path, self._drivers, row)
-        self.lane[samples] = np.where(path.lane >= 0, path.lane + self.worlds.first_lane[world], -1)
+        self.lane[samples] = np.where(path.lane >= 0, path.lane + int(self.worlds.first_lane[world]), -1)
         self.lane_m[samples] = path.lane_m
         self.step_m[row], self.last[row], self.length_m[row] = path.step_m, n - 1, path.length_m
         self.begin[row], self.scale[row] = np.nan, 1.0

@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import accumulate, pairwise
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int32
 
 from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate, join_curves, resample, smooth_step
@@ -21,7 +21,7 @@ _CURVATURE_WINDOW_M = 3.0
 
 #: Positions of samples; lanes that a vehicle occupies at samples, and positions on them.
 _Positions = Float64[np.ndarray, " point"]
-_Slots = Int64[np.ndarray, "point slot"]
+_Slots = Int32[np.ndarray, "point slot"]
 _SlotPositions = Float64[np.ndarray, "point slot"]
 
 
@@ -68,7 +68,7 @@ class Path:
     curvature: Float64[np.ndarray, " point"]
     limit_mps: Float64[np.ndarray, " point"]
     spans: tuple[LaneSpan, ...]
-    lane: Int64[np.ndarray, "point slot"]
+    lane: Int32[np.ndarray, "point slot"]
     lane_m: Float64[np.ndarray, "point slot"]
 
     @property
@@ -201,7 +201,7 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretch(stretch) for span in spans]
     position = step * np.arange(len(curve.xy))
-    lane, lane_m = np.full((len(position), SLOTS), -1), np.zeros((len(position), SLOTS))
+    lane, lane_m = np.full((len(position), SLOTS), -1, np.int32), np.zeros((len(position), SLOTS))
     limit = np.full(len(position), math.inf)
     sizes = [span.scale * network.lanes[span.lane].length_m for span in spans]
     begins = position.searchsorted([span.begin_m - 1e-6 for span in spans]).tolist()

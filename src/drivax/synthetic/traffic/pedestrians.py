@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import overlap
 from drivax.geometry.vectors import wrap
-from drivax.scenario.schema import DT_S
+from drivax.scenario.schema import DT_S, nonzero
 from drivax.synthetic.roads.curves import STEP_M, Curve, resample
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork, per_roads
 from drivax.synthetic.roads.signals import Colour
@@ -136,7 +136,7 @@ class Pedestrians:
             for network, conflicts, times in zip(worlds.networks, self._conflicts, times_s, strict=True)
         ]
         self._remaining_red = np.concatenate(pad_steps(red_s), axis=1)
-        curves = [resample(pedestrian.curve, STEP_M) for pedestrian in pedestrians]
+        curves = [pedestrian.samples for pedestrian in pedestrians]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         ends = np.cumsum(self._last + 1)
         self._begin, self._table = ends - self._last - 1, np.empty((ends[-1] if curves else 0, 3))
@@ -208,7 +208,7 @@ class Pedestrians:
         centre = np.where(active[:, None], vehicles.xy, np.inf)
         near_x, near_y = pad_last(centre.T, np.inf).take(self._worlds.rows, axis=1).take(world, axis=1)
         dx, dy, reach = x[:, None] - near_x, y[:, None] - near_y, half.sum(axis=1).max(initial=0.0) + 0.1
-        point, column = np.nonzero((np.abs(dx) < reach) & (np.abs(dy) < reach))
+        point, column = nonzero((np.abs(dx) < reach) & (np.abs(dy) < reach))
         if len(point):
             row, dx, dy = self._worlds.rows[world[point], column], dx[point, column], dy[point, column]
             cos, sin = (component[row] for component in vehicles.direction)

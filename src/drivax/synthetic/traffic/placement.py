@@ -187,12 +187,13 @@ def place_vehicles(
                 vehicles.append((index, float(position)))
                 occupied.append(float(position))
             position += minimum + rng.exponential(mean)
-    vehicles = [vehicle for vehicle in vehicles if not _is_blocked(network, *vehicle, parked)]
+    blockers = [(*user.xy[0].tolist(), float(user.size_m[1])) for user in parked]
+    vehicles = [vehicle for vehicle in vehicles if not _is_blocked(network, *vehicle, blockers)]
     vehicles = _drop_close_followers(network, vehicles, (ego_lane, ego_along_m))
     current = network.lanes[ego_lane].curve
     ego_xy = current.xy[np.searchsorted(current.arc_m, ego_along_m).clip(max=len(current.xy) - 1)]
     vehicles.sort(key=lambda vehicle: float(np.hypot(*(_point_on_lane(network, *vehicle) - ego_xy))))
-    vehicles = _drop_overlapping(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
+    vehicles = _drop_overlapping(network, vehicles, (ego_lane, ego_along_m), density.vehicles)
     return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
@@ -200,38 +201,47 @@ def _least_spacing_m(lane: Lane) -> float:
     return _LENGTH_M + _GAP_M + _GAP_S * lane.limit_mps
 
 
-def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles close to an earlier one, which may be on another lane, for example where lanes fork or merge."""
+def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place, most: int) -> _Places:
+    """Drop vehicles close to an earlier one, which may be on another lane, for example where lanes fork or merge.
+
+    The first ``most`` of the others are kept.
+    """
     centres: list[tuple[float, float]] = []
     result = []
     for lane, along in [ego, *vehicles]:
         curve = network.lanes[lane].curve
-        x, y = _point_on_lane(network, lane, along)
-        heading = float(np.interp(along, curve.arc_m, curve.heading))
-        cos, sin = np.cos(heading), np.sin(heading)
+        x, y = _point_on_lane(network, lane, along).tolist()
+        heading = np.interp(along, curve.arc_m, curve.heading)
+        cos, sin = float(np.cos(heading)), float(np.sin(heading))
         is_close = (
             abs((x - a) * cos + (y - b) * sin) < _MIN_SEPARATION_M
             and abs((y - b) * cos - (x - a) * sin) < _MAX_WIDTH_M
             for a, b in centres
         )
         if not any(is_close):
-            centres.append((float(x), float(y)))
+            centres.append((x, y))
             result.append((lane, along))
+        if len(result) > most:
+            break
     return result[1:]
 
 
-def _is_blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[ScriptedUser, ...]) -> bool:
+def _is_blocked(
+    network: RoadNetwork, lane: int, along: float, parked: Sequence[tuple[float, float, float]]
+) -> bool:
     """Whether a parked car is in a straight strip, a vehicle wide, from 14 m behind a position to 30 m ahead.
 
-    Bends are ignored: cars in bays on their outside may count, and cars in the lane further ahead may not.
+    ``parked`` has the x, y and width of each car. Bends are ignored: cars in bays on their outside may count, and cars
+    in the lane further ahead may not.
     """
     curve = network.lanes[lane].curve
     index = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
-    cos, sin = np.cos(curve.heading[index]), np.sin(curve.heading[index])
-    for other in parked:
-        dx, dy = other.xy[0] - curve.xy[index]
+    x, y = curve.xy[index].tolist()
+    cos, sin = float(np.cos(curve.heading[index])), float(np.sin(curve.heading[index]))
+    for other_x, other_y, width in parked:
+        dx, dy = other_x - x, other_y - y
         ahead, lateral = dx * cos + dy * sin, abs(dy * cos - dx * sin)
-        if -_FREE_BEHIND_M < ahead < _FREE_BEFORE_M and lateral < (_MAX_WIDTH_M + other.size_m[1]) / 2:
+        if -_FREE_BEHIND_M < ahead < _FREE_BEFORE_M and lateral < (_MAX_WIDTH_M + width) / 2:
             return True
     return False
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64, Int8, Int64
 
 from drivax.geometry.vectors import wrap
-from drivax.scenario.schema import DT_S
+from drivax.scenario.schema import DT_S, nonzero
 from drivax.synthetic.roads.curves import resample
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork, per_roads
 from drivax.synthetic.roads.signals import Colour
@@ -226,7 +226,7 @@ class RightOfWay:
         tables = state.tables
         is_held = np.arange(tables.connector.shape[1]) < self._grants[:, None]
         is_held &= (tables.connector_end > state.rear_m[:, None]) & state.active[:, None]
-        row, slot = np.nonzero(is_held & (tables.connector >= 0))
+        row, slot = nonzero(is_held & (tables.connector >= 0))
         world = self._worlds.world[row]
         connector = tables.connector[row, slot] - self._worlds.first_lane[world]
         result: list[_Holders] = [[] for _ in self._rules]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8
 
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.idm import IdmParameters
-from drivax.synthetic.roads.curves import Curve, Pose
+from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, resample
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.paths import Path
 
@@ -92,6 +93,11 @@ class Pedestrian:
     kerb_m: float = 0.0
     across_m: float = 0.0
     size_m: tuple[float, float, float] = (0.6, 0.6, 1.75)
+
+    @cached_property
+    def samples(self) -> Curve:
+        """The curve at equal distances of about ``STEP_M``, which all runs of a traffic share."""
+        return resample(self.curve, STEP_M)
 
 
 @dataclass(frozen=True)

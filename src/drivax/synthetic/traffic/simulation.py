@@ -370,11 +370,12 @@ class _Simulation:
             log = self._log.pedestrian_poses[t]
             log[:, :2], log[:, 2], log[:, 3] = users.xy, users.heading, users.speed
         movers = [(world, user) for world, user in self._movers if t < len(user.valid) and user.valid[t]]
-        self._moving_users = users.concatenate(boxes_at(tuple(user for _, user in movers), t))
         self._user_world, self._users_by_world = self._pedestrian_world, self._pedestrians_by_world
         if movers:
+            users = users.concatenate(boxes_at(tuple(user for _, user in movers), t))
             self._user_world = np.append(self._user_world, [world for world, _ in movers])
             self._users_by_world = group_indices(self._user_world, len(self._worlds))
+        self._moving_users = users
 
     def _preferred_acceleration(
         self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask

@@ -328,7 +328,8 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
     gore = int(np.argmin(np.sum((edge.xy - left.xy[0]) ** 2, axis=-1)))
     first, points = max(0, gore - span), left.xy[:span]
     window = edge.xy[first : gore + span]
-    near = first + np.argmin(np.sum((points[:, None] - window[None]) ** 2, axis=-1), axis=1)
+    x, y = (np.subtract.outer(points[:, axis], window[:, axis]) for axis in (0, 1))
+    near = first + np.argmin(x**2 + y**2, axis=1)
     dx, dy = (points - edge.xy[near]).T
     lateral = -dx * np.sin(edge.heading[near]) + dy * np.cos(edge.heading[near])
     sample = int(np.argmax(lateral < -0.05))
