@@ -19,6 +19,7 @@ CASES = [
     ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
     ("driving_self_ppo", "two"),
 ]  # fmt: skip
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "driving_cql", "sac")]
 DEVICES = "--xla_force_host_platform_device_count"
 
 
@@ -43,10 +44,7 @@ def run_on_devices(count, file, *arguments, repository):
     assert result.stdout == "same\n", result.stderr
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["functions", "ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "driving_cql"))],
-)
+@pytest.mark.parametrize("name", ["functions", "ppo", *SLOW])
 def test_devices_exchange_little_and_resume(name, repository):
     run_on_devices(2, "two_devices.py", name, repository=repository)
 

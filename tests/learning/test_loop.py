@@ -297,6 +297,17 @@ def test_resuming_with_other_kernels_warns(data, config, tmp_path, monkeypatch):
     assert warnings("none: make native") == []
 
 
+def test_resuming_on_other_devices_warns(data, config, tmp_path):
+    run = train(config, data, tmp_path / "run", validation=None)
+    assert run.info["devices"] == 1
+    for former, warnings in ((1, 0), (2, 1), (None, 0)):
+        run, lines = run.note(devices=former), []
+        train(config, data, run.path, validation=None, resume=True, log=lines.append)
+        lines = [line for line in lines if line.startswith("warning: ")]
+        assert len(lines) == warnings
+        assert all("the run used 2 devices, this process 1: the result differs" in line for line in lines)
+
+
 def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):
     class Stop(Exception):
         pass

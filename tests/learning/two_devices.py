@@ -27,7 +27,7 @@ from drivax.tracking.checkpoints import Checkpoints
 
 TYPES = (jnp.float32, jnp.bfloat16, jnp.uint32, jnp.int8, jnp.float64, jnp.int64)
 #: Most exchanges per update of each algorithm, however many parameters there are.
-EXCHANGES = {"ppo": 1, "bc": 3, "driving_cql": 3}
+EXCHANGES = {"ppo": 1, "bc": 3, "driving_cql": 3, "sac": 6}
 MESH = jax.sharding.Mesh(np.array(jax.devices()), (_AXIS,))
 
 

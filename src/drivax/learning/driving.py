@@ -153,7 +153,8 @@ class Driving:
     ) -> tuple[Environments, Outcome]:
         """Return environments and outcomes after a decision, given where new episodes would start.
 
-        Totals are those of a device: added after a rollout, they cost no exchange in each step.
+        ``Outcome.totals`` have an axis of devices (on one device of size 1): their sum after the rollout takes a single
+        exchange.
         """
         now, cache, action, start = batch
         state, result = self._step_or_reset(data, now, cache, action, start)

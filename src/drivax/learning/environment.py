@@ -44,7 +44,7 @@ class Outcome:
         truncated: The episode was cut off: bootstrap the value of the next state.
         cache: :meth:`Environment.cache` of the new state.
         totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
-            ``"reward/<name>"`` over steps; of any shape, to be added up.
+            ``"reward/<name>"`` over steps. Each is an array of any shape of partial sums.
         terms: Terms of the reward by name, with their weights; those of ``Environment.penalties`` are read.
     """
 

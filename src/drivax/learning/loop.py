@@ -50,7 +50,7 @@ _RESUMED_WITH_OTHER = {
 }
 
 #: Entries of ``run.json`` that the folders of several seeds share.
-_INHERITED_NOTES = ("validation", "weights", "networks_from")
+_INHERITED_NOTES = ("validation", "weights", "networks_from", "devices")
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] = ()) -> Any:
@@ -125,8 +125,6 @@ def train(
     notes = hashes(validation_set, weights)
     if call.resume:
         config, folders = _resumed_folders(data, notes, out, call.seeds, trust)
-        if difference := kernels_difference(folders[0].info):
-            call.log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
     else:
         RunFolder.check(out, call.overwrite, "training")
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
@@ -138,6 +136,8 @@ def train(
     seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
+    if call.resume:
+        _warn_of_other_bits(folders[0].info, len(program.devices), call.log)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     if isinstance(validation_set, HoldOut):
@@ -148,6 +148,7 @@ def train(
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
         stack.enter_context(explain_full_disk(out))
+        notes["devices"] = len(program.devices)
         folders = folders or _create_folders(config, data, notes, out, seeds, call.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
@@ -307,6 +308,15 @@ def _resumed_folders(
     notes = {name: folder.info[name] for name in _INHERITED_NOTES if name in folder.info}
     numbers = range(config.seed, config.seed + count)
     return config, [_seed_folder(config, data, notes, out, number) for number in numbers]
+
+
+def _warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
+    """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
+    differences = [kernels_difference(info)]
+    if (former := info.get("devices") or devices) != devices:
+        differences.append(f"the run used {former} devices, this process {devices}")
+    for difference in filter(None, differences):
+        log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
 
 
 @dataclass(frozen=True)

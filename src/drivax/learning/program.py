@@ -131,7 +131,7 @@ class Program:
         if len(self.devices) > 1:
             self._layout = _layout(self._mesh, seeds.is_stacked, shapes)
             self._init = jax.jit(seeds.init, out_shardings=self._layout)
-            if self.devices[0].platform == "cpu":  # cores share memory, but only that of NumPy's arrays
+            if self.devices[0].platform == "cpu":  # devices share the memory of NumPy arrays, not of JAX's
                 data = jax.tree.map(np.asarray, data)
             data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
