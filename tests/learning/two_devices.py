@@ -27,7 +27,7 @@ from drivax.tracking.checkpoints import Checkpoints
 
 TYPES = (jnp.float32, jnp.bfloat16, jnp.uint32, jnp.int8, jnp.float64, jnp.int64)
 #: Most exchanges per update of each algorithm, however many parameters there are.
-EXCHANGES = {"ppo": 1, "bc": 3, "driving_cql": 3, "sac": 6}
+EXCHANGES = {"ppo": 1, "bc": 3, "driving_cql": 2, "sac": 2}
 MESH = jax.sharding.Mesh(np.array(jax.devices()), (_AXIS,))
 
 
@@ -43,6 +43,10 @@ def same(one, other):
     assert np.asarray(one).tobytes() == np.asarray(other).tobytes(), (one, other)
 
 
+def at(ring, row, column):
+    return jax.tree.map(lambda leaf: leaf[row, column], ring)
+
+
 def check_columns():
     """Columns of every type, and a number of columns that devices cannot divide."""
     row, column = jnp.array([[0, 1], [2, 2]]), jnp.array([[0, 3], [1, 2]])
@@ -50,9 +54,9 @@ def check_columns():
     with jax.enable_x64(True):
         ring = {str(jnp.dtype(t)): jnp.asarray(bits.view(jnp.dtype(t))) for t in TYPES}
         ring |= {"bool": jnp.asarray(bits[..., 0] > 99), "flat": jnp.arange(12.0).reshape(3, 4)}
-        jax.tree.map(same, on_two(read_columns, ring, row, column), read_columns(ring, row, column))
+        jax.tree.map(same, on_two(partial(read_columns, at), ring, row, column), at(ring, row, column))
     for ring in (jnp.arange(15).reshape(3, 5), jax.random.split(jax.random.key(0), (3, 4))):
-        same(on_two(read_columns, ring, row, column), ring[row, column])
+        same(on_two(partial(read_columns, at), ring, row, column), ring[row, column])
 
 
 def check_sums():

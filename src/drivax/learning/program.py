@@ -269,11 +269,12 @@ def sum_over_devices(
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def summed(parameters: Array, share: Any) -> Any:
         logs, sums = function(unravel_parameters(parameters), share)
-        vector, unravel = ravel_pytree((logs, sums))
+        # A maximum has an element per device in the vector: ``pmax`` loses NaN on CPUs.
+        own = jax.lax.axis_index(_AXIS) == jnp.arange(count)
+        apart = {n: jnp.where(own, log, 0.0) for n, log in logs.items() if is_largest(n)}
+        vector, unravel = ravel_pytree((logs | apart, sums))
         total_logs, total = unravel(jax.lax.psum(vector, _AXIS))
-        # Unlike ``pmax`` on CPUs, this keeps NaN.
-        largest = {n: jax.lax.all_gather(log, _AXIS).max(axis=0) for n, log in logs.items() if is_largest(n)}
-        return total_logs | largest, total
+        return {n: log.max() if is_largest(n) else log for n, log in total_logs.items()}, total
 
     return summed(parameters, divided)
 
@@ -309,31 +310,39 @@ def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: A
     return jax.shard_map(function, in_specs=specs, out_specs=specs[1], check_vma=False)(whole, divided)
 
 
-def read_columns(tree: Any, row: Int[Array, "*batch"], column: Int[Array, "*batch"]) -> Any:
-    """Return ``leaf[row, column]`` of arrays ``[row, column, ...]`` that devices may divide by columns.
+def read_columns(
+    read: Callable[[Any, Array, Array], Any], ring: Any, row: Int[Array, "*batch"],
+    column: Int[Array, "*batch"],
+) -> Any:  # fmt: skip
+    """Return ``read(ring, row, column)`` of arrays ``[row, column, ...]`` that devices may divide by columns.
 
-    The result is whole on every device. Each device contributes the bits of its own columns, and zeros for others; the
-    compiler would exchange the index for every leaf. Indices must be in range: not negative, and less than the sizes.
+    ``read`` returns arrays ``[*batch, ...]``, each element read from its own column only. The result is whole on every
+    device: each evaluates ``read`` on its columns and contributes the bits of these, and zeros for others, where the
+    compiler would exchange the index for every leaf. Columns must be in range.
     """
-    count, leaves = device_count(), jax.tree.leaves(tree)
-    if count == 1 or any(leaf.shape[1] % count or not _has_bits(leaf.dtype) for leaf in leaves):
-        return jax.tree.map(lambda leaf: leaf[row, column], tree)
-    columns = PartitionSpec(None, _AXIS)
+    count, shapes = device_count(), jax.eval_shape(read, ring, row, column)
+    is_divided = count > 1 and all(leaf.shape[1] % count == 0 for leaf in jax.tree.leaves(ring))
+    if not is_divided or not all(_has_bits(leaf.dtype) for leaf in jax.tree.leaves(shapes)):
+        return read(ring, row, column)
+    specs = (PartitionSpec(None, _AXIS), PartitionSpec())
 
-    @partial(jax.shard_map, in_specs=(columns, PartitionSpec()), out_specs=PartitionSpec(), check_vma=False)
-    def read(share: Any, index: tuple[Array, Array]) -> Any:
+    @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
+    def exchange(share: Any, index: tuple[Array, Array]) -> Any:
         size = jax.tree.leaves(share)[0].shape[1]
         own = index[1] - size * jax.lax.axis_index(_AXIS)
         is_own = (own >= 0) & (own < size)
 
         def bits(leaf: Array) -> Array:
-            value = _as_bits(leaf[index[0], jnp.clip(own, 0, size - 1)])
+            value = _as_bits(leaf)
             return jnp.where(is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim)), value, 0)
 
-        vector, unravel = ravel_pytree(jax.tree.map(bits, share))
+        columns = read(share, index[0], jnp.clip(own, 0, size - 1))
+        vector, unravel = ravel_pytree(jax.tree.map(bits, columns))
         return unravel(jax.lax.psum(vector, _AXIS))
 
-    return jax.tree.map(lambda leaf, bits: _from_bits(bits, leaf.dtype), tree, read(tree, (row, column)))
+    return jax.tree.map(
+        lambda leaf, bits: _from_bits(bits, leaf.dtype), shapes, exchange(ring, (row, column))
+    )
 
 
 def _has_bits(dtype: Any) -> bool:

@@ -172,31 +172,34 @@ class ReplayBuffer:
 
         They have fewer than ``steps`` where the episode ends or the next state was not written yet.
         """
-        row, column = index
         rows = replay.reward.shape[0]
-        window = (row + jnp.arange(steps).reshape(-1, *[1] * row.ndim)) % rows
-        columns = jnp.broadcast_to(column, window.shape)
-        reward, terminated, alive = read_columns(
-            (replay.reward, replay.terminated, replay.alive), window, columns
-        )
-        # A row that resets an environment, or the newest, ends the window.
-        returns = n_step_returns(reward, terminated, alive & (window != (replay.next_row - 1) % rows), gamma)
+
+        def read(ring: dict[str, Any], row: Array, column: Array) -> dict[str, Any]:
+            window = (row + jnp.arange(steps).reshape(-1, *[1] * row.ndim)) % rows
+            names = ("reward", "terminated", "alive")
+            reward, terminated, alive = (ring[name][window, column] for name in names)
+            # A row that resets an environment, or the newest, ends the window.
+            follows = alive & (window != (replay.next_row - 1) % rows)
+            returns = n_step_returns(reward, terminated, follows, gamma)
+            following = (row + returns.steps) % rows
+            return {
+                "observation": jax.tree.map(lambda leaf: leaf[row, column], ring["stored"]),
+                "action": ring["action"][row, column],
+                "reward": returns.reward,
+                "terminated": returns.terminated,
+                "next_observation": jax.tree.map(lambda leaf: leaf[following, column], ring["stored"]),
+                "discount": returns.discount,
+            }
 
         def observe(sampled: Any) -> dict[str, Array]:
             if replay.store == "state":
                 return self.environment.observe_all(data, sampled)
             return _cast(sampled, jnp.float32)
 
-        stored, action = read_columns((replay.stored, replay.action), row, column)
-        following = read_columns(replay.stored, (row + returns.steps) % rows, column)
-        return Transitions(
-            observation=observe(stored),
-            action=action,
-            reward=returns.reward,
-            terminated=returns.terminated,
-            next_observation=observe(following),
-            discount=returns.discount,
-        )
+        ring = {name: getattr(replay, name) for name in ("stored", "action", "reward", "terminated", "alive")}
+        columns = read_columns(read, ring, *index)
+        observed = {name: observe(columns[name]) for name in ("observation", "next_observation")}
+        return Transitions(**columns | observed)
 
 
 def _cast(observation: dict[str, Array], dtype: Any) -> dict[str, Array]:
