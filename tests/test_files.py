@@ -435,6 +435,14 @@ def test_changed_note_does_not_count(tmp_path: Path):
     folder.close()
 
 
+def test_note_of_another_number_does_not_count(tmp_path: Path):
+    first = started(tmp_path / "set", {"seed": 1}).root / "progress" / "00000.json"
+    first.with_name("00001.json").write_bytes(first.read_bytes())
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert len(folder.open()) == 1
+    folder.close()
+
+
 #: Makes what drivax never writes under a hidden name.
 LITTER = {
     "garbage": lambda path: path.write_bytes(b"\xff\0{["),

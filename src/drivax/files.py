@@ -274,8 +274,7 @@ class PartialFolder:
         """Record that part ``number`` (from 0) is finished and on disk."""
         if self.identity is not None:
             sync_folder(self.content)
-            note = {"sha256": _digest(value), "value": value}
-            write_json(self.root / "progress" / _note_name(number), note)
+            write_json(self.root / "progress" / _note_name(number), _sealed_note(number, value))
 
     def publish(self) -> None:
         """Rename the content to its final name; an existing folder keeps the name until that moment."""
@@ -326,7 +325,7 @@ class PartialFolder:
         notes: list[dict[str, Any]] = []
         while self.identity is not None and identity == self.identity and self.content.is_dir():
             note = _read_json(self.root / "progress" / _note_name(len(notes)), _MOST_NOTE)
-            if not isinstance(note, dict) or _digest(note.get("value")) != note.get("sha256"):
+            if not isinstance(note, dict) or note != _sealed_note(len(notes), note.get("value")):
                 break
             notes.append(note["value"])
         return notes
@@ -454,9 +453,10 @@ def _exchange(first: Path, second: Path) -> bool:
     return False
 
 
-def _digest(value: Any) -> str:
-    """Return the SHA-256 (hex) of a JSON value, whatever its form in a file."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+def _sealed_note(number: int, value: Any) -> dict[str, Any]:
+    """Return a note with the SHA-256 (hex) of its number and its JSON value, whatever its form in a file."""
+    digest = hashlib.sha256(json.dumps([number, value], sort_keys=True).encode()).hexdigest()
+    return {"sha256": digest, "value": value}
 
 
 def parse_json(data: bytes) -> Any:

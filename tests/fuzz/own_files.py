@@ -47,6 +47,7 @@ from drivax import settings
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.export.writer import Export, export
+from drivax.datasets.formats import survey
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.episode_table import Crash, EpisodeTable, Trajectories
 from drivax.evaluation.runner import EvaluationConfig
@@ -279,7 +280,7 @@ def read_export(folder: Path) -> Any:
     """The converted scenarios."""
     found = []
     for name, reader in EXPORTS.items():
-        for file in sorted(file for file in (folder / name).iterdir() if file.name != "export.json"):
+        for file in survey(folder / name, reader).paths():
             for item in convert_file(file, Conversion(format=reader)):
                 if isinstance(item, BadRecord):
                     if problem := complaint(item.error()):
