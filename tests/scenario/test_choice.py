@@ -69,6 +69,13 @@ def test_names_in_a_file_may_contain_line_breaks_of_unicode(tmp_path):
     assert select_scenarios(data, names=[tmp_path / "some.txt"]) == [2, 3]
 
 
+def test_a_file_with_millions_of_names_is_refused_before_they_take_memory(tmp_path):
+    file = tmp_path / "some.txt"
+    file.write_bytes(b"a\n" * 4_000_001)
+    with pytest.raises(DataError, match="has more than 4,000,000 lines; give a file"):
+        select_scenarios(Set(), names=[file])
+
+
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [

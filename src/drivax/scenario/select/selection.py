@@ -27,6 +27,9 @@ from drivax.seal import check_seal
 
 #: Number of missing names in an error message.
 _MOST_NAMES = 3
+#: Most lines of a file of names; each takes 200 bytes of memory.
+_MOST_LINES = 4_000_000
+_NAME_FILE = "give a file with one scenario id per line"
 _Kind = Literal["number", "truth", "word"]
 #: Counters of overflow; zeros are not stored.
 OVERFLOWS = (
@@ -252,10 +255,17 @@ def select_scenarios(
 
 
 def read_names(file: Path) -> list[_Name]:
-    """Read names from a text file, one per line; empty lines are skipped."""
+    """Read names from a text file, one per line; empty lines are skipped.
+
+    Raises:
+        DataError: The file was changed, is not text, or has too many lines.
+    """
     check_seal(file)
+    content = read_text(file, _NAME_FILE)
+    if content.count("\n") > _MOST_LINES:
+        raise DataError(f"has more than {_MOST_LINES:,} lines", file=file, cure=_NAME_FILE)
     # Not splitlines(): ids may contain other line breaks of Unicode.
-    lines = read_text(file, "give a file with one scenario id per line").split("\n")
+    lines = content.split("\n")
     return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
 
 
