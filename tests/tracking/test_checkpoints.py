@@ -246,6 +246,15 @@ def test_damage_is_found_before_orbax_reads(tmp_path: Path, capfd: pytest.Captur
     assert capfd.readouterr().err == ""
 
 
+def test_file_far_larger_than_the_arrays_is_refused_unread(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    path = checkpoints.save(1, {"a": np.zeros(3)})
+    file = max((path / "arrays").rglob("*"), key=lambda file: file.stat().st_size * file.is_file())
+    os.truncate(file, 1 << 40)
+    with pytest.raises(DataError, match=r"has 1.1 TB, more than the 17 MB that are read; use another"):
+        checkpoints.restore({"a": np.zeros(3)})
+
+
 def test_edited_score_is_found(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path)
     about = checkpoints.save(1, {"a": 1}, 0.25) / "about.json"

@@ -28,7 +28,7 @@ import numpy as np
 
 from drivax.errors import DataError
 from drivax.files import atomic_write, format_bytes, inside, remove, replace_folder, sync_folder, write_text
-from drivax.reading import ArrayType, check_regular, explain_damage, read_arrays, read_json
+from drivax.reading import ArrayType, check_regular, check_size, explain_damage, read_arrays, read_json
 from drivax.seal import check_seal
 
 ABOUT = "about.json"
@@ -37,6 +37,8 @@ _RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _OTHER = "use another checkpoint, or train again"
 _CHUNK_BYTES = 1 << 24
+#: Most bytes of a checkpoint's file for each number that its arrays hold (keys hold several words), and besides.
+_MOST_ITEM_BYTES, _MOST_OTHER_BYTES = 32, 1 << 24
 #: Threads of Orbax end within this time after a failure (s).
 _LATE_S = 2.0
 _CURE = "use the configuration that the checkpoint was trained with"
@@ -174,7 +176,8 @@ class Checkpoints:
         ]
         part_leaves = [leaf for leaf in stored_leaves if is_part(leaf["name"], templates)]
         _compare(path, part_leaves, requested_leaves, cure)
-        _check_files(path, about.get("files", {}))
+        most = _MOST_ITEM_BYTES * sum(math.prod(leaf["shape"]) for leaf in stored_leaves) + _MOST_OTHER_BYTES
+        _check_files(path, about.get("files", {}), most)
         arrays = _load_arrays(path, stored_leaves, dict(requested_leaves))
         values = iter([_rebuild(arrays[name], leaf) for name, leaf in requested_leaves])
         return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
@@ -244,12 +247,16 @@ def _check_types(about: Mapping[str, Any]) -> None:
         raise ValueError("scores or files of other types")
     for leaf in about["leaves"]:
         types = {name: type(leaf[name]) for name in ("name", "type", "shape", "crc")}
-        if types != {"name": str, "type": str, "shape": list, "crc": int}:
+        is_shape = all(type(size) is int and size >= 0 for size in leaf["shape"])
+        if types != {"name": str, "type": str, "shape": list, "crc": int} or not is_shape:
             raise ValueError("a leaf of other types")
 
 
-def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or no regular file."""
+def _check_files(path: Path, checksums: Mapping[str, int], most: int) -> None:
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, or no regular file.
+
+    So are links, and files of more than ``most`` bytes, whose checksums might take forever.
+    """
     entries = {entry.relative_to(path): entry for entry in sorted(path.rglob("*"))}
     for name in entries:
         inside(path, *name.parts)
@@ -260,6 +267,7 @@ def _check_files(path: Path, checksums: Mapping[str, int]) -> None:
         with explain_damage(path / name, _OTHER):
             if name not in files:  # A stranger's checkpoint may name files outside.
                 raise FileNotFoundError
+            check_size(files[name], _OTHER, most)
             with files[name].open("rb") as file:
                 crc = _file_crc(file)
             if crc != expected:
