@@ -25,6 +25,7 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation import episode_table
 from drivax.evaluation.episode_table import KEYS, _read_columns
 from drivax.reading import (
+    check_regular,
     explain_damage,
     parse_array,
     read_arrays,
@@ -42,6 +43,13 @@ from drivax.tracking.sinks import JsonLines, read_rows
 
 def header(text: str) -> bytes:
     return b"\x93NUMPY\1\0" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n"
+
+
+def test_a_link_to_itself_is_no_regular_file(tmp_path):
+    file = tmp_path / "a"
+    file.symlink_to(file)
+    with pytest.raises(DataError, match=r"a: cannot be read \(Too many levels of symbolic links\); again"):
+        check_regular(file, "again")
 
 
 def test_arrays_are_those_of_numpy(tmp_path):

@@ -7,6 +7,7 @@ import csv
 import io
 import lzma
 import math
+import stat
 import struct
 import threading
 import tokenize
@@ -72,8 +73,9 @@ def _cause(error: BaseException) -> str:
 
 def check_regular(file: Path, cure: str) -> None:
     """Raise a DataError if a path is a pipe or device, which might never end, or a folder; a missing file passes."""
-    with explain_damage(file, cure):
-        if file.exists() and not file.is_file():
+    # Not exists(), which takes a link to itself for a missing file.
+    with explain_damage(file, cure), contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISREG(file.stat().st_mode):
             raise ValueError("not a regular file")
 
 

@@ -703,7 +703,7 @@ def test_forged_note_is_reported_in_one_line(thirty, tmp_path, changes):
     note = tmp_path / ".set.partial" / "progress" / "00000.json"
     value = json.loads(note.read_text())["value"]
     value["note"].update(changes)
-    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([0, value], sort_keys=True).encode()).hexdigest()
     note.write_text(json.dumps({"sha256": digest, "value": value}))
     with pytest.raises(
         DataError, match=r"\.set\.partial: unfinished output is damaged .*; remove this folder"
