@@ -423,7 +423,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--against", type=Path, help="root of the other tree")
     parser.add_argument("--kernels", action="store_true", help="this tree without and with native kernels")
-    parser.add_argument("--cores", action="store_true", help="this tree with them, on one core and on all")
+    parser.add_argument(
+        "--cores", action="store_true", help="this tree with native kernels, on one core and on all"
+    )
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--write", action="store_true", help="store the rows; others stay")

@@ -1,4 +1,4 @@
-"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files; their names.
+"""User-defined classes and functions by dotted name, ``package.module:name``, as in configuration files.
 
 A name that the user writes resolves anywhere. A name in data (a run folder, a policy, a score table) resolves only to a
 component of drivax, or within a module that the user trusts.

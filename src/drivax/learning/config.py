@@ -70,7 +70,7 @@ class TrainConfig:
         keep: Number of newest checkpoints to keep in addition to the best.
         checkpoint_rule: How validation ranks checkpoints; see :data:`~drivax.learning.training_log.Rule`.
         patience: Validations without improvement after which training stops; 0: never.
-        devices: Number of this machine's devices; None: all if seeds, environments or batch divide among them, else 1.
+        devices: Number of this machine's devices; None: the most that divide seeds, environments or batch.
     """
 
     total_steps: int = 2_000_000

@@ -135,7 +135,8 @@ def train(
     held_out = _held_out(config, environment, learner, validation_scenarios)
     seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
-    program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
+    devices = config.devices or (_former_devices(folders[0].info) if call.resume else None)
+    program = Program(Seeds(learner, tuple(seeds)), experience, devices)
     if call.resume:
         _warn_of_other_bits(folders[0].info, len(program.devices), call.log)
     memory = program.account(None if held_out is None else held_out.bank)
@@ -310,10 +311,16 @@ def _resumed_folders(
     return config, [_seed_folder(config, data, notes, out, number) for number in numbers]
 
 
+def _former_devices(info: Mapping[str, Any]) -> int | None:
+    """Return the number of devices of a run, given its ``run.json``; None if there are fewer now."""
+    former = int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
+    return former if former <= jax.local_device_count() else None
+
+
 def _warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
     """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
     differences = [kernels_difference(info)]
-    if (former := info.get("devices") or devices) != devices:
+    if (former := info.get("devices") or 1) != devices:
         differences.append(f"the run used {former} devices, this process {devices}")
     for difference in filter(None, differences):
         log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")

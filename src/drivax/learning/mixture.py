@@ -108,7 +108,7 @@ class Mixture:
     def step(
         self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
-        """Step or reset the environments of every block; totals are those of all."""
+        """Step or reset the environments of every block; totals are those of all, which devices add in every step."""
         keys, sizes = jax.random.split(key, len(self.blocks)), self.sizes(len(action))
         after, outcomes = [], []
         for number, (start, end) in enumerate(pairwise(accumulate(sizes, initial=0))):

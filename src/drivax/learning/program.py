@@ -202,7 +202,7 @@ def _listed_field(path: Sequence[Any]) -> str | None:
 
 
 def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
-    """Return the requested number of devices; None: all local devices if the work can be divided among them, else one.
+    """Return the requested number of devices; None: the most local devices that the work can be divided among.
 
     Work is divided by seeds, by environments of their state (or its shapes), or by the batch of an offline algorithm.
     Raises UsageError if there are fewer devices, or the work cannot be divided among them.
@@ -211,17 +211,18 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     if requested is not None and not 1 <= requested <= len(available):
         problem = f"{requested} devices, but there are {len(available)}"
         raise UsageError(problem, cure=f"use 1 to {len(available)}")
-    count = len(available) if requested is None else requested
-    if count == 1 or seeds % count == 0:
-        return available[:count]
     divisible = ((leaf, axis) for leaf, axis in _divisible(state, seeds > 1) if axis is not None)
     sizes = [(leaf.shape[axis], "environments") for leaf, axis in divisible]
     sizes += [] if batch is None else [(batch, "steps per batch")]
-    indivisible = [f"{size} {kind}" for size, kind in sizes if size % count]
-    if sizes and not indivisible:
+
+    def divides(count: int) -> bool:
+        by_sizes = bool(sizes) and all(size % count == 0 for size, _ in sizes)
+        return count == 1 or seeds % count == 0 or by_sizes
+
+    count = requested or max(filter(divides, range(1, len(available) + 1)))
+    if divides(count):
         return available[:count]
-    if requested is None:
-        return available[:1]
+    indivisible = [f"{size} {kind}" for size, kind in sizes if size % count]
     work = indivisible[0] if indivisible else "an algorithm without environments or batches"
     kinds = " or ".join(dict.fromkeys([*(kind for size, kind in sizes if size % count), "seeds"]))
     cure = f"use a multiple of {count} {kinds}, or fewer devices"
@@ -271,8 +272,8 @@ def sum_over_devices(
         logs, sums = function(unravel_parameters(parameters), share)
         # A maximum has an element per device in the vector: ``pmax`` loses NaN on CPUs.
         own = jax.lax.axis_index(_AXIS) == jnp.arange(count)
-        apart = {n: jnp.where(own, log, 0.0) for n, log in logs.items() if is_largest(n)}
-        vector, unravel = ravel_pytree((logs | apart, sums))
+        maxima = {n: jnp.where(own, log, 0.0) for n, log in logs.items() if is_largest(n)}
+        vector, unravel = ravel_pytree((logs | maxima, sums))
         total_logs, total = unravel(jax.lax.psum(vector, _AXIS))
         return {n: log.max() if is_largest(n) else log for n, log in total_logs.items()}, total
 

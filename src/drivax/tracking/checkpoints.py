@@ -253,9 +253,9 @@ def _check_types(about: Mapping[str, Any]) -> None:
 
 
 def _check_files(path: Path, checksums: Mapping[str, int], most: int) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing, damaged, or no regular file.
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or no regular file.
 
-    So are links, and files of more than ``most`` bytes, whose checksums might take forever.
+    Files of more than ``most`` bytes are refused unread, because their checksums might take forever.
     """
     entries = {entry.relative_to(path): entry for entry in sorted(path.rglob("*"))}
     for name in entries:

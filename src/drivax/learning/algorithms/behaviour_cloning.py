@@ -102,7 +102,7 @@ class Cloning:
             mask = ~(clipped & self.mask_clipped)
             return self._sums(policy(parameters, observation), action, mask)
 
-        # As a whole: the compiler would exchange the gradient of each parameter.
+        # One exchange for the whole gradient; otherwise XLA exchanges each parameter separately.
         return _mean(*sum_over_devices(sums, parameters, batch, axis=0), len(batch[1]))
 
     def imitation_loss(
@@ -114,7 +114,7 @@ class Cloning:
     def _sums(
         self, policy: Distribution, action: Float[Array, "B D"], mask: Bool[Array, " B"]
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
-        """Return the sums over steps where ``mask`` holds of values to log, 1 among them, and of the loss."""
+        """Return the number of steps where ``mask`` holds, with sums of values to log over them, and of the loss."""
         error = policy.mode() - action
         squared = self.loss == "mse"
         loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(action))
