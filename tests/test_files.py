@@ -560,6 +560,12 @@ def test_system_error_has_path_and_cure(number: int, text: str):
     error = explain_system(OSError(number, os.strerror(number), "x"))
     assert isinstance(error, DataError) and str(error).startswith(text)
     assert str(explain_system(OSError(number, os.strerror(number)), "x")) == str(error)
+    quoted = ValueError(f"INVALID_ARGUMENT: Failed to write: {text} [os_error_code='{number}']")
+    assert str(explain_system(quoted, "x")) == str(error)
+
+
+def test_file_system_without_bytes_says_itself_why_it_is_not_written():
+    check_space(Path("/proc/drivax"), 1 << 30)
 
 
 def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.MonkeyPatch):
@@ -573,6 +579,11 @@ def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.Mo
         (
             RuntimeError("can't start new thread"),
             "(limit of processes and threads: 2048); raise the limit: ulimit -u 4096, or",
+        ),
+        (ValueError("Failed to open file 9: x [os_error_code='24']"), "limit of open files: 2048); raise"),
+        (
+            RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 13743895347 bytes."),
+            "cannot allocate memory (limit of memory in kB: 2); use fewer --workers",
         ),
     ):
         explained = explain_system(error)

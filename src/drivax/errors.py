@@ -6,6 +6,7 @@ import difflib
 import errno
 import importlib
 import os
+import re
 import resource
 from collections.abc import Iterable
 from pathlib import Path
@@ -44,6 +45,8 @@ _LIMITS = {
     errno.ENOMEM: ("memory in kB", resource.RLIMIT_AS, _LESS_MEMORY),
     errno.EAGAIN: ("processes and threads", resource.RLIMIT_NPROC, "raise the limit: ulimit -u {}, or end processes"),
 }  # fmt: skip
+#: How TensorStore quotes the number of a system error.
+_QUOTED_NUMBER = re.compile(r"\[os_error_code='(\d+)'\]")
 #: Address space below which JAX aborts a process (bytes).
 _LEAST_MEMORY = 1400 << 20
 
@@ -110,6 +113,10 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
         number = errno.ENOMEM
     elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         number = errno.EAGAIN
+    elif quoted := _QUOTED_NUMBER.search(str(error)):
+        number = int(quoted[1])
+    elif isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED: Out of memory" in str(error):
+        number = errno.ENOMEM
     elif not isinstance(error, OSError) or number is None:
         return None
     file, problem = getattr(error, "filename", None) or file, os.strerror(number).lower()

@@ -96,10 +96,14 @@ def path_end(path: Path, others: Iterable[Path]) -> str:
 
 def free_bytes(path: Path) -> int:
     """Return the free bytes on the disk of a path, which need not exist."""
+    return _disk(path).free
+
+
+def _disk(path: Path) -> Any:
     path = path.absolute()
     while not path.exists():
         path = path.parent
-    return shutil.disk_usage(path).free
+    return shutil.disk_usage(path)
 
 
 def format_bytes(size: float) -> str:
@@ -116,8 +120,9 @@ def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
     Raises:
         DataError: The disk has less space left.
     """
-    if size > (free := free_bytes(path)):
-        problem = f"no space: needs about {format_bytes(size)}, the disk has {format_bytes(free)} left"
+    disk = _disk(path)
+    if disk.total and size > disk.free:  # A file system like /proc has no bytes; writing to it says why.
+        problem = f"no space: needs about {format_bytes(size)}, the disk has {format_bytes(disk.free)} left"
         raise DataError(problem, file=path, cure=cure)
 
 

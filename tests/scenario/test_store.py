@@ -702,7 +702,7 @@ def test_forged_note_costs_its_shard_only(tmp_path: Path, changes: dict):
     note = tmp_path / ".set.partial" / "progress" / "00001.json"
     value = json.loads(note.read_text())["value"]
     (value if changes.keys() <= value.keys() else value["shard"]).update(changes)
-    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps([1, value], sort_keys=True).encode()).hexdigest()
     note.write_text(json.dumps({"sha256": digest, "value": value}))
     assert continued(tmp_path / "set") == [2]
 
