@@ -22,7 +22,7 @@ from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet, check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
-from drivax.learning.program import Program, Seeds
+from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
 from drivax.learning.training_log import (
     DivergenceError,
     Preempted,
@@ -40,7 +40,7 @@ from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RUN_FILE, RunFolder, kernels_difference, run_and_step, training_sets
+from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, training_sets
 
 #: Problem and option, where inputs of a resumed run differ.
 _RESUMED_WITH_OTHER = {
@@ -135,10 +135,9 @@ def train(
     held_out = _held_out(config, environment, learner, validation_scenarios)
     seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
-    devices = config.devices or (_former_devices(folders[0].info) if call.resume else None)
-    program = Program(Seeds(learner, tuple(seeds)), experience, devices)
+    program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
     if call.resume:
-        _warn_of_other_bits(folders[0].info, len(program.devices), call.log)
+        warn_of_other_bits(folders[0].info, len(program.devices), call.log)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     if isinstance(validation_set, HoldOut):
@@ -149,7 +148,7 @@ def train(
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
         stack.enter_context(explain_full_disk(out))
-        notes["devices"] = len(program.devices)
+        notes |= {"devices": len(program.devices)}
         folders = folders or _create_folders(config, data, notes, out, seeds, call.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
@@ -288,7 +287,7 @@ def _seed_folder(
 def _resumed_folders(
     data: ScenarioSet, notes: Mapping[str, Any], out: Path, seeds: int, trust: Sequence[str]
 ) -> tuple[TrainConfig, list[RunFolder]]:
-    """Return the configuration of a run, and the folder of each of its seeds.
+    """Return the configuration of a run with its number of devices, and the folder of each of its seeds.
 
     Raises:
         UsageError: Data or options differ from those of the run, or it names code that is not trusted.
@@ -303,27 +302,13 @@ def _resumed_folders(
     config, count = folder.config(TrainConfig, trust=trust), folder.info.get("seeds") or 1
     if seeds not in (1, count):
         raise UsageError(f"contains {count} seeds, not {seeds}", file=out, cure="resume without --seeds")
+    resumed = replace(config, devices=config.devices or former_devices(folder.info))
     if folder.kind != "seeds":
-        return config, [folder]
+        return resumed, [folder]
     # A process that was killed at its start may not have created all of them.
     notes = {name: folder.info[name] for name in _INHERITED_NOTES if name in folder.info}
     numbers = range(config.seed, config.seed + count)
-    return config, [_seed_folder(config, data, notes, out, number) for number in numbers]
-
-
-def _former_devices(info: Mapping[str, Any]) -> int | None:
-    """Return the number of devices of a run, given its ``run.json``; None if there are fewer now."""
-    former = int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
-    return former if former <= jax.local_device_count() else None
-
-
-def _warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
-    """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
-    differences = [kernels_difference(info)]
-    if (former := info.get("devices") or 1) != devices:
-        differences.append(f"the run used {former} devices, this process {devices}")
-    for difference in filter(None, differences):
-        log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
+    return resumed, [_seed_folder(config, data, notes, out, number) for number in numbers]
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithm import Learner
+from drivax.tracking.run_folder import kernels_difference
 from drivax.tracking.workers import available_cores
 
 #: Threads of XLA's pool, enough to avoid deadlocks.
@@ -227,6 +228,21 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     kinds = " or ".join(dict.fromkeys([*(kind for size, kind in sizes if size % count), "seeds"]))
     cure = f"use a multiple of {count} {kinds}, or fewer devices"
     raise UsageError(f"{work} cannot be divided among {count} devices", cure=cure)
+
+
+def former_devices(info: Mapping[str, Any]) -> int | None:
+    """Return the number of devices of a run, given its ``run.json``; None if there are fewer now."""
+    former = int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
+    return former if former <= jax.local_device_count() else None
+
+
+def warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
+    """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
+    differences = [kernels_difference(info)]
+    if (former := info.get("devices") or 1) != devices:
+        differences.append(f"the run used {former} devices, this process {devices}")
+    for difference in filter(None, differences):
+        log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
 
 
 def shard_axis(tree: Any, axis: int) -> Any:
