@@ -485,7 +485,7 @@ def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
 
 
 def test_too_small_disk_is_reported_before_the_start(thirty, tmp_path, monkeypatch):
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=1 << 60, free=5_000_000))
     with pytest.raises(
         DataError, match=r"set: no space: needs about 1\d MB, the disk has 5\.0 MB left; make room"
     ):

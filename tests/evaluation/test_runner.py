@@ -316,7 +316,7 @@ def test_disk_space_is_checked_before_the_first_episode(scenarios, tmp_path, mon
         pytest.fail("an episode was evaluated")
 
     monkeypatch.setattr("drivax.evaluation.runner.evaluate", fail)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=1 << 60, free=1_000))
     config = EvaluationConfig(planner="expert", traffic="idm")
     with pytest.raises(DataError, match=r"run: no space: needs about \d+ kB, the disk has 1 kB left"):
         run_evaluation(config, Expert(), ScenarioSet.open(tmp_path / "set"), tmp_path / "run")

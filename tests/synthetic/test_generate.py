@@ -246,7 +246,7 @@ def test_invalid_requests_are_refused(tmp_path):
 
 
 def test_disk_space_is_checked_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=1 << 60, free=5_000_000))
     with pytest.raises(DataError, match=r"set: no space: needs about 59 MB, the disk has 5\.0 MB left"):
         generate(tmp_path / "set", 100, progress=lambda done, total: pytest.fail("drew a scenario"))
     with pytest.raises(DataError, match=r"sets: no space: needs about 3\.\d GB"):
