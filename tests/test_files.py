@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivax import files
-from drivax.errors import DataError, UsageError, explain_system, missing_package
+from drivax.errors import DataError, UsageError, explain_library, explain_system, missing_package
 from drivax.files import (
     PartialFolder,
     allow_open_files,
@@ -561,7 +561,8 @@ def test_system_error_has_path_and_cure(number: int, text: str):
     assert isinstance(error, DataError) and str(error).startswith(text)
     assert str(explain_system(OSError(number, os.strerror(number)), "x")) == str(error)
     quoted = ValueError(f"INVALID_ARGUMENT: Failed to write: {text} [os_error_code='{number}']")
-    assert str(explain_system(quoted, "x")) == str(error)
+    assert f"x: {explain_library(quoted)}" == str(error)
+    assert explain_system(quoted) is None, "a file of a stranger may contain these words"
 
 
 def test_file_system_without_bytes_says_itself_why_it_is_not_written():
@@ -586,7 +587,7 @@ def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.Mo
             "cannot allocate memory (limit of memory in kB: 2); use fewer --workers",
         ),
     ):
-        explained = explain_system(error)
+        explained = explain_system(error) or explain_library(error)
         assert isinstance(explained, UsageError) and text in str(explained)
     assert explain_system(ValueError("x")) is None and explain_system(RuntimeError("x")) is None
 

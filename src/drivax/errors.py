@@ -113,10 +113,6 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
         number = errno.ENOMEM
     elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         number = errno.EAGAIN
-    elif quoted := _QUOTED_NUMBER.search(str(error)):
-        number = int(quoted[1])
-    elif isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED: Out of memory" in str(error):
-        number = errno.ENOMEM
     elif not isinstance(error, OSError) or number is None:
         return None
     file, problem = getattr(error, "filename", None) or file, os.strerror(number).lower()
@@ -127,6 +123,17 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
         text, twice = ("none", "unlimited") if limit == resource.RLIM_INFINITY else (size, 2 * size)
         return UsageError(f"{problem} (limit of {name}: {text})", file=file, cure=cure.format(twice))
     return DataError(problem, file=file, cure=_DISK_CURES[number]) if number in _DISK_CURES else None
+
+
+def explain_library(error: BaseException) -> DrivaxError | None:
+    """Return what :func:`explain_system` returns for the system error that TensorStore or XLA quotes; None without one.
+
+    Only for errors that end a command: those of damaged files may quote text of a stranger.
+    """
+    if quoted := _QUOTED_NUMBER.search(str(error)):
+        return explain_system(OSError(int(quoted[1]), quoted[0]))
+    is_memory = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED: Out of memory" in str(error)
+    return explain_system(MemoryError()) if is_memory else None
 
 
 def check_memory_limit() -> None:

@@ -34,6 +34,12 @@ def test_cure_names_only_work_that_there_is(monkeypatch):
             choose_devices(2, 1, state, batch)
 
 
+def test_the_most_devices_that_divide_the_work_are_used(monkeypatch):
+    monkeypatch.setattr(jax, "local_devices", lambda: [0, 1, 2, 3])
+    for batch, seeds, expected in ((6, 1, [0, 1, 2]), (7, 1, [0]), (7, 4, [0, 1, 2, 3]), (None, 1, [0])):
+        assert choose_devices(None, seeds, {"parameters": np.zeros(3)}, batch) == expected
+
+
 def run_on_devices(count, file, *arguments, repository):
     """Run a file of this folder in a process that simulates a number of devices."""
     paths = (str(repository / folder) for folder in ("src", "tests", "tests/learning"))

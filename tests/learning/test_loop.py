@@ -308,6 +308,27 @@ def test_resuming_on_other_devices_warns(data, config, tmp_path):
         assert all("the run used 2 devices, this process 1: the result differs" in line for line in lines)
 
 
+def test_a_resumed_run_keeps_its_devices_where_there_are_as_many(data, config, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    requested = []
+
+    def note(seeds, experience, devices):
+        requested.append(devices)
+        raise Stop
+
+    run = train(config, data, tmp_path / "run", validation=None)
+    assert config.devices is None
+    monkeypatch.setattr(loop, "Program", note)
+    monkeypatch.setattr(jax, "local_device_count", lambda: 2)
+    for former in (1, 2, 3, None):
+        run = run.note(devices=former)
+        with pytest.raises(Stop):
+            train(config, data, run.path, validation=None, resume=True)
+    assert requested == [1, 2, None, 1]
+
+
 def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):
     class Stop(Exception):
         pass

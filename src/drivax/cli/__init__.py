@@ -32,6 +32,7 @@ from drivax.errors import (
     UsageError,
     check_memory_limit,
     did_you_mean,
+    explain_library,
     explain_system,
     missing_package,
 )
@@ -250,7 +251,7 @@ def describe(error: BaseException) -> tuple[str, int]:
         return f"stopped by {error.signal.name}", 128 + error.signal
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", 130
-    if explained := explain_system(error):
+    if explained := explain_system(error) or explain_library(error):
         return str(explained), 1
     if isinstance(error, ImportError) and (missing := missing_package(error)):
         return str(missing), 1

@@ -148,7 +148,7 @@ def train(
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
         stack.enter_context(explain_full_disk(out))
-        notes |= {"devices": len(program.devices)}
+        notes["devices"] = len(program.devices)
         folders = folders or _create_folders(config, data, notes, out, seeds, call.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
@@ -302,7 +302,8 @@ def _resumed_folders(
     config, count = folder.config(TrainConfig, trust=trust), folder.info.get("seeds") or 1
     if seeds not in (1, count):
         raise UsageError(f"contains {count} seeds, not {seeds}", file=out, cure="resume without --seeds")
-    resumed = replace(config, devices=config.devices or former_devices(folder.info))
+    devices = former_devices(folder.info)
+    resumed = replace(config, devices=devices) if devices <= jax.local_device_count() else config
     if folder.kind != "seeds":
         return resumed, [folder]
     # A process that was killed at its start may not have created all of them.

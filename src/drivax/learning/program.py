@@ -230,16 +230,15 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
     raise UsageError(f"{work} cannot be divided among {count} devices", cure=cure)
 
 
-def former_devices(info: Mapping[str, Any]) -> int | None:
-    """Return the number of devices of a run, given its ``run.json``; None if there are fewer now."""
-    former = int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
-    return former if former <= jax.local_device_count() else None
+def former_devices(info: Mapping[str, Any]) -> int:
+    """Return the number of devices of a run, given its ``run.json``."""
+    return int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
 
 
 def warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
     """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
     differences = [kernels_difference(info)]
-    if (former := info.get("devices") or 1) != devices:
+    if (former := former_devices(info)) != devices:
         differences.append(f"the run used {former} devices, this process {devices}")
     for difference in filter(None, differences):
         log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")

@@ -83,7 +83,7 @@ _MAX_REACTION_STEPS = 6
 #: Steps ahead for which a planned ego reserves connectors.
 _LOOKAHEAD_STEPS = 25
 #: Runs that are simulated together.
-_BATCH_RUNS = 32
+_BATCH_RUNS = 16
 
 _T = TypeVar("_T")
 
@@ -200,7 +200,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     """Run tasks and yield their results in order.
 
-    Each task yields runs and receives their motion. Up to 32 runs of different tasks are simulated together.
+    Each task yields runs and receives their motion. Up to 16 runs of different tasks are simulated together.
     """
     remaining = iter(enumerate(tasks))
     results: dict[int, _T] = {}
