@@ -10,7 +10,8 @@ the summary in ``experiments/results``; ``page`` puts what is stored there into 
 
 The work folder is a small tmpfs in a user namespace (``unshare``, no privileges), so that it can be filled; a system
 without user namespaces skips the fault ``full``. Half of the moments are uniform in the run, half after the first file
-is written. Half of the runs of a command with ``--overwrite`` replace an output, which must stay complete.
+is written. Half of the runs of a command with ``--overwrite`` replace an output, which must stay complete where it is
+replaced in one step.
 
 Files are compared byte for byte except for: TensorBoard files and Orbax arrays, whose names are random (``about.json``
 has the checksum of each array, and later commands read them), and the values in ``VOLATILE``.
@@ -59,6 +60,7 @@ VOLATILE = {
     "metrics.jsonl": {"steps_per_second"},
     "about.json": {"files", "crc"},
     "seal.json": {"run.json", "metrics.jsonl"},
+    "demo.json": {"started", "command", "git", "stages_s"},
 }
 #: The same in pages: times, command lines, and the curve of the training's speed.
 _VOLATILE_HTML = re.compile(
@@ -67,7 +69,7 @@ _VOLATILE_HTML = re.compile(
     re.DOTALL,
 )
 _IGNORED_FOLDERS = {"tensorboard", "arrays"}
-#: Size of the disk, and free space that may remain on a full one (bytes).
+#: Size of the disk, and the most free space that may remain on a full one (bytes).
 _DISK, _REST = 512 << 20, 1 << 18
 #: A stopped command, and a whole one, end within these times (s).
 _STOP_S, _RUN_S = 120.0, 900.0
@@ -122,7 +124,8 @@ class Command:
     Attributes:
         arguments: Its arguments.
         outputs: Files and folders that it writes.
-        overwrite: Whether it has ``--overwrite``, and replaces each output in one step.
+        overwrite: Whether it has ``--overwrite``, which is passed where output exists.
+        in_one_step: Whether it replaces each output in one step: a training replaces the former run at its start.
         resume: Whether ``--resume`` continues its run folder.
         workers: Whether it starts processes.
         devices: Number of CPU devices.
@@ -131,6 +134,7 @@ class Command:
     arguments: tuple[str, ...]
     outputs: tuple[str, ...]
     overwrite: bool = True
+    in_one_step: bool = True
     resume: bool = False
     workers: bool = False
     devices: int = 1
@@ -142,6 +146,10 @@ def _command(text: str, *outputs: str, **options: Any) -> Command:
 
 #: In the order in which they need each other's output.
 COMMANDS = {
+    "demo": _command(
+        "demo --training 6 --held-out 3 --workers 2 --preset ./train.yaml --out demo",
+        "demo", in_one_step=False, workers=True,
+    ),
     "generate": _command("generate set --scenarios 12 --workers 2 --split 50/25/25", "set", workers=True),
     "export": _command("export set recordings --format gpudrive", "recordings"),
     "export-set": _command("export set part --limit 4", "part"),
@@ -150,6 +158,8 @@ COMMANDS = {
         "convert recordings converted --workers 2 --shard-size 3 --split 50/25/25", "converted", workers=True
     ),
     "view": _command("view part --out view.html", "view.html"),
+    "inspect": _command("inspect set part --html sets.html", "sets.html"),
+    "draw": _command("inspect part --observations --planner idm --draw observation.png", "observation.png"),
     "curate": _command("curate kinematic --data set --out scores.npz --export top 4", "scores.npz", "top"),
     "curate-ensemble": _command(
         "curate ensemble --data set --out ensemble.npz --folds 2 --total_steps 256 --cloning.batch 16 "
@@ -157,6 +167,9 @@ COMMANDS = {
         "ensemble.npz",
     ),
     "train": _command("train train.yaml --data set --validation none --out run", "run", overwrite=False, resume=True),
+    "train-again": _command(
+        "train train.yaml --data part --validation none --out again", "again", in_one_step=False
+    ),
     "train-seeds": _command(
         "train train.yaml --data converted --validation part --seeds 2 --out seeds",
         "seeds", overwrite=False, resume=True,
@@ -170,6 +183,7 @@ COMMANDS = {
     "judge": _command("judge idm", "idm/devkit.csv"),
     "compare": _command("compare policy idm --html comparison.html", "comparison.html"),
     "report": _command("report idm policy run --episodes 2 --out report.html", "report.html"),
+    "video": _command("report policy --video worst:1 --out videos", "videos"),
     "tables": _command("report idm policy --tables --out tables", "tables"),
     "study": _command(
         "study study.yaml --config settings.yaml --data set --validation part --test part --cores 2 --anyway "
@@ -235,7 +249,11 @@ class Bench:
         """Stop a command by a fault at a random moment, and check what it leaves."""
         command = self.commands[name]
         replaces = command.overwrite and self._exists(command) and self.rng.random() < 0.5
-        complete = replaces and all((self.work / output).exists() for output in command.outputs)
+        complete = (
+            replaces
+            and command.in_one_step
+            and all((self.work / output).exists() for output in command.outputs)
+        )
         shares = iter(_SHARES)
         process = self._run_until(name, next(shares), replaces)
         while process.poll() is not None and (share := next(shares, None)):
@@ -346,8 +364,9 @@ class Bench:
                 process.send_signal(getattr(signal, f"SIG{fault.upper()}"))
 
     def _fill(self) -> None:
-        """Leave a random rest of the disk free."""
-        size = shutil.disk_usage(self.disk).free - self.rng.randrange(_REST)
+        """Leave a random rest of the disk free, as often less than 1 kB as more, so that small files do not fit."""
+        rest = int(_REST ** self.rng.random())
+        size = shutil.disk_usage(self.disk).free - rest
         with self.ballast.open("wb") as file, contextlib.suppress(OSError):
             os.posix_fallocate(file.fileno(), 0, max(size, 1))
 

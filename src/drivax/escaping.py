@@ -13,8 +13,8 @@ _BEGIN, _BLANKS = r"[=+\-@\uff1d\uff0b\uff0d\uff20]", r"[ \xa0]*"
 _FORMULA = rf"(?=[\t\r\n]|{_BLANKS}{_BEGIN})(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
 #: Where a spreadsheet may begin a cell: at the beginning, and after what separates cells in some country or program.
 _AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", rf"[\" \xa0]*{_BEGIN}"
-_ACTIVE = re.compile(rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})")
-_NEUTRAL = re.compile(rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})")
+_ACTIVE = rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})"
+_NEUTRAL = rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})"
 _QUOTED = re.compile(r'[,"\r\n]')
 #: Controls (C0, DEL, C1), marks and overrides of direction, line separators, and undecodable bytes of file names.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -35,15 +35,17 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
 
     This includes text after a separator in a cell, such as ``;=1``: some spreadsheets begin a cell there.
     """
-    return "".join(",".join(_csv_cell(str(cell)) for cell in row) + "\n" for row in rows)
+    active = re.compile(_ACTIVE)  # not at import: most commands write no CSV
+    return "".join(",".join(_csv_cell(str(cell), active) for cell in row) + "\n" for row in rows)
 
 
 def csv_rows(lines: Iterable[str]) -> Iterator[list[str]]:
     """Yield the rows of :func:`csv_text` from its lines, with the cells as they were."""
+    neutral = re.compile(_NEUTRAL)
     for row in csv.reader(lines):
-        yield [_NEUTRAL.sub("", cell) if "'" in cell else cell for cell in row]
+        yield [neutral.sub("", cell) if "'" in cell else cell for cell in row]
 
 
-def _csv_cell(cell: str) -> str:
-    cell = _ACTIVE.sub("'", cell)
+def _csv_cell(cell: str, active: re.Pattern[str]) -> str:
+    cell = active.sub("'", cell)
     return '"' + cell.replace('"', '""') + '"' if _QUOTED.search(cell) else cell

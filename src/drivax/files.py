@@ -17,7 +17,6 @@ outputs, which the user names, are followed; links inside them, which a stranger
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import hashlib
@@ -112,6 +111,11 @@ def format_bytes(size: float) -> str:
         if size >= scale:
             return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
     return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
+
+
+def count_text(number: int, noun: str) -> str:
+    """Return a number with its noun in the singular or plural."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
@@ -447,6 +451,8 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
 
 def _exchange(first: Path, second: Path) -> bool:
     """Exchange the names of two folders in one step; return whether the disk can."""
+    import ctypes  # not for every command
+
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # of Linux
     if rename is None:
         return False

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,9 @@ from orbax.checkpoint._src import asyncio_utils
 
 from drivax import cli
 from drivax.errors import DataError, UsageError
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.store import ScenarioWriter
+from scenes import SMALL, car, straight_road
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,6 +205,50 @@ def test_low_memory_limit_is_one_line(limit, command):
     needed = "drivax: JAX needs 1433600 kB of memory, the limit of this process is"
     assert result.stderr == f"{needed} {limit}; raise the limit: ulimit -v unlimited\n"
     assert (result.returncode, result.stdout) == (2, "")
+
+
+GENERATE, EVALUATE = "generate OUT --scenarios 2 --workers 2", "evaluate --planner idm --data SET --out OUT"
+
+
+def run_limited(command, tmp_path, limit, *before):
+    """Run a command, where shared memory or open files are scarce; return its process, and what it left."""
+    words = command.replace("OUT", str(tmp_path / "out")).replace("SET", str(tmp_path / "set")).split()
+    script = f'{limit}; exec "$@"'
+    program = [*before, "sh", "-c", script, "sh", sys.executable, "-m", "drivax", *words]
+    result = subprocess.run(program, capture_output=True, text=True, check=False)
+    return result, [path.name for path in tmp_path.iterdir() if path.name != "set"]
+
+
+@pytest.mark.parametrize(
+    ("command", "files", "line"),
+    [
+        (
+            GENERATE,
+            14,
+            r"out: too many open files \(limit of open files: 14\); raise the limit: ulimit -n 28, or use",
+        ),
+        (EVALUATE, 100, r"set: needs 129 open files, the limit is 100; raise it: ulimit -Hn 129"),
+    ],
+)
+def test_few_open_files_are_one_line(command, files, line, tmp_path):
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(assemble(straight_road([car(speed=8.0)]), SMALL))
+    result, left = run_limited(command, tmp_path, f"ulimit -n {files}")
+    assert re.search(line, result.stderr.splitlines()[-1]) and "Traceback" not in result.stderr
+    assert (result.returncode in (1, 2), left) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("mount", "error"), [("-o ro", "Read-only file system"), ("-o size=4k", "No space left on device")]
+)
+def test_workers_without_shared_memory_are_one_line(mount, error, tmp_path):
+    user = ("unshare", "--user", "--map-root-user", "--mount")
+    shm = f"mount -t tmpfs {mount} tmpfs /dev/shm && (head -c 4096 /dev/zero > /dev/shm/full; true) 2> /dev/null"
+    if subprocess.run([*user, "sh", "-c", shm], capture_output=True).returncode:
+        pytest.skip("the system has no user namespaces, or /dev/shm cannot be replaced in one")
+    result, left = run_limited(GENERATE, tmp_path, shm, *user)
+    problem = f"drivax: /dev/shm: no shared memory for worker processes ({error}); mount it (docker run --shm-size 1g)"
+    assert result.stderr.splitlines()[-1].startswith(problem) and (result.returncode, left) == (2, [])
 
 
 @pytest.fixture(autouse=True)

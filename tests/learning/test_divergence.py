@@ -21,6 +21,7 @@ from drivax.learning.algorithms.optimisers import sum_gradients
 from drivax.learning.algorithms.sac import _sums
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.config import TrainConfig
+from drivax.learning.environment import collect
 from drivax.learning.loop import mean_logs, train
 from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import DivergenceError, large_logs, nonfinite_leaf, nonfinite_log, rank
@@ -112,6 +113,25 @@ class NanReward(Pendulum):
 def test_nan_reward_is_named_before_the_losses_that_it_spoils(name):
     _, logs, _ = next(iterate({"ppo": PPO, "sac": SAC}[name], NanReward(), iterations=1))
     assert nonfinite_log(mean_logs(logs)) == "reward/swing is NaN"
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0.5, None), (jnp.nan, "NaN"), (-jnp.inf, "infinite")])
+def test_sampled_actions_are_logged_and_named(value, expected):
+    """One of two pendulums has another action at one of four steps."""
+
+    def actor(observation, key):
+        is_first = (observation["pendulum"] == start.observation["pendulum"]).all(axis=1)
+        action = jnp.where(is_first & jnp.array([False, True]), value, -0.25)[:, None]
+        return action, action, {}
+
+    environment, key = Pendulum(), jax.random.key(0)
+    start = environment.start((), key, 2)
+    *_, sums = collect(environment, (), start, actor, key, 4)
+    row = mean_logs({f"rollout/{name}": total for name, total in sums.items()})
+    if expected is None:
+        assert nonfinite_log(row) is None and row["rollout/action"] == (7 * 0.25 + 0.5) / 8
+    else:
+        assert nonfinite_log(row | {"reward/swing": jnp.nan}) == f"rollout/action is {expected}"
 
 
 def test_healthy_state_is_finite_although_environments_are_not():

@@ -36,7 +36,7 @@ LONGTAIL = load_study("longtail")
 ARMS, METRICS = LONGTAIL.arms, LONGTAIL.metrics
 SEEDS, SCENARIOS = 5, 400
 TINY = [
-    "--total_steps", "64", "--validations", "4", "--seeds", "2",
+    "--total_steps", "64", "--validations", "4", "--seeds", "2", "--progress", "1.5",
     "--arms", "[baseline, bc, heuristic, random_matched]",
     "--training", '["--algorithm.batch", "8", "--algorithm.updates", "1", "--algorithm.network.head", "[4]"]',
 ]  # fmt: skip
@@ -330,6 +330,21 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert main([*arguments, "--anyway"]) == 0
     again = capsys.readouterr().err
     assert "trained" not in again and "evaluating" not in again
+    # An edited evaluation is refused, or named by the results and the page.
+    episodes = out / "drives" / "heuristic" / "seed-0" / "episodes.csv"
+    text = episodes.read_text()
+    rows = [line.split(",") for line in text.splitlines(keepends=True)]
+    rows[1][rows[0].index("ade")] = "1.5"
+    episodes.write_text("".join(map(",".join, rows)))
+    assert main([*arguments, "--anyway"]) == 1
+    assert f"{episodes}: changed since drivax wrote it" in capsys.readouterr().err
+    assert main([*arguments, "--anyway", "--edited"]) == 0
+    assert capsys.readouterr().err.endswith(f"drivax: made with edited files: {episodes}\n")
+    assert json.loads((out / "results.json").read_text())["edited"] == [str(episodes)]
+    assert f"edited after drivax wrote them:</b> {episodes}" in (out / "report.html").read_text()
+    episodes.write_text(text)
+    assert main([*arguments, "--anyway"]) == 0
+    capsys.readouterr()
     # Nor does one that is restored from its stored files.
     script = load_script("longtail")
     monkeypatch.setattr(script, "KEPT", tmp_path / "kept")

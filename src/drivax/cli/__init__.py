@@ -37,7 +37,6 @@ from drivax.errors import (
     missing_package,
 )
 from drivax.escaping import escape_controls, show
-from drivax.seal import allow_edited, edited_files
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -110,10 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug, without_cache, edited = (flag in arguments for flag in _FLAGS)
     arguments = [argument for argument in arguments if argument not in _FLAGS]
     try:
-        with _stop_at_signals(), allow_edited(edited):
-            status = _dispatch(arguments, not without_cache)
-            if files := edited_files():
-                show(f"drivax: made with edited files: {', '.join(files)}", sys.stderr)
+        with _stop_at_signals():
+            status = _dispatch(arguments, not without_cache, edited)
         sys.stdout.flush()
     except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
         if stop.code is None:
@@ -279,7 +276,7 @@ def overview() -> str:
     ))  # fmt: skip
 
 
-def _dispatch(arguments: list[str], use_cache: bool) -> int:
+def _dispatch(arguments: list[str], use_cache: bool, edited: bool) -> int:
     """Run the command that the first argument names, or print the overview or the version."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         show(overview())
@@ -292,7 +289,13 @@ def _dispatch(arguments: list[str], use_cache: bool) -> int:
         kind = "option" if name.startswith("-") else "command"
         cure = did_you_mean(name, COMMANDS, otherwise="see drivax --help")
         raise UsageError(f"unknown {kind} {name!r}", cure=cure)
-    return _run(name, COMMANDS[name], rest, use_cache)
+    from drivax.seal import allow_edited, edited_files  # not for the overview
+
+    with allow_edited(edited):
+        status = _run(name, COMMANDS[name], rest, use_cache)
+        if files := edited_files():
+            show(f"drivax: made with edited files: {', '.join(files)}", sys.stderr)
+    return status
 
 
 def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> int:

@@ -12,12 +12,11 @@ import tyro
 
 from drivax.cli import record_of
 from drivax.datasets.conversion import Conversion, Converted, Plan, convert
-from drivax.datasets.doctor import count_text
 from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.evaluation.audit import audit
-from drivax.files import can_resume
+from drivax.files import can_resume, count_text
 from drivax.scenario.schema import CAPACITIES
 from drivax.tracking.progress import Progress
 

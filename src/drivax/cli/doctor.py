@@ -20,10 +20,10 @@ from rich.text import Text
 
 from drivax import kernels
 from drivax.cli import console
-from drivax.datasets.doctor import Diagnosis, Part, count_text, diagnose
+from drivax.datasets.doctor import Diagnosis, Part, diagnose
 from drivax.errors import UsageError
 from drivax.escaping import escape_controls
-from drivax.files import format_bytes, free_bytes
+from drivax.files import count_text, format_bytes, free_bytes
 from drivax.tracking.run_folder import zoo
 
 #: Modules and purpose of every extra.

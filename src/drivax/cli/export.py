@@ -47,8 +47,8 @@ class Export:
 
 def run(args: Export) -> int:
     """Export, and print the number of elements that did not fit the format."""
-    from drivax.datasets.doctor import count_text
     from drivax.datasets.export import writer
+    from drivax.files import count_text
     from drivax.tracking.progress import Progress
 
     options = record_of(writer.Export, args, filters=args.filter)

@@ -112,8 +112,6 @@ def _check_flags(args: Inspect) -> None:
     """Refuse flags that exclude each other, and an existing picture."""
     from drivax.errors import UsageError
     from drivax.files import check_output
-    from drivax.planners.catalogue import PLANNERS
-    from drivax.tracking.run_folder import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(
@@ -123,9 +121,12 @@ def _check_flags(args: Inspect) -> None:
         if getattr(args, name) and not args.observations:
             flag = f"--{name.replace('_', '-')}"
             raise UsageError(f"{flag} needs --observations", cure="add --observations")
-    planner = args.planner or "expert"
-    if args.task is not None and is_policy(planner.partition("@")[0], PLANNERS):
-        raise UsageError("a trained policy has its own task", cure="leave out --task")
+    if args.task is not None and args.planner is not None:
+        from drivax.planners.catalogue import PLANNERS
+        from drivax.tracking.run_folder import is_policy
+
+        if is_policy(args.planner.partition("@")[0], PLANNERS):
+            raise UsageError("a trained policy has its own task", cure="leave out --task")
     if args.draw is not None:
         check_output(args.draw, args.overwrite)
 

@@ -25,10 +25,11 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 
-from drivax.datasets.doctor import Estimate, count_text, estimate
+from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
 from drivax.errors import DataError, DrivaxError, UsageError, explain_system
+from drivax.files import count_text
 from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle

@@ -15,7 +15,7 @@ from drivax.datasets import unsupported
 from drivax.datasets.formats import AUTO, Survey, find_reader, survey
 from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with_steps
 from drivax.errors import DataError, UsageError
-from drivax.files import check_space, format_bytes, free_bytes
+from drivax.files import check_space, count_text, format_bytes, free_bytes
 from drivax.reading import read_json
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
@@ -256,11 +256,6 @@ def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
     # Readers count windows of the usual stride and length; estimate the recordings' length from their number.
     steps = STEPS + STRIDE * max(scenarios / recordings - 1, 0)
     return round(recordings * max((steps - length) // stride + 1, 1))
-
-
-def count_text(number: int, noun: str) -> str:
-    """Return a number with its noun in the singular or plural."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _size(paths: Sequence[Path]) -> int:

@@ -186,8 +186,8 @@ def collect(
     """Unroll ``steps`` steps in every environment.
 
     Returns:
-        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, and the numbers of ``episodes``
-        that ended and of ``steps`` that were alive.
+        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, absolute values of ``action``
+        with their count, and the numbers of ``episodes`` that ended and of ``steps`` that were alive.
     """
 
     def step(carry: tuple[Environments, Any, Array], _: None) -> tuple[Any, Any]:
@@ -196,12 +196,14 @@ def collect(
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
         row = transition(environment, now, sampled, outcome, keep, terms)
-        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive)
+        size = jnp.where(now.over, 0.0, jnp.abs(sampled[1]).mean(axis=-1))
+        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive, size)
 
     first = (environments, environment.cache(data, environments.state), key)
-    (environments, _, _), (rollout, totals, ends) = jax.lax.scan(step, first, None, steps)
-    counts = {"episodes": ends.sum(), "steps": rollout.alive.sum()}
-    totals |= {name: count.astype(jnp.float32) for name, count in counts.items()}
+    (environments, _, _), (rollout, totals, ends, sizes) = jax.lax.scan(step, first, None, steps)
+    alive = rollout.alive.sum()
+    sums = {"episodes": ends.sum(), "steps": alive, "action": sizes.sum(), "action/n": alive}
+    totals |= {name: value.astype(jnp.float32) for name, value in sums.items()}
     return environments, rollout, {name: value.sum() for name, value in totals.items()}
 
 

@@ -43,7 +43,7 @@ _ORDER = ("accuracy", "progress_ratio", "comfortable")
 #: rewards of +-100 per step reach at a discount of 0.99.
 _BOUNDS = {"loss/kl": 1.0, "loss/mean_q": 1e4, "loss/largest_q": 1e4}
 #: Logged values that are finite in a healthy training; causes come first.
-_PREFIXES = ("reward/", "loss/")
+_PREFIXES = ("rollout/action", "reward/", "loss/")
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class DivergenceError(DrivaxError):
 
 
 def nonfinite_log(row: Mapping[str, float]) -> str | None:
-    """Return the first reward or loss of an iteration that is NaN or infinite, with its value; None without any."""
+    """Return the first action, reward or loss of an iteration that is NaN or infinite; None without any."""
     names = (name for prefix in _PREFIXES for name in row if name.startswith(prefix))
     return next((f"{name} is {_word(row[name])}" for name in names if not np.isfinite(row[name])), None)
 
