@@ -11,7 +11,7 @@ from scipy import stats
 from drivax.errors import UsageError
 from drivax.learning.driving import Driving
 from drivax.learning.environment import Environments, Outcome, collect
-from drivax.learning.replay import ReplayBuffer, ReplayConfig
+from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -87,6 +87,19 @@ def fill(config, steps, unroll):
 
 def sample_batch(buffer, replay, count, seed=1, n=1):
     return buffer.sample((), replay, buffer.draw(replay, jax.random.key(seed), (count,)), 0.9, n)
+
+
+@pytest.mark.parametrize("environments", [1, 6, 16])
+def test_drawn_number_counts_the_steps_with_a_successor(environments):
+    alive = np.random.default_rng(0).random((9, environments)) < 0.6
+    empty = jnp.zeros_like(alive, float)
+    is_step = jnp.array(alive)
+    replay = Replay((), empty[..., None], empty, is_step, is_step, jnp.int32(4), "state")
+    buffer, key = ReplayBuffer(ReplayConfig(), Counting()), jax.random.key(3)
+    row, column = jax.jit(buffer.draw, static_argnums=2)(replay, key, (5, 40))
+    alive[3] = False  # the newest row
+    expected = np.argwhere(alive)[jax.random.randint(key, (5, 40), 0, alive.sum())]
+    np.testing.assert_array_equal(np.stack([row, column], axis=-1), expected)
 
 
 @pytest.mark.parametrize("store", ["state", "observation"])

@@ -116,14 +116,16 @@ def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
         scale = jax.random.uniform(key)
         return scale * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(policy)), {"scale": scale}
 
+    key, auxiliary_key = jax.random.split(jax.random.key(3))
+    keys = jax.random.split(key, (16, 2))
+
     def loss(trained):
-        key, auxiliary_key = jax.random.split(jax.random.key(3))
-        total, logs = learner.loss(trained, target, batch, jax.random.split(key, (16, 2)))
+        total, logs = learner.loss(trained, target, batch, keys)
         auxiliary, auxiliary_logs = auxiliary_loss(trained.policy, auxiliary_key)
         return total + auxiliary, auxiliary_logs | logs
 
     chunked = jax.jit(
-        lambda trained: learner.gradient(trained, target, batch, jax.random.key(3), auxiliary_loss)
+        lambda trained: learner.gradient(trained, target, batch, keys, auxiliary_key, auxiliary_loss)
     )
     gradient, logs = jax.grad(loss, has_aux=True)(trained)
     jax.tree.map(

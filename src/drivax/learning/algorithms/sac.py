@@ -65,6 +65,8 @@ from drivax.scenario.record import record
 MOST_RETURN_STEPS = 1000
 #: Steps of the replay buffer, and logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
+#: Two keys of each sample ``[batch, 2]``, and that of the auxiliary loss.
+_BatchKeys = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
@@ -285,14 +287,16 @@ class Sac(OffPolicy[SacConfig]):
 
         @jax.jit  # so that the shapes of its logs do not trace it a second time
         def learn() -> tuple[Carry, dict[str, Array]]:
-            def update(carry: Carry, drawn: tuple[_BatchIndex, Array]) -> tuple[Carry, dict[str, Array]]:
+            def update(carry: Carry, drawn: tuple[_BatchIndex, _BatchKeys]) -> tuple[Carry, dict[str, Array]]:
                 batch = self._sample(data, state.replay, drawn[0])
-                after, logs = self.update_networks(carry, batch, drawn[1], auxiliary_loss)
+                after, logs = self.update_networks(carry, batch, *drawn[1], auxiliary_loss)
                 return after if settling is None else _keep_policy(settling, carry, after), logs
 
             updates = config.unroll * config.updates_per_step
             index = self._draw(data, state.replay, draw_key, updates)
-            carry, logs = jax.lax.scan(update, first, (index, jax.random.split(update_key, updates)))
+            # For all updates at once: many small calls of the generator take longer.
+            keys = jax.vmap(self._batch_keys)(jax.random.split(update_key, updates))
+            carry, logs = jax.lax.scan(update, first, (index, keys))
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
@@ -318,6 +322,10 @@ class Sac(OffPolicy[SacConfig]):
             return index, None
         return index, sample_steps(data.critic, jax.random.fold_in(key, 1), (updates, logged))
 
+    def _batch_keys(self, key: Array) -> _BatchKeys:
+        key, auxiliary_key = jax.random.split(key)
+        return jax.random.split(key, (self.config.batch, 2)), auxiliary_key
+
     def _sample(self, data: Any, replay: Replay, index: _BatchIndex) -> Transitions:
         """Return the batch at an index of :meth:`_draw`."""
         gamma, steps = self.config.gamma, self.config.steps
@@ -332,15 +340,14 @@ class Sac(OffPolicy[SacConfig]):
     ) -> tuple[dict[str, Array], SacParameters]:
         """Return values to log, and the gradient of :meth:`loss`, in chunks, plus that of the auxiliary loss.
 
-        ``batch`` is transitions, a key, and an :data:`AuxiliaryLoss` or None.
+        ``batch`` is transitions, two keys of each, and the key and the function of an :data:`AuxiliaryLoss` or None.
         """
-        transitions, key, auxiliary_loss = batch
-        key, auxiliary_key = jax.random.split(key)
+        transitions, keys, auxiliary_key, auxiliary_loss = batch
 
         def loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             return self.loss(trained, target, *samples)
 
-        samples = in_chunks((transitions, jax.random.split(key, (len(transitions.reward), 2))))
+        samples = in_chunks((transitions, keys))
         logs, gradient = mean_gradients(loss, trained, samples)
         logs, policy = add_auxiliary(auxiliary_loss, trained.policy, auxiliary_key, logs, gradient.policy)
         return logs, replace(gradient, policy=policy)
