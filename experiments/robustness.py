@@ -10,8 +10,8 @@ the summary in ``experiments/results``; ``page`` puts what is stored there into 
 
 The work folder is a small tmpfs in a user namespace (``unshare``, no privileges), so that it can be filled; a system
 without user namespaces skips the fault ``full``. Half of the moments are uniform in the run, half after the first file
-is written. Half of the runs of a command with ``--overwrite`` replace an output, which must stay complete where it is
-replaced in one step.
+is written. Half of the runs of a command with ``--overwrite`` replace an output, which must stay complete, except where
+it is not replaced atomically.
 
 Files are compared byte for byte except for: TensorBoard files and Orbax arrays, whose names are random (``about.json``
 has the checksum of each array, and later commands read them), and the values in ``VOLATILE``.
@@ -69,8 +69,8 @@ _VOLATILE_HTML = re.compile(
     re.DOTALL,
 )
 _IGNORED_FOLDERS = {"tensorboard", "arrays"}
-#: Size of the disk, and the most free space that may remain on a full one (bytes).
-_DISK, _REST = 512 << 20, 1 << 18
+#: Size of the disk, the most free space that may remain on a full one, and the least that tmpfs allocates (bytes).
+_DISK, _REST, _PAGE = 512 << 20, 1 << 18, 4096
 #: A stopped command, and a whole one, end within these times (s).
 _STOP_S, _RUN_S = 120.0, 900.0
 _POLL_S = 0.01
@@ -125,7 +125,7 @@ class Command:
         arguments: Its arguments.
         outputs: Files and folders that it writes.
         overwrite: Whether it has ``--overwrite``, which is passed where output exists.
-        in_one_step: Whether it replaces each output in one step: a training replaces the former run at its start.
+        not_atomic: Folders that it does not replace atomically: a training removes the former run first.
         resume: Whether ``--resume`` continues its run folder.
         workers: Whether it starts processes.
         devices: Number of CPU devices.
@@ -134,7 +134,7 @@ class Command:
     arguments: tuple[str, ...]
     outputs: tuple[str, ...]
     overwrite: bool = True
-    in_one_step: bool = True
+    not_atomic: tuple[str, ...] = ()
     resume: bool = False
     workers: bool = False
     devices: int = 1
@@ -144,53 +144,59 @@ def _command(text: str, *outputs: str, **options: Any) -> Command:
     return Command(tuple(text.split()), outputs, **options)
 
 
-#: In the order in which they need each other's output.
-COMMANDS = {
-    "demo": _command(
-        "demo --training 6 --held-out 3 --workers 2 --preset ./train.yaml --out demo",
-        "demo", in_one_step=False, workers=True,
-    ),
-    "generate": _command("generate set --scenarios 12 --workers 2 --split 50/25/25", "set", workers=True),
-    "export": _command("export set recordings --format gpudrive", "recordings"),
-    "export-set": _command("export set part --limit 4", "part"),
-    "export-tfexample": _command("export part tfexample --format tfexample --shard-size 2", "tfexample"),
-    "convert": _command(
-        "convert recordings converted --workers 2 --shard-size 3 --split 50/25/25", "converted", workers=True
-    ),
-    "view": _command("view part --out view.html", "view.html"),
-    "inspect": _command("inspect set part --html sets.html", "sets.html"),
-    "draw": _command("inspect part --observations --planner idm --draw observation.png", "observation.png"),
-    "curate": _command("curate kinematic --data set --out scores.npz --export top 4", "scores.npz", "top"),
-    "curate-ensemble": _command(
-        "curate ensemble --data set --out ensemble.npz --folds 2 --total_steps 256 --cloning.batch 16 "
-        "--cloning.network.head [4]",
-        "ensemble.npz",
-    ),
-    "train": _command("train train.yaml --data set --validation none --out run", "run", overwrite=False, resume=True),
-    "train-again": _command(
-        "train train.yaml --data part --validation none --out again", "again", in_one_step=False
-    ),
-    "train-seeds": _command(
-        "train train.yaml --data converted --validation part --seeds 2 --out seeds",
-        "seeds", overwrite=False, resume=True,
-    ),
-    "train-devices": _command(
-        "train devices.yaml --data set --validation none --out run2",
-        "run2", overwrite=False, resume=True, devices=2,
-    ),
-    "evaluate": _command("evaluate --planner run --data part --out policy", "policy"),
-    "evaluate-idm": _command("evaluate --planner idm --data part --out idm", "idm"),
-    "judge": _command("judge idm", "idm/devkit.csv"),
-    "compare": _command("compare policy idm --html comparison.html", "comparison.html"),
-    "report": _command("report idm policy run --episodes 2 --out report.html", "report.html"),
-    "video": _command("report policy --video worst:1 --out videos", "videos"),
-    "tables": _command("report idm policy --tables --out tables", "tables"),
-    "study": _command(
-        "study study.yaml --config settings.yaml --data set --validation part --test part --cores 2 --anyway "
-        "--out study",
-        "study", overwrite=False, workers=True,
-    ),
-}  # fmt: skip
+def commands(scenarios: int, part: int) -> dict[str, Command]:
+    """Return all commands that write files, on a set and a part of it, in the order in which they need each other."""
+    return {
+        "demo": _command(
+            f"demo --training {scenarios} --held-out {part} --workers 2 --preset ./train.yaml --out demo",
+            "demo", not_atomic=("demo/training",), workers=True,
+        ),
+        "generate": _command(f"generate set --scenarios {scenarios} --workers 2 --split 50/25/25", "set", workers=True),
+        "export": _command("export set recordings --format gpudrive", "recordings"),
+        "export-set": _command(f"export set part --limit {part}", "part"),
+        "export-tfexample": _command("export part tfexample --format tfexample --shard-size 2", "tfexample"),
+        "convert": _command(
+            "convert recordings converted --workers 2 --shard-size 3 --split 50/25/25", "converted", workers=True
+        ),
+        "view": _command("view part --out view.html", "view.html"),
+        "inspect": _command("inspect set part --html sets.html", "sets.html"),
+        "draw": _command("inspect part --observations --planner idm --draw observation.png", "observation.png"),
+        "curate": _command("curate kinematic --data set --out scores.npz --export top 4", "scores.npz", "top"),
+        "curate-ensemble": _command(
+            "curate ensemble --data set --out ensemble.npz --folds 2 --total_steps 256 --cloning.batch 16 "
+            "--cloning.network.head [4]",
+            "ensemble.npz",
+        ),
+        "train": _command(
+            "train train.yaml --data set --validation none --out run", "run", overwrite=False, resume=True
+        ),
+        "train-again": _command(
+            "train train.yaml --data part --validation none --out again", "again", not_atomic=("again",)
+        ),
+        "train-seeds": _command(
+            "train train.yaml --data converted --validation part --seeds 2 --out seeds",
+            "seeds", overwrite=False, resume=True,
+        ),
+        "train-devices": _command(
+            "train devices.yaml --data set --validation none --out run2",
+            "run2", overwrite=False, resume=True, devices=2,
+        ),
+        "evaluate": _command("evaluate --planner run --data part --out policy", "policy"),
+        "evaluate-idm": _command("evaluate --planner idm --data part --out idm", "idm"),
+        "judge": _command("judge idm", "idm/devkit.csv"),
+        "compare": _command("compare policy idm --html comparison.html", "comparison.html"),
+        "report": _command("report idm policy run --episodes 2 --out report.html", "report.html"),
+        "video": _command("report policy --video worst:1 --out videos", "videos"),
+        "tables": _command("report idm policy --tables --out tables", "tables"),
+        "study": _command(
+            "study study.yaml --config settings.yaml --data set --validation part --test part --cores 2 --anyway "
+            "--out study",
+            "study", overwrite=False, workers=True,
+        ),
+    }  # fmt: skip
+
+
+COMMANDS = commands(12, 4)
 
 
 @dataclass
@@ -249,11 +255,7 @@ class Bench:
         """Stop a command by a fault at a random moment, and check what it leaves."""
         command = self.commands[name]
         replaces = command.overwrite and self._exists(command) and self.rng.random() < 0.5
-        complete = (
-            replaces
-            and command.in_one_step
-            and all((self.work / output).exists() for output in command.outputs)
-        )
+        complete = replaces and all((self.work / output).exists() for output in command.outputs)
         shares = iter(_SHARES)
         process = self._run_until(name, next(shares), replaces)
         while process.poll() is not None and (share := next(shares, None)):
@@ -270,7 +272,8 @@ class Bench:
         self.counts[name, fault, "finished" if status == 0 else "stopped"] += 1
         self._check_end(name, fault, process, error)
         if complete:
-            self.problems += [f"{name}, {fault}: replaced {line}" for line in self._differences(name)]
+            lines = self._differences(name, without=command.not_atomic)
+            self.problems += [f"{name}, {fault}: replaced {line}" for line in lines]
 
     def _run_until(self, name: str, share: float, replaces: bool) -> subprocess.Popen[str]:
         """Start a command and wait until a random moment in this share of its time, after its first file or not."""
@@ -300,16 +303,18 @@ class Bench:
 
     def remove(self, command: Command) -> None:
         """Remove the outputs of a command."""
-        for output in command.outputs:
-            path = self.work / output
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        remove_outputs(command, self.work)
 
     def _exists(self, command: Command) -> bool:
         return any((self.work / output).exists() for output in command.outputs)
 
-    def _differences(self, name: str) -> list[str]:
-        """Return how the outputs of a command differ from the reference."""
-        return differences(self._own(name, self.reference), self._own(name, digests(self.work)))
+    def _differences(self, name: str, without: Sequence[str] = ()) -> list[str]:
+        """Return how the outputs of a command differ from the reference, except those in the folders ``without``."""
+        own = (self._own(name, paths) for paths in (self.reference, digests(self.work)))
+        expected, actual = (
+            {path: digest for path, digest in paths.items() if not _is_below(path, without)} for paths in own
+        )
+        return differences(expected, actual)
 
     def _own(self, name: str, paths: dict[str, str]) -> dict[str, str]:
         """Select what a command writes, without what others write into its folders."""
@@ -364,11 +369,16 @@ class Bench:
                 process.send_signal(getattr(signal, f"SIG{fault.upper()}"))
 
     def _fill(self) -> None:
-        """Leave a random rest of the disk free, as often less than 1 kB as more, so that small files do not fit."""
-        rest = int(_REST ** self.rng.random())
-        size = shutil.disk_usage(self.disk).free - rest
-        with self.ballast.open("wb") as file, contextlib.suppress(OSError):
-            os.posix_fallocate(file.fileno(), 0, max(size, 1))
+        """Leave nothing of the disk free half of the time, otherwise a random rest."""
+        rest, filled, piece = self.rng.choice((0, self.rng.randrange(_REST))), 0, _DISK
+        with self.ballast.open("wb") as file:
+            while piece >= _PAGE and (free := shutil.disk_usage(self.disk).free) >= rest + _PAGE:
+                piece = min(piece, free - rest)
+                try:
+                    os.posix_fallocate(file.fileno(), filled, piece)
+                    filled += piece
+                except OSError:  # The command wrote meanwhile: tmpfs undoes an allocation that does not fit.
+                    piece //= 2
 
     def _kill_worker(self, process: subprocess.Popen[str]) -> None:
         workers = list(_children(process.pid))
@@ -401,6 +411,13 @@ class Bench:
         paths = (path for path in _paths(self.work) if "/." in f"/{path}" or ".partial" in path)
         hidden = [f"leaves {path}" for path in sorted(paths)]
         return hidden + [f"leaves tmp/{path}" for path in sorted(_paths(self.temporary))]
+
+
+def remove_outputs(command: Command, work: Path) -> None:
+    """Remove the outputs of a command from a work folder."""
+    for output in command.outputs:
+        path = work / output
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -547,8 +564,9 @@ def table(kills: dict[str, Any], soak: dict[str, Any]) -> str:
         ]
         lines.append(f"| {words} | {' | '.join(map(str, cells))} |")
     equal = "equals" if soak["digest"] == soak["undisturbed"] else "differs from"
+    stopped = ", ".join(f"`{name}`" for name in COMMANDS if name in kills["runs"])
     return "\n".join([
-        *lines, "",
+        f"Single commands: {stopped}.", "", *lines, "",
         f"Problems: {len(kills['problems'])} in {kills['moments']} moments, {len(soak['problems'])} in the soak of "
         f"{soak['minutes']:.0f} minutes ({soak['cycles']} cycles through all commands). The digest of its last cycle "
         f"{equal} that of the undisturbed runs.",

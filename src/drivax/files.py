@@ -17,6 +17,7 @@ outputs, which the user names, are followed; links inside them, which a stranger
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import hashlib
@@ -451,8 +452,6 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
 
 def _exchange(first: Path, second: Path) -> bool:
     """Exchange the names of two folders in one step; return whether the disk can."""
-    import ctypes  # not for every command
-
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # of Linux
     if rename is None:
         return False

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import multiprocessing
 import os
-import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,9 +22,6 @@ from orbax.checkpoint._src import asyncio_utils
 
 from drivax import cli
 from drivax.errors import DataError, UsageError
-from drivax.scenario.build.assemble import assemble
-from drivax.scenario.store import ScenarioWriter
-from scenes import SMALL, car, straight_road
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,10 +174,20 @@ def test_each_command_help_has_an_example_within_100_columns(name: str, capsys, 
 def test_help_imports_nothing_heavy():
     program = (
         "import sys; from drivax.cli import main; main(['--help'])\n"
-        "print(sorted({'jax', 'numpy', 'tyro', 'rich', 'yaml'} & set(sys.modules)))"
+        "heavy = {'jax', 'numpy', 'tyro', 'rich', 'yaml', 'json', 'drivax.seal', 'drivax.files'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_export_imports_no_reader():
+    program = (
+        "import sys; import drivax.cli.export, drivax.datasets.export.writer\n"
+        "print('drivax.datasets.formats' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout == "False\n"
 
 
 def test_console_prints_text_as_it_is(capsys):
@@ -207,37 +214,28 @@ def test_low_memory_limit_is_one_line(limit, command):
     assert (result.returncode, result.stdout) == (2, "")
 
 
-GENERATE, EVALUATE = "generate OUT --scenarios 2 --workers 2", "evaluate --planner idm --data SET --out OUT"
+GENERATE = "generate OUT --scenarios 2 --workers 2"
 
 
-def run_limited(command, tmp_path, limit, *before):
-    """Run a command, where shared memory or open files are scarce; return its process, and what it left."""
-    words = command.replace("OUT", str(tmp_path / "out")).replace("SET", str(tmp_path / "set")).split()
-    script = f'{limit}; exec "$@"'
-    program = [*before, "sh", "-c", script, "sh", sys.executable, "-m", "drivax", *words]
+def run_limited(tmp_path, limit, *prefix):
+    """Generate a set after a shell command that limits the process; return status, last line, and files left behind."""
+    words = GENERATE.replace("OUT", str(tmp_path / "out")).split()
+    program = [*prefix, "sh", "-c", f'{limit}; exec "$@"', "sh", sys.executable, "-m", "drivax", *words]
     result = subprocess.run(program, capture_output=True, text=True, check=False)
-    return result, [path.name for path in tmp_path.iterdir() if path.name != "set"]
+    assert "Traceback" not in result.stderr
+    return result.returncode, result.stderr.splitlines()[-1], [path.name for path in tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize(
-    ("command", "files", "line"),
-    [
-        (
-            GENERATE,
-            14,
-            r"out: too many open files \(limit of open files: 14\); raise the limit: ulimit -n 28, or use",
-        ),
-        (EVALUATE, 100, r"set: needs 129 open files, the limit is 100; raise it: ulimit -Hn 129"),
-    ],
-)
-def test_few_open_files_are_one_line(command, files, line, tmp_path):
-    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
-        writer.add(assemble(straight_road([car(speed=8.0)]), SMALL))
-    result, left = run_limited(command, tmp_path, f"ulimit -n {files}")
-    assert re.search(line, result.stderr.splitlines()[-1]) and "Traceback" not in result.stderr
-    assert (result.returncode in (1, 2), left) == (True, [])
+def test_few_open_files_are_one_line(tmp_path):
+    """Where it fails depends on the versions of Python and libraries."""
+    status, line, left = run_limited(tmp_path, "ulimit -n 10")
+    cause = (
+        "too many open files (limit of open files: 10); raise the limit: ulimit -n 20, or use fewer --workers"
+    )
+    assert (status, left) == (1, []) and line.startswith(f"drivax: {tmp_path}/") and line.endswith(cause)
 
 
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="the system has no user namespaces")
 @pytest.mark.parametrize(
     ("mount", "error"), [("-o ro", "Read-only file system"), ("-o size=4k", "No space left on device")]
 )
@@ -245,10 +243,10 @@ def test_workers_without_shared_memory_are_one_line(mount, error, tmp_path):
     user = ("unshare", "--user", "--map-root-user", "--mount")
     shm = f"mount -t tmpfs {mount} tmpfs /dev/shm && (head -c 4096 /dev/zero > /dev/shm/full; true) 2> /dev/null"
     if subprocess.run([*user, "sh", "-c", shm], capture_output=True).returncode:
-        pytest.skip("the system has no user namespaces, or /dev/shm cannot be replaced in one")
-    result, left = run_limited(GENERATE, tmp_path, shm, *user)
+        pytest.skip("/dev/shm cannot be replaced in a user namespace")
+    status, line, left = run_limited(tmp_path, shm, *user)
     problem = f"drivax: /dev/shm: no shared memory for worker processes ({error}); mount it (docker run --shm-size 1g)"
-    assert result.stderr.splitlines()[-1].startswith(problem) and (result.returncode, left) == (2, [])
+    assert (status, left) == (2, []) and line.startswith(problem)
 
 
 @pytest.fixture(autouse=True)

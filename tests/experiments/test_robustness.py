@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import random
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -69,14 +71,35 @@ def test_litter_is_found(bench):
         bench("litter").measure()
 
 
-def test_incomplete_replacement_is_found(bench):
+@pytest.mark.parametrize("not_atomic", [(), ("out",)])
+def test_incomplete_replacement_is_found_where_it_should_be_atomic(bench, not_atomic):
     bench = bench("direct")
+    bench.commands["write"] = replace(bench.commands["write"], not_atomic=not_atomic)
     bench.measure()
     bench.rng = random.Random(1)
     for _ in range(6):
         bench.finish("write")
         bench.disturb("write", "kill")
-    assert any("replaced out/data" in problem for problem in bench.problems)
+    assert any("replaced out/data" in problem for problem in bench.problems) == (not_atomic == ())
+
+
+@pytest.mark.parametrize(("seed", "rest"), [(1, 0), (5, 133_926)])
+def test_disk_is_filled_although_the_command_writes_meanwhile(bench, monkeypatch, seed, rest):
+    """As on tmpfs: an allocation that does not fit is undone, and takes whole pages."""
+    free = [40 << 20]
+
+    def allocate(number, offset, size):
+        free[0] -= 3 * 4096 * (free[0] > 39 << 20)  # the command writes, once
+        if size > free[0]:
+            raise OSError(28, "No space left on device")
+        free[0] -= -(-size // 4096) * 4096
+
+    monkeypatch.setattr(robustness.shutil, "disk_usage", lambda path: SimpleNamespace(free=free[0]))
+    monkeypatch.setattr(robustness.os, "posix_fallocate", allocate)
+    bench = bench("none")
+    bench.rng = random.Random(seed)
+    bench._fill()
+    assert max(rest - 4 * 4096, 0) <= free[0] < rest + 4096
 
 
 def test_volatile_values_are_not_compared(tmp_path):

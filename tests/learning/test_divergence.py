@@ -116,22 +116,22 @@ def test_nan_reward_is_named_before_the_losses_that_it_spoils(name):
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.5, None), (jnp.nan, "NaN"), (-jnp.inf, "infinite")])
-def test_sampled_actions_are_logged_and_named(value, expected):
-    """One of two pendulums has another action at one of four steps."""
+def test_actions_of_a_rollout_are_logged_and_named(value, expected):
+    """One of three pendulums has another action at one of four steps; that of one whose episode is over is NaN."""
 
     def actor(observation, key):
         is_first = (observation["pendulum"] == start.observation["pendulum"]).all(axis=1)
-        action = jnp.where(is_first & jnp.array([False, True]), value, -0.25)[:, None]
+        action = jnp.where(is_first, jnp.array([-0.25, value, jnp.nan]), -0.25)[:, None]
         return action, action, {}
 
     environment, key = Pendulum(), jax.random.key(0)
-    start = environment.start((), key, 2)
+    start = replace(environment.start((), key, 3), over=jnp.array([False, False, True]))
     *_, sums = collect(environment, (), start, actor, key, 4)
     row = mean_logs({f"rollout/{name}": total for name, total in sums.items()})
     if expected is None:
-        assert nonfinite_log(row) is None and row["rollout/action"] == (7 * 0.25 + 0.5) / 8
+        assert nonfinite_log(row) is None and row["rollout/action_magnitude"] == (10 * 0.25 + 0.5) / 11
     else:
-        assert nonfinite_log(row | {"reward/swing": jnp.nan}) == f"rollout/action is {expected}"
+        assert nonfinite_log({"reward/swing": jnp.nan} | row) == f"rollout/action_magnitude is {expected}"
 
 
 def test_healthy_state_is_finite_although_environments_are_not():

@@ -135,6 +135,15 @@ def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
     )
 
 
+def test_every_update_has_keys_of_its_own(sac):
+    learner, (first, second) = sac[0], jax.random.split(jax.random.key(7))
+    keys, auxiliary_keys = jax.vmap(learner._batch_keys)(jnp.stack([first, second]))
+    for number, key in enumerate((first, second)):
+        sample_key, auxiliary_key = jax.random.split(key)
+        assert (keys[number] == jax.random.split(sample_key, (learner.config.batch, 2))).all()
+        assert auxiliary_keys[number] == auxiliary_key
+
+
 @pytest.fixture(scope="module")
 def logged():
     """Logged steps whose numbers no step of the pendulum has."""

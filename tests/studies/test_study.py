@@ -344,8 +344,9 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert f"edited after drivax wrote them:</b> {episodes}" in (out / "report.html").read_text()
     episodes.write_text(text)
     assert main([*arguments, "--anyway"]) == 0
-    capsys.readouterr()
-    # Nor does one that is restored from its stored files.
+    assert "edited files" not in capsys.readouterr().err
+    assert json.loads((out / "results.json").read_text()) == results
+    # A study that is restored from its stored files trains nothing, either.
     script = load_script("longtail")
     monkeypatch.setattr(script, "KEPT", tmp_path / "kept")
     script.keep(out)

@@ -121,7 +121,7 @@ def _check_flags(args: Inspect) -> None:
         if getattr(args, name) and not args.observations:
             flag = f"--{name.replace('_', '-')}"
             raise UsageError(f"{flag} needs --observations", cure="add --observations")
-    if args.task is not None and args.planner is not None:
+    if args.task is not None and args.planner:
         from drivax.planners.catalogue import PLANNERS
         from drivax.tracking.run_folder import is_policy
 

@@ -186,8 +186,8 @@ def collect(
     """Unroll ``steps`` steps in every environment.
 
     Returns:
-        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, absolute values of ``action``
-        with their count, and the numbers of ``episodes`` that ended and of ``steps`` that were alive.
+        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, the mean absolute action of each
+        step (``action_magnitude``) with its count, and the numbers of ``episodes`` that ended and ``steps`` alive.
     """
 
     def step(carry: tuple[Environments, Any, Array], _: None) -> tuple[Any, Any]:
@@ -196,13 +196,14 @@ def collect(
         sampled = actor(now.observation, act_key)
         after, outcome = environment.step(data, now, cache, sampled[1], step_key)
         row = transition(environment, now, sampled, outcome, keep, terms)
-        size = jnp.where(now.over, 0.0, jnp.abs(sampled[1]).mean(axis=-1))
-        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive, size)
+        magnitude = jnp.where(now.over, 0.0, jnp.abs(sampled[1]).mean(axis=-1))
+        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive, magnitude)
 
     first = (environments, environment.cache(data, environments.state), key)
-    (environments, _, _), (rollout, totals, ends, sizes) = jax.lax.scan(step, first, None, steps)
+    (environments, _, _), (rollout, totals, ends, magnitudes) = jax.lax.scan(step, first, None, steps)
     alive = rollout.alive.sum()
-    sums = {"episodes": ends.sum(), "steps": alive, "action": sizes.sum(), "action/n": alive}
+    sums = {"episodes": ends.sum(), "steps": alive}
+    sums |= {"action_magnitude": magnitudes.sum(), "action_magnitude/n": alive}
     totals |= {name: value.astype(jnp.float32) for name, value in sums.items()}
     return environments, rollout, {name: value.sum() for name, value in totals.items()}
 

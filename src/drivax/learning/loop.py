@@ -416,7 +416,7 @@ class _Training:
     def _check(
         self, iteration: int, state: LearnerState, rows: list[dict[str, float]], finite: np.ndarray
     ) -> None:
-        """Stop each seed whose rewards, losses or trained leaves are not finite; warn of large values."""
+        """Stop each seed whose actions, rewards, losses or trained leaves are not finite; warn of large values."""
         seeds, steps = self.program.seeds, self._steps(iteration)
         for number, log in enumerate(self.logs):
             if log.stopped:

@@ -21,13 +21,13 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.checks import check_at_most
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment, Environments, Rollout, Store
-from drivax.learning.program import read_columns
+from drivax.learning.program import device_count, read_columns
 from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
 
 #: Largest number of steps of a buffer; the published one has a million.
 MOST_CAPACITY = 100_000_000
-#: Steps of a row that are counted at once to draw from the buffer.
+#: Environments of a row that are counted together to draw from the buffer.
 _BLOCK = 8
 
 
@@ -161,18 +161,19 @@ class ReplayBuffer:
         """
         rows, environments = replay.reward.shape
         newest = (replay.next_row - 1) % rows
-        # Of a block of neighbours, so that a device counts its own environments: a running count of all takes longer.
-        size = math.gcd(environments, _BLOCK)
-        blocks = (replay.alive & (jnp.arange(rows) != newest)[:, None]).reshape(rows, -1, size)
-        counts = blocks.sum(axis=-1, dtype=jnp.int32).reshape(-1)
+        # Blocks of neighbouring environments of one device: a running count over all steps takes five times as long.
+        size = math.gcd(environments, environments // device_count(), _BLOCK)
+        sampleable = (replay.alive & (jnp.arange(rows) != newest)[:, None]).reshape(rows, -1, size)
+        counts = sampleable.sum(axis=-1, dtype=jnp.int32).reshape(-1)
         running = jnp.cumsum(counts)
-        # The n-th sampleable step is where the running count first exceeds n: of blocks, then within the block.
-        number = jax.random.randint(key, shape, 0, jnp.maximum(running[-1], 1))
-        block = jnp.searchsorted(running, number, side="right").astype(jnp.int32)
-        rest = number - (running - counts)[block]
-        inside = jnp.cumsum(blocks.reshape(-1, size)[block], axis=-1, dtype=jnp.int32)
-        position = block * size + jnp.argmax(inside > rest[..., None], axis=-1).astype(jnp.int32)
-        return position // environments, position % environments
+        # The n-th sampleable step is where the running count first exceeds n: over blocks, then within the block.
+        rank = jax.random.randint(key, shape, 0, jnp.maximum(running[-1], 1))
+        block = jnp.searchsorted(running, rank, side="right").astype(jnp.int32)
+        rank_in_block = rank - (running - counts)[block]
+        count_in_block = jnp.cumsum(sampleable.reshape(-1, size)[block], axis=-1, dtype=jnp.int32)
+        place = jnp.argmax(count_in_block > rank_in_block[..., None], axis=-1).astype(jnp.int32)
+        step = block * size + place
+        return step // environments, step % environments
 
     def sample(
         self, data: Any, replay: Replay, index: ReplayIndex, gamma: float, steps: int = 1

@@ -43,7 +43,7 @@ _ORDER = ("accuracy", "progress_ratio", "comfortable")
 #: rewards of +-100 per step reach at a discount of 0.99.
 _BOUNDS = {"loss/kl": 1.0, "loss/mean_q": 1e4, "loss/largest_q": 1e4}
 #: Logged values that are finite in a healthy training; causes come first.
-_PREFIXES = ("rollout/action", "reward/", "loss/")
+_PREFIXES = ("rollout/action_magnitude", "reward/", "loss/")
 
 
 @dataclass(frozen=True)

@@ -288,13 +288,14 @@ class Sac(OffPolicy[SacConfig]):
         @jax.jit  # so that the shapes of its logs do not trace it a second time
         def learn() -> tuple[Carry, dict[str, Array]]:
             def update(carry: Carry, drawn: tuple[_BatchIndex, _BatchKeys]) -> tuple[Carry, dict[str, Array]]:
-                batch = self._sample(data, state.replay, drawn[0])
-                after, logs = self.update_networks(carry, batch, *drawn[1], auxiliary_loss)
+                index, (keys, auxiliary_key) = drawn
+                batch = self._sample(data, state.replay, index)
+                after, logs = self.update_networks(carry, batch, keys, auxiliary_key, auxiliary_loss)
                 return after if settling is None else _keep_policy(settling, carry, after), logs
 
             updates = config.unroll * config.updates_per_step
             index = self._draw(data, state.replay, draw_key, updates)
-            # For all updates at once: many small calls of the generator take longer.
+            # In one call, which is faster than a call per update.
             keys = jax.vmap(self._batch_keys)(jax.random.split(update_key, updates))
             carry, logs = jax.lax.scan(update, first, (index, keys))
             return carry, _sums(logs)
@@ -336,13 +337,13 @@ class Sac(OffPolicy[SacConfig]):
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, logged)
 
     def gradient(
-        self, trained: SacParameters, target: dict[str, Any], *batch: Any
-    ) -> tuple[dict[str, Array], SacParameters]:
+        self, trained: SacParameters, target: dict[str, Any], transitions: Transitions, keys: Array,
+        auxiliary_key: Array, auxiliary_loss: AuxiliaryLoss | None,
+    ) -> tuple[dict[str, Array], SacParameters]:  # fmt: skip
         """Return values to log, and the gradient of :meth:`loss`, in chunks, plus that of the auxiliary loss.
 
-        ``batch`` is transitions, two keys of each, and the key and the function of an :data:`AuxiliaryLoss` or None.
+        ``keys`` are two per transition.
         """
-        transitions, keys, auxiliary_key, auxiliary_loss = batch
 
         def loss(trained: SacParameters, samples: Any) -> tuple[Array, dict[str, Array]]:
             return self.loss(trained, target, *samples)
