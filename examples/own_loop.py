@@ -27,7 +27,8 @@ def iteration(bank, state):
         now, cache, key = carry
         key, act_key, step_key = jax.random.split(key, 3)
         sampled = agent.sample_action(state, now.observation, act_key)
-        after, outcome = environment.step(bank, now, cache, sampled.action, step_key)
+        drawn = environment.draw(bank, step_key, algorithm.environments)
+        after, outcome = environment.step(bank, now, cache, sampled.action, drawn)
         return (after, outcome.cache, key), agent.transition(now, sampled, outcome)
 
     cache = environment.cache(bank, state.environments.state)

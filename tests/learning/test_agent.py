@@ -40,7 +40,8 @@ def own_loop(config, bank):
             now, cache, key = carry
             key, act_key, step_key = jax.random.split(key, 3)
             sampled = agent.sample_action(state, now.observation, act_key)
-            after, outcome = agent.environment.step(bank, now, cache, sampled.action, step_key)
+            drawn = agent.environment.draw(bank, step_key, config.algorithm.environments)
+            after, outcome = agent.environment.step(bank, now, cache, sampled.action, drawn)
             return (after, outcome.cache, key), agent.transition(now, sampled, outcome)
 
         cache = agent.environment.cache(bank, state.environments.state)

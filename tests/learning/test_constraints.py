@@ -59,6 +59,9 @@ class Bandit:
     def cache(self, data, state):
         return ()
 
+    def draw(self, data, key, count):
+        return key
+
     def step(self, data, now, cache, action, key):
         pay = (action[:, 0] + 1.0) / 2.0
         fails = (jax.random.uniform(key, pay.shape) < pay**2) & ~now.over

@@ -45,6 +45,9 @@ class Counting:
     def cache(self, data, state):
         return ()
 
+    def draw(self, data, key, count):
+        return key
+
     def step(self, data, now, cache, action, key):
         env, episode, step = jnp.moveaxis(now.state, -1, 0)
         moved = jnp.stack([env, episode, step + 1], axis=-1)

@@ -53,7 +53,8 @@ def experience(bank, environment):
 
         def step(now, key):
             action = swerve(key)
-            after, outcome = environment.step(bank, now, (), action, key)
+            drawn = environment.draw(bank, key, COUNT)
+            after, outcome = environment.step(bank, now, (), action, drawn)
             return after, (now, action, outcome)
 
         return jax.lax.scan(step, now, jax.random.split(jax.random.key(1), STEPS))

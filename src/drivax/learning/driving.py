@@ -139,14 +139,13 @@ class Driving:
         return jax.vmap(self.simulator.now, (None, 0))(data, state.context)
 
     def step(
-        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], drawn: Any
     ) -> tuple[Environments, Outcome]:
         """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
 
         An episode that ends while a decision is held counts no further step. Rewards of the steps are added.
         """
-        start = self._draw_starts(data, key, len(now.over))
-        return map_over_devices(self._step_all, data, (now, cache, action, start))
+        return map_over_devices(self._step_all, data, (now, cache, action, drawn))
 
     def _step_all(
         self, data: ScenarioBank, batch: tuple[Environments, Any, Float[Array, "B D"], Any]
@@ -186,7 +185,7 @@ class Driving:
         over = self._over(data, state, now.over, ends)
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
-    def _draw_starts(self, data: ScenarioBank, key: Array, count: int) -> Any:
+    def draw(self, data: ScenarioBank, key: Array, count: int) -> Any:
         """Draw where new episodes start, for ``count`` environments."""
         return self._draw(data, key, count, self.earliest_start, self.latest_start)
 

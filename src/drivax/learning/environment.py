@@ -95,10 +95,14 @@ class Environment(Protocol):
         """Return intermediate results of states that the next step reuses."""
         ...
 
+    def draw(self, data: Any, key: Array, count: int) -> Any:
+        """Return the random numbers of a step of ``count`` environments, which do not depend on their states."""
+        ...
+
     def step(
-        self, data: Any, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
+        self, data: Any, now: Environments, cache: Any, action: Float[Array, "B D"], drawn: Any
     ) -> tuple[Environments, Outcome]:
-        """Step every environment, or reset it (or wait) where its episode is over.
+        """Step every environment, or reset it (or wait) where its episode is over, with the result of :meth:`draw`.
 
         A reset takes a step of its own, so every state that the policy sees, final states included, is observed once.
         """
@@ -190,17 +194,23 @@ def collect(
         step (``action_magnitude``) with its count, and the numbers of ``episodes`` that ended and ``steps`` alive.
     """
 
-    def step(carry: tuple[Environments, Any, Array], _: None) -> tuple[Any, Any]:
-        now, cache, key = carry
-        key, act_key, step_key = jax.random.split(key, 3)
-        sampled = actor(now.observation, act_key)
-        after, outcome = environment.step(data, now, cache, sampled[1], step_key)
+    def split(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        key, *keys = jax.random.split(key, 3)
+        return key, tuple(keys)
+
+    def step(carry: tuple[Environments, Any], random: tuple[Array, Any]) -> tuple[Any, Any]:
+        now, cache = carry
+        sampled = actor(now.observation, random[0])
+        after, outcome = environment.step(data, now, cache, sampled[1], random[1])
         row = transition(environment, now, sampled, outcome, keep, terms)
         magnitude = jnp.where(now.over, 0.0, jnp.abs(sampled[1]).mean(axis=-1))
-        return (after, outcome.cache, key), (row, outcome.totals, after.over & row.alive, magnitude)
+        return (after, outcome.cache), (row, outcome.totals, after.over & row.alive, magnitude)
 
-    first = (environments, environment.cache(data, environments.state), key)
-    (environments, _, _), (rollout, totals, ends, magnitudes) = jax.lax.scan(step, first, None, steps)
+    _, (act_keys, step_keys) = jax.lax.scan(split, key, None, steps)
+    # Drawn for all steps at once: on CPUs each call of the random generator is a loop of small operations.
+    drawn = jax.vmap(lambda key: environment.draw(data, key, len(environments.over)))(step_keys)
+    first = (environments, environment.cache(data, environments.state))
+    (environments, _), (rollout, totals, ends, magnitudes) = jax.lax.scan(step, first, (act_keys, drawn))
     alive = rollout.alive.sum()
     sums = {"episodes": ends.sum(), "steps": alive}
     sums |= {"action_magnitude": magnitudes.sum(), "action_magnitude/n": alive}

@@ -105,18 +105,25 @@ class Mixture:
         pairs = zip(self.blocks, state, strict=True)
         return tuple(block.cache(data, states) for (_, block), states in pairs)
 
+    def draw(self, data: ScenarioBank, key: Array, count: int) -> list[Any]:
+        """Draw where new episodes of every block start."""
+        keys = jax.random.split(key, len(self.blocks))
+        blocks = zip(self.blocks, keys, self.sizes(count), strict=True)
+        return [block.draw(data, key, size) for (_, block), key, size in blocks]
+
     def step(
-        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
-    ) -> tuple[Environments, Outcome]:
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"],
+        drawn: list[Any],
+    ) -> tuple[Environments, Outcome]:  # fmt: skip
         """Step or reset the environments of every block; totals are those of all, which devices add in every step."""
-        keys, sizes = jax.random.split(key, len(self.blocks)), self.sizes(len(action))
+        sizes = self.sizes(len(action))
         after, outcomes = [], []
         for number, (start, end) in enumerate(pairwise(accumulate(sizes, initial=0))):
             over, observation, actions = jax.tree.map(
                 lambda leaf, start=start, end=end: leaf[start:end], (now.over, now.observation, action)
             )
             environments, block = Environments(now.state[number], over, observation), self.blocks[number][1]
-            stepped, outcome = block.step(data, environments, cache[number], actions, keys[number])
+            stepped, outcome = block.step(data, environments, cache[number], actions, drawn[number])
             after.append(stepped)
             outcomes.append(outcome)
         totals = jax.tree.map(

@@ -98,7 +98,8 @@ class SelfPlay(Driving):
         state = _flatten(reset(data, index, slots, step, keys))
         return state, ~is_driven(data, state)
 
-    def _draw_starts(self, data: ScenarioBank, key: Array, count: int) -> Any:
+    def draw(self, data: ScenarioBank, key: Array, count: int) -> Any:
+        """Draw where new episodes of groups start, for ``count`` environments."""
         return self._draw_groups(data, key, count // self.config.vehicles, self.latest_start)
 
     def _step_or_reset(
