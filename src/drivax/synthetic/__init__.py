@@ -1,7 +1,7 @@
 """The built-in traffic world: procedural roads, traffic and events.
 
-``world`` draws a scenario, of roads and drivers of one of the ``domains``; ``generate`` writes sets, and has the splits
-of the benchmark.
+``world`` draws a scenario with the roads and drivers of one of the ``domains``; ``generate`` writes scenario sets, and
+defines the splits of the benchmark.
 """
 
 import lazy_loader

@@ -36,8 +36,7 @@ from drivax.tracking.workers import worker_pool
 #: NumPy's module with the table of CPU features, and the environment variable that disables features.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
-#: Scenarios per audited batch; scenarios of the first batch and the first task, and least number in later tasks but the
-#: last one.
+#: Scenarios per audited batch; scenarios of the first batch and task, and least number in later tasks except the last.
 _BATCH, _FIRST = 64, 4
 #: Largest number of scenarios per task, and number of tasks per worker that smaller sets are divided into.
 _CHUNK, _TASKS = 16, 4
@@ -46,19 +45,19 @@ _AHEAD, _AHEAD_BATCHES = 3, 2
 _EVENT = "event"
 #: First seed of the benchmark's splits.
 RESERVED_SEED = 1_000_000_000
-#: Raised when a split changes while the world's version stays.
+#: Increased when a split changes while the world's version stays.
 BENCHMARK_VERSION = 3
 
 #: Called with (finished scenarios, all scenarios).
 Progress = Callable[[int, int], None]
-#: Returns the audit of scenarios: one dictionary each.
+#: Returns the audit findings of scenarios: one dictionary per scenario.
 Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 
 
 @contextmanager
 def portable_workers() -> Iterator[None]:
     """Context in which started worker processes compute the same bits on any x86-64 processor."""
-    # Features that the variable already disables count as missing in the table; since it is replaced, keep them.
+    # Features that the variable already disables count as missing in the table, so list them again.
     # NumPy splits the variable at commas, too. "Prescott": OpenBLAS's kernels for the oldest x86-64 processors.
     disabled = os.environ.get(_FEATURES, "").replace(",", " ").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
@@ -80,12 +79,12 @@ class Generation:
     """Options of a generation.
 
     Attributes:
-        workers: Number of worker processes. With 0 this process draws, whose NumPy depends on the processor in its last
-            bits: only workers write the same bytes on any x86-64 processor.
+        workers: Number of worker processes. With 0 this process draws the scenarios, and their last bits depend on the
+            processor: only workers write the same bytes on any x86-64 processor.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
         egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.assemble``).
-        split: Percentages of train/validation/test, as 80/10/10, for the lists in ``splits/``, by map; None: no lists.
+        split: Percentages of train/validation/test, such as 80/10/10, for lists in ``splits/``, by map; None: no lists.
         overwrite: Replace an existing scenario set.
         world: Settings of the world.
     """
@@ -167,7 +166,7 @@ class _Draw:
 
 
 class _Counts:
-    """Counts draws by family."""
+    """Counter of draws by family."""
 
     def __init__(self) -> None:
         self._kept: Counter[str] = Counter()
@@ -177,11 +176,11 @@ class _Counts:
 
     def add(self, draw: _Draw) -> None:
         self._kept[draw.family] += 1
-        for (family, cause), times in draw.rejected.items():
+        for (family, cause), count in draw.rejected.items():
             if cause in UNSUITED:
-                self._unsuited[family] += times
+                self._unsuited[family] += count
             else:
-                self._rejected[family][cause] += times
+                self._rejected[family][cause] += count
         if _EVENT in draw.scenario.tags:
             self._events[draw.family][draw.scenario.tags[_EVENT]] += 1
 
@@ -263,9 +262,9 @@ def _no_audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
 def _audit_batches(
     scenarios: Iterator[Scenario], audit: Audit | None
 ) -> Generator[tuple[Scenario, dict[str, Any]], None, None]:
-    """Audit scenarios in batches, in a thread that compiles the audit while others are drawn.
+    """Yield scenarios with their audits, computed in batches by a thread while further scenarios are drawn.
 
-    The first batch is as small as the first task of a worker, so that compilation begins early.
+    The first batch is as small as the first task of a worker, so that the audit is compiled early.
     """
     auditor = ThreadPoolExecutor(1)
     waiting: deque[tuple[list[Scenario], Future[list[dict[str, Any]]]]] = deque()
@@ -296,14 +295,14 @@ def _draw_chunk(first: int, end: int, seed: int, options: Generation) -> Iterato
 
 
 def _draw_in_worker(first: int, end: int, seed: int, options: Generation) -> list[_Draw]:
-    """:func:`_draw_chunk`; the garbage collector ignores imported objects, which saves time."""
+    """Draw a chunk in a worker; the garbage collector ignores imported objects, which saves time."""
     if not gc.get_freeze_count():
         gc.freeze()
     return list(_draw_chunk(first, end, seed, options))
 
 
 def _spans(scenarios: int, workers: int) -> list[tuple[int, int]]:
-    """First scenario of each task and of the next one; the first task is short, so that the audit begins early."""
+    """Return first and end of each task's scenarios; the first task is short, so that the audit begins early."""
     size = min(max(scenarios // (_TASKS * workers), _FIRST), _CHUNK)
     return list(pairwise([0, *range(_FIRST, scenarios, size), scenarios]))
 
@@ -364,7 +363,7 @@ def generate_benchmark(
     """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
 
     Args:
-        out: A folder.
+        out: Folder of the sets.
         options: Options with the default ``future_s``; of the world only the domain may differ from the default.
         train: Size of the training set, for tests and trials; the other sets are scaled with it, to at least 1. Smaller
             sets are prefixes of the full ones.
@@ -385,7 +384,7 @@ def generate_benchmark(
     counts, sets = sizes(train), dict[str, GeneratedSet]()
     check_set_space(out, options.sizes, sum(counts.values()))
     for name in SPLITS:
-        # Refuses an existing set.
+        # Refuse existing sets before any is generated.
         ScenarioWriter(inside(Path(out), name), options.sizes, overwrite=options.overwrite)
     for name, split in SPLITS.items():
         world = options.world

@@ -16,9 +16,9 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind, nonzero
 
-#: Speed below which noise decreases, m/s, and its share at standstill.
+#: Speed below which noise decreases, m/s, and share of the noise that remains at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
-#: Clip of errors in standard deviations: noise must not make a user overlap ego.
+#: Limit of errors in standard deviations: noise must not make a user overlap ego.
 _MAX_SIGMA = 3.0
 #: Lines of sight per batch.
 _BATCH_SIZE = 512
@@ -49,7 +49,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Errors of recorded poses and speeds of the others: standard deviations, and correlations over one step.
+    """Errors of recorded poses and speeds of all users but ego: standard deviations, and correlations over one step.
 
     Deviations hold from 2 m/s on; slower users have smaller errors. The defaults are the level of vehicle tracks in
     WOMD recordings, measured by ``experiments/world/perception_noise.py``.
@@ -59,7 +59,7 @@ class NoiseConfig:
         along_m, across_m: Position along and across the heading.
         heading_rad: Heading.
         speed_mps: Speed along the heading.
-        position_correlation, heading_correlation, speed_correlation: Correlations of an error with that 0.1 s earlier.
+        position_correlation, heading_correlation, speed_correlation: Correlations of an error with that 0.1 s before.
     """
 
     level: float = 1.0
@@ -104,7 +104,7 @@ def visible(
 ) -> _Visible:
     """Mask of users in the sensor's range whose centre or a corner is in free view; ego sees itself.
 
-    A ray from the sensor to half the height of the other's box is blocked by every box that it does not pass above.
+    A ray from the sensor to half the height of a user is blocked by every other box that it does not pass above.
 
     ``box`` holds the boxes of all users (:mod:`drivax.geometry.boxes`), ego first; ``blocks`` is a mask of those that
     occlude others.
@@ -143,7 +143,7 @@ def _occluders(box: _Boxes, blocking: _Visible, target: _Rays, step: _Rays) -> t
     is_near[0] = False
     near_rows = np.flatnonzero(is_near)
     pairs = []
-    # Batches keep the tables in the processor's cache.
+    # Batches keep the arrays in the processor's cache.
     for first in range(0, len(target), _BATCH_SIZE):
         batch = slice(first, first + _BATCH_SIZE)
         steps, targets, cos, sin = step[batch], target[batch], ray_x[batch], ray_y[batch]
@@ -177,7 +177,7 @@ def _cuts(
 
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
-    """Return the largest distance by which :func:`noisy` can move a corner of a box, m (for small turns)."""
+    """Return the largest distance by which :func:`noisy` can move a corner of a box, m (for small heading errors)."""
     maximum = _MAX_SIGMA * config.level
     turn = maximum * config.heading_rad
     along = maximum * config.along_m + turn * width_m / 2

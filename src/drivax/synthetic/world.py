@@ -1,7 +1,7 @@
 """The built-in traffic world: one recording per seed and index, whose expert neither collides nor leaves the road.
 
-Everything is drawn from ``numpy.random.default_rng`` seeded with the seed and the numbers of the scenario (of the map
-for roads) and of the attempt: a recording depends neither on the number of workers nor on other recordings.
+Every ``numpy.random.default_rng`` is seeded with the seed, the number of the scenario (for roads, of the map) and the
+number of the attempt, so a recording depends neither on the number of workers nor on other recordings.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, largest delay after the warm-up, stride.
 _EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
-#: Steps before an event from which the first plan of ego reacts to it (:func:`expert.driver.drive_ego`).
+#: Ego's first plan reacts to an event from this many steps before it on (:func:`expert.driver.drive_ego`).
 _LEAD_STEPS = 8
 #: Lights are recorded within the bounding rectangle of ego's log and this margin, m.
 _LIGHTS_M = 95.0
@@ -60,7 +60,7 @@ _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
 UNSUITED = _NO_OCCASION, _NO_THREAT = "no_occasion", "no_threat"
 #: Largest number of stagings with the same roles.
 _STAGINGS = 3
-#: Largest number of recorded users without ego: the actors of its event and those nearest to it.
+#: Largest number of recorded users other than ego: the actors of the event and the users nearest to ego.
 _RECORDED = 76
 
 
@@ -71,14 +71,14 @@ class WorldConfig:
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
-        critical_share: Share of the others in which ego must give way, if the roads allow it; the recording begins at a
-            critical step (:mod:`events.conflict_start`), if there is one.
+        critical_share: Share of the scenarios without an event in which ego must give way, if the roads allow it; the
+            recording begins at a critical step (:mod:`events.conflict_start`), if there is one.
         lane_change_share: Share of random routes with room for it on which ego plans a lane change; routes past a place
             of an event or a conflict have none.
-        signal_timing: Shares of ego's next light at the end of the warm-up: green, turning green, turning yellow.
+        signal_timing: Shares of states of ego's next light after the warm-up: green, turning green, turning yellow.
         scenarios_per_map: Number of consecutive indices whose scenarios share roads and a segment, those with an event
             excepted; new roads are drawn after 12 rejected draws.
-        noise: Perception noise of the others' tracks.
+        noise: Perception noise of the tracks of all users but ego.
         sensor: Ego's sensor.
     """
 
@@ -162,7 +162,7 @@ def generate_many(
 def _generate(
     seed: int, index: int, config: WorldConfig, domain: Domain, steps: int
 ) -> Generator[Run, Motion, GeneratedRecording]:
-    """Draw until an attempt gives a recording."""
+    """Repeat attempts until one gives a recording; raise a UsageError after ``_ATTEMPTS``."""
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     events, severity = _draw_events(config, np.random.default_rng([seed, 0, index]))
@@ -178,12 +178,12 @@ def _generate(
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
-        world = f"w{WORLD_VERSION}-{config.domain}-s{seed}"
-        length = f"-t{steps}" if steps != STEPS else ""
+        prefix = f"w{WORLD_VERSION}-{config.domain}-s{seed}"
+        suffix = f"-t{steps}" if steps != STEPS else ""
         recording = replace(
             result,
-            scenario_id=f"{world}{length}-{index:06d}-{family.name}",
-            segment=f"{world}-{'r' if event else 'm'}{map_number[0]:06d}.{map_number[1]}",
+            scenario_id=f"{prefix}{suffix}-{index:06d}-{family.name}",
+            segment=f"{prefix}-{'r' if event else 'm'}{map_number[0]:06d}.{map_number[1]}",
             tags={"family": family.name, "domain": config.domain, **result.tags},
         )
         return GeneratedRecording(recording, family.name, config.domain, dict(rejected))
@@ -195,10 +195,10 @@ def _generate(
 
 
 def _draw_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
-    """Draw the kinds of event in the order of attempts (or none), and the severity of the event."""
+    """Draw the kinds of event in the order in which to attempt them, or only ``NONE``, and the severity, m/s2."""
     kinds = [kind for kind in EventKind if kind]
-    rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
-    return ([kinds[k] for k in order] if rare else [EventKind.NONE]), draw_severity(rng)
+    is_rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
+    return ([kinds[k] for k in order] if is_rare else [EventKind.NONE]), draw_severity(rng)
 
 
 @lru_cache(maxsize=1)
@@ -248,7 +248,7 @@ def _drive_without_event(
 ) -> Generator[Run, Motion, Recording | str]:
     """Return a recording without perception noise, or the cause of its rejection.
 
-    A ``critical`` one begins at a critical step, if there is one.
+    With ``critical`` it begins at a critical step, if there is one.
     """
     motion, begin, tags = (yield Run(traffic)), _WARM_UP, {}
     step = _critical_step(traffic, motion, rng) if critical else None
@@ -263,14 +263,14 @@ def _drive_without_event(
 def _stage_event(
     draw: _Draw, traffic: Traffic, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
-    """Return a recording of the event without perception noise, or why none was staged or the last one failed."""
+    """Return a recording of the event without perception noise, or why none was staged or the last was rejected."""
     view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
         staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
             break
-        aware = staged.first_step - _LEAD_STEPS
-        motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware)
+        aware_step = staged.first_step - _LEAD_STEPS
+        motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware_step)
         if not cause and endangers_ego(view, motion, staged):
             return _to_recording(traffic.roles, motion, _WARM_UP, staged, draw.steps)
         cause = cause or _NO_THREAT
@@ -295,15 +295,15 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
 
 
 def _to_recording(
-    roles: Roles, motion: Motion, first: int, staged: StagedEvent | None, steps: int
+    roles: Roles, motion: Motion, first_step: int, staged: StagedEvent | None, steps: int
 ) -> Recording:
-    """Return the recording of ``steps`` steps from step ``first`` on, without id and segment."""
-    network, motion = roles.network, motion.from_step(first)
+    """Return the recording of ``steps`` steps from ``first_step`` on, without id and segment."""
+    network, motion = roles.network, motion.from_step(first_step)
     times = np.arange(steps) * DT_S
     events, tags = (), {}
     if staged is not None:
         tags = {"event": staged.kind.name.lower(), "severity_mps2": f"{staged.severity_mps2:.1f}"}
-        begin, last = staged.first_step - first, staged.last_step - first
+        begin, last = staged.first_step - first_step, staged.last_step - first_step
         actors = tuple(user + 1 for user in staged.actors)
         events = (Event(int(staged.kind), begin, min(last, steps - 1), actors),)
     return Recording(
@@ -315,8 +315,8 @@ def _to_recording(
         ego=0,
         tracks=_tracks(motion, () if staged is None else staged.actors),
         features=map_features(network),
-        lights=_lights(network, motion, (first - _WARM_UP) * DT_S + times),
-        # After a wide detour of ego, the lanes next to it follow at the end.
+        lights=_lights(network, motion, (first_step - _WARM_UP) * DT_S + times),
+        # After a wide detour of ego, the adjacent lanes that it occupied follow at the end.
         route_lanes=tuple(map(feature_id, dict.fromkeys(span.lane for span in motion.paths[0].spans))),
         events=events,
         tags=tags,
@@ -342,13 +342,13 @@ def _lights(network: RoadNetwork, motion: Motion, times_s: Float64[np.ndarray, "
 
 
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
-    """Return tracks of ego, an event's actors and the nearest others, with zeros where invalid."""
+    """Return tracks of ego, an event's actors and the users nearest to ego, with zeros where invalid."""
     valid = motion.valid
-    separation = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
-    nearest = np.where(valid, separation, np.inf).min(axis=1)
-    nearest[[0, *actors]] = -1.0
-    rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
-    rows = rows[np.isfinite(nearest[rows])]
+    distance_m = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
+    least_distance_m = np.where(valid, distance_m, np.inf).min(axis=1)
+    least_distance_m[[0, *actors]] = -1.0
+    rows = np.sort(np.argsort(least_distance_m, kind="stable")[: _RECORDED + 1])
+    rows = rows[np.isfinite(least_distance_m[rows])]
     valid = valid[rows]
     heading = np.where(valid, wrap(motion.heading[rows]), 0.0)
     speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[rows], 0.0)

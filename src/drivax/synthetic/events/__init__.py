@@ -1,8 +1,8 @@
 """Labelled events: unusual situations that are staged in a scenario and stored with their actors and times.
 
-A script reads the scenario without the event (``ego_view``) and proposes when an actor does what, so that an ego at
-constant speed would come close to collision; ``adversary`` computes what this requires of ego, ``choosing`` checks the
-proposals. The scripts are registered in ``choosing.SCRIPTS``.
+A script reads the scenario without the event (``ego_view``) and proposes an actor's motion, with which an ego at
+constant speed would come close to collision; ``adversary`` computes the deceleration that this requires of ego, and
+``choosing`` checks the proposals. The scripts are registered in ``choosing.SCRIPTS``.
 """
 
 import lazy_loader

@@ -23,19 +23,19 @@ CAR_M = (4.6, 1.85, 1.55)
 def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
     """Return distance and speed of a change between constant speeds from time 0 on (negative distances before)."""
     duration_s = abs(last_mps - first_mps) / rate_mps2
-    rate = math.copysign(rate_mps2, last_mps - first_mps)
-    during = np.clip(times_s, 0.0, duration_s)
-    distance = first_mps * np.minimum(times_s, 0.0) + first_mps * during + rate * during**2 / 2
+    acceleration = math.copysign(rate_mps2, last_mps - first_mps)
+    elapsed_s = np.clip(times_s, 0.0, duration_s)
+    distance = first_mps * np.minimum(times_s, 0.0) + first_mps * elapsed_s + acceleration * elapsed_s**2 / 2
     distance = distance + last_mps * np.maximum(times_s - duration_s, 0.0)
-    return distance, first_mps + rate * during
+    return distance, first_mps + acceleration * elapsed_s
 
 
 def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
     """Return the time to cover a distance from rest: constant acceleration, then constant speed."""
-    ramp = speed_mps**2 / (2 * gain_mps2)
-    if distance_m <= ramp:
+    ramp_m = speed_mps**2 / (2 * gain_mps2)
+    if distance_m <= ramp_m:
         return math.sqrt(2 * max(distance_m, 0.0) / gain_mps2)
-    return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
+    return speed_mps / gain_mps2 + (distance_m - ramp_m) / speed_mps
 
 
 def gait(
@@ -45,14 +45,14 @@ def gait(
 
     ``rates_mps2`` are acceleration and deceleration.
     """
-    gain, loss = rates_mps2
-    stopping = speed_mps**2 / (2 * loss)
-    if distance_m < stopping + speed_mps**2 / (2 * gain):
+    gain_mps2, loss_mps2 = rates_mps2
+    stopping_m = speed_mps**2 / (2 * loss_mps2)
+    if distance_m < stopping_m + speed_mps**2 / (2 * gain_mps2):
         return None
-    braking_at_s = travel_s(distance_m - stopping, speed_mps, gain)
-    travelled_m, rising_mps = speed_change(0.0, speed_mps, gain, np.minimum(times_s, braking_at_s))
-    braked_m, falling_mps = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - braking_at_s, 0.0))
-    return travelled_m + braked_m, np.where(times_s < braking_at_s, rising_mps, falling_mps)
+    brake_s = travel_s(distance_m - stopping_m, speed_mps, gain_mps2)
+    travelled_m, rising_mps = speed_change(0.0, speed_mps, gain_mps2, np.minimum(times_s, brake_s))
+    braked_m, falling_mps = speed_change(speed_mps, 0.0, loss_mps2, np.maximum(times_s - brake_s, 0.0))
+    return travelled_m + braked_m, np.where(times_s < brake_s, rising_mps, falling_mps)
 
 
 def along_track(
@@ -71,14 +71,14 @@ def scripted_motion(
 ) -> ScriptedUser:  # fmt: skip
     """Build an actor headed along its motion.
 
-    Below 0.3 m/s it keeps its last heading; before it moves, it has its first one. ``heading`` is that of an actor that
-    never moves.
+    Below 0.3 m/s the actor keeps its last heading, and before it first moves it has its first one. ``heading`` is used
+    for an actor that never moves.
     """
-    step = np.gradient(xy, DT_S, axis=0)
-    speed = np.hypot(step[:, 0], step[:, 1])
+    velocity = np.gradient(xy, DT_S, axis=0)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
     is_moving = speed > 0.3
     if is_moving.any():
-        angle = np.arctan2(step[:, 1], step[:, 0])
+        angle = np.arctan2(velocity[:, 1], velocity[:, 0])
         index = np.maximum.accumulate(np.where(is_moving, np.arange(len(xy)), -1))
         index = np.where(index < 0, int(np.argmax(is_moving)), index)
         heading = angle[index]
@@ -86,7 +86,7 @@ def scripted_motion(
 
 
 def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) -> ScriptedUser:
-    """Build an actor that drives along a curve and is valid while it is on it."""
+    """Build an actor that drives along a curve and is valid while both bumpers are on it."""
     xy, heading = curve.at(distance_m)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
     valid = (distance_m >= size_m[0] / 2) & (distance_m <= curve.arc_m[-1] - size_m[0] / 2)
@@ -96,19 +96,19 @@ def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) 
 def user_trajectory(motion: Motion, row: int) -> ScriptedUser:
     """Return the trajectory of a user of the traffic."""
     length, width, height = map(float, motion.size_m[row])
-    track = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
-    return ScriptedUser(AgentKind(int(motion.kind[row])), (length, width, height), *track)
+    trajectory = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
+    return ScriptedUser(AgentKind(int(motion.kind[row])), (length, width, height), *trajectory)
 
 
 def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> ScriptedUser:
-    """Return a vehicle of the traffic that brakes from a step to a halt on its path."""
+    """Return the trajectory of a vehicle of the traffic that brakes from a step on to a halt on its path."""
     user = user_trajectory(motion, row)
     arc = Curve(user.xy, user.heading).arc_m
     times = DT_S * (np.arange(len(arc)) - step)
-    travelled_m, slower = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
+    travelled_m, braked_mps = speed_change(float(user.speed[step]), 0.0, braking_mps2, times)
     position = np.where(times < 0, arc, np.minimum(arc[step] + travelled_m, arc))
     is_new = np.concatenate([[True], np.diff(arc) > 1e-6])
     heading = np.interp(position, arc[is_new], np.unwrap(user.heading)[is_new])
-    speed = np.where(times < 0, user.speed, np.minimum(slower, user.speed))
+    speed = np.where(times < 0, user.speed, np.minimum(braked_mps, user.speed))
     xy = curves.interpolate(position, arc[is_new], user.xy[is_new])
     return replace(user, xy=xy, heading=heading, speed=speed)

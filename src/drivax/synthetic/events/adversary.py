@@ -38,7 +38,7 @@ _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
 _SAME_LANE_M = 6.5
 #: Margins added to the length and width of a crossing vehicle, and largest distance of centres in overlap tests, m.
 _CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
-#: Time gap of the vehicle behind an actor that appears, s.
+#: Vehicles must need at least this time to reach an actor that appears, s.
 _BEHIND_S = 0.8
 
 
@@ -51,15 +51,15 @@ def required_deceleration(
     """
     if np.any(room_m <= 0.0):
         return math.inf
-    relevant = (time_s > 0) & (speed_mps * time_s > room_m)
-    room, time = room_m[relevant], time_s[relevant]
-    rolling = 2 * (speed_mps * time - room) / time**2
-    stopping = speed_mps**2 / (2 * room)
-    return float(np.max(np.where(room >= speed_mps * time / 2, rolling, stopping), initial=0.0))
+    is_relevant = (time_s > 0) & (speed_mps * time_s > room_m)
+    room, time = room_m[is_relevant], time_s[is_relevant]
+    moving_mps2 = 2 * (speed_mps * time - room) / time**2
+    stopping_mps2 = speed_mps**2 / (2 * room)
+    return float(np.max(np.where(room >= speed_mps * time / 2, moving_mps2, stopping_mps2), initial=0.0))
 
 
 def waiting_room(speed_mps: float, deceleration_mps2: float, time_s: float) -> float:
-    """Return the distance at which a place that is blocked until a time requires this deceleration."""
+    """Return the distance, m, at which a place that is blocked until a time requires this deceleration."""
     if deceleration_mps2 * time_s <= speed_mps:
         return speed_mps * time_s - deceleration_mps2 * time_s**2 / 2
     return speed_mps**2 / (2 * deceleration_mps2)
@@ -124,13 +124,13 @@ def least_ttc(
     station, left, speed = ego
     steps = np.arange(max(from_step, first_step), view.last_step + 1)
     xy, heading = view.track.pose(station + speed * DT_S * (steps - first_step), left)
-    own, other = boxes(xy, heading, view.ego_size_m[:2] - _BOX_MARGIN_M), actor_boxes(actor)[steps]
-    toward = own[:, 2:4]
-    time = time_to_overlap(own, speed * toward, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
-    time = np.where(overlap(own, other), 0.0, time)
+    ego_box, other = boxes(xy, heading, view.ego_size_m[:2] - _BOX_MARGIN_M), actor_boxes(actor)[steps]
+    direction = ego_box[:, 2:4]
+    ttc_s = time_to_overlap(ego_box, speed * direction, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
+    ttc_s = np.where(overlap(ego_box, other), 0.0, ttc_s)
     # Braking does not avoid actors from behind.
-    is_ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
-    return float(np.min(np.where(is_ahead & actor.valid[steps], time, 5.0), initial=5.0))
+    is_ahead = np.sum((other[:, :2] - xy) * direction, axis=-1) > -view.ego_size_m[0] / 2
+    return float(np.min(np.where(is_ahead & actor.valid[steps], ttc_s, 5.0), initial=5.0))
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
@@ -156,8 +156,8 @@ def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
         ego = view.track.at[first_step], 0.0, float(speed[first_step])
         return least_ttc(view, adversary, ego, first_step, step) < _PROPOSED_TTC_S
 
-    steady = abs(speed[step] - speed[current]) < _STEADY_SHARE * speed[current]
-    return close(step) and (not steady or close(current))
+    is_steady = abs(speed[step] - speed[current]) < _STEADY_SHARE * speed[current]
+    return close(step) and (not is_steady or close(current))
 
 
 def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
@@ -167,24 +167,24 @@ def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[in
     """
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
-    gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
+    is_near = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1) < _SAME_LANE_M**2
     is_parallel = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
-    is_in_lane = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _SAME_LANE_M**2) & is_parallel
+    is_in_lane = motion.valid[rows, : until + 1] & extra.valid[steps] & is_near & is_parallel
     return tuple(rows[is_in_lane.any(axis=1)].tolist())
 
 
 def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
     """Return the rows of vehicles that would collide with an actor across their path."""
     motion, last = view.motion, view.last_step
-    rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
-    moves = moves[moves <= last]
-    gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
-    headings = motion.heading[rows][:, moves]
-    is_crossing = np.abs(np.cos(headings - extra.heading[moves])) < 0.7
-    row, step = nonzero(motion.valid[rows][:, moves] & is_crossing & (gap < _NEAR_M**2))
+    rows, steps = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
+    steps = steps[steps <= last]
+    squared_gap = np.sum((motion.xy[rows][:, steps] - extra.xy[steps]) ** 2, axis=-1)
+    headings = motion.heading[rows][:, steps]
+    is_crossing = np.abs(np.cos(headings - extra.heading[steps])) < 0.7
+    row, step = nonzero(motion.valid[rows][:, steps] & is_crossing & (squared_gap < _NEAR_M**2))
     size = motion.size_m[rows[row], :2] + _CROSSING_MARGIN_M
-    other = boxes(motion.xy[rows[row], moves[step]], headings[row, step], size)
-    hit = overlap(actor_boxes(extra)[moves[step]], other)
+    other = boxes(motion.xy[rows[row], steps[step]], headings[row, step], size)
+    hit = overlap(actor_boxes(extra)[steps[step]], other)
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
@@ -213,26 +213,26 @@ def enter_when_clear(
     is_ahead = np.sum((other[user, step, :2] - box[0, step, :2]) * forward, axis=-1) > 0
     is_pedestrian = motion.kind[users][user] == AgentKind.PEDESTRIAN
     collisions = step[overlap(box[0, step], other[user, step]) & (is_ahead | is_pedestrian)]
-    appears = int(np.argmax(extra.valid))
+    entry = int(np.argmax(extra.valid))
     if len(collisions):
         # It appears half a second after its last collision.
-        appears = max(appears, int(collisions.max()) + 5)
-    if appears >= end or not extra.valid[appears]:
+        entry = max(entry, int(collisions.max()) + 5)
+    if entry >= end or not extra.valid[entry]:
         return None
-    distance = np.hypot(*(extra.xy[appears] - motion.xy[0, appears]))
-    is_visible = appears > view.first_step and distance < _APPEARANCE_M
-    is_clear = _is_clear(box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears])
+    distance = np.hypot(*(extra.xy[entry] - motion.xy[0, entry]))
+    is_visible = entry > view.first_step and distance < _APPEARANCE_M
+    is_clear = _is_clear(box[0, entry], other[:, entry], valid[:, entry], motion.speed[users, entry])
     if is_visible or not is_clear:
         return None
-    return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
+    return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= entry))
 
 
 def _is_clear(
-    box: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, "user 6"], valid: Bool[np.ndarray, " user"],
+    box: Float64[np.ndarray, " 6"], others: Float64[np.ndarray, "user 6"], valid: Bool[np.ndarray, " user"],
     speed: Float64[np.ndarray, " user"],
 ) -> bool:  # fmt: skip
-    """Whether a new box is clear of all others, each extended by its travel of the next 0.8 s."""
-    longer = other.copy()
-    longer[:, 4] += _BEHIND_S * speed
-    longer[:, :2] += _BEHIND_S / 2 * speed[:, None] * other[:, 2:4]
-    return not bool(np.any(valid & overlap(np.broadcast_to(box, other.shape), longer)))
+    """Whether a new box is clear of all others, each extended by its travel in the next 0.8 s."""
+    extended_box = others.copy()
+    extended_box[:, 4] += _BEHIND_S * speed
+    extended_box[:, :2] += _BEHIND_S / 2 * speed[:, None] * others[:, 2:4]
+    return not bool(np.any(valid & overlap(np.broadcast_to(box, others.shape), extended_box)))

@@ -89,19 +89,19 @@ def stage(
             continue
         result = _check(proposal.view or view, proposal)
         if result is not None:
-            required, staging = result
+            required_mps2, staging = result
             actor = len(view.motion.kind) if proposal.vehicle is None else proposal.vehicle
             actors = (actor, *proposal.others)
-            return StagedEvent(kind, staging, actors, proposal.first_step, proposal.last_step, required)
+            return StagedEvent(kind, staging, actors, proposal.first_step, proposal.last_step, required_mps2)
     return None
 
 
 def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     """Return the deceleration that a proposal requires of ego, and its staging, or None if it fails a check."""
     begin, adversary = proposal.first_step, proposal.adversary
-    required = severity(view, adversary, begin + NOTICED)
+    required_mps2 = severity(view, adversary, begin + NOTICED)
     low, high = SEVERITY_MPS2
-    if not low <= required <= high or abs(required - proposal.severity_mps2) > _TOLERANCE_MPS2:
+    if not low <= required_mps2 <= high or abs(required_mps2 - proposal.severity_mps2) > _TOLERANCE_MPS2:
         return None
     is_blocked = np.isfinite(first_blocked_station(view, adversary, begin))
     entry = begin + int(np.argmax(is_blocked))
@@ -109,12 +109,12 @@ def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     if not is_in_time or not comes_close(view, adversary, begin):
         return None
     staging = proposal.staging
-    crossing = (row for extra in staging.extras for row in vehicles_that_cross(view, extra))
-    removed = tuple(sorted({*staging.removed, *crossing}))
+    crossing_rows = (row for extra in staging.extras for row in vehicles_that_cross(view, extra))
+    removed = tuple(sorted({*staging.removed, *crossing_rows}))
     if not set(removed).isdisjoint(proposal.others):
         return None
-    entering = (enter_when_clear(view, extra, entry, removed) for extra in staging.extras)
-    extras = tuple(extra for extra in entering if extra is not None and extra.valid[begin])
+    entering_extras = (enter_when_clear(view, extra, entry, removed) for extra in staging.extras)
+    extras = tuple(extra for extra in entering_extras if extra is not None and extra.valid[begin])
     if len(extras) < len(staging.extras):
         return None
-    return required, replace(staging, extras=extras, removed=removed)
+    return required_mps2, replace(staging, extras=extras, removed=removed)

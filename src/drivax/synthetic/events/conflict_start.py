@@ -25,7 +25,7 @@ from drivax.synthetic.traffic.roles import Motion
 
 #: The reference driver: IDM parameters, lateral acceleration in bends and braking before them, m/s2.
 _DRIVER, _LATERAL_MPS2, _SLOWING_MPS2 = IdmParameters(), 2.5, 2.0
-#: Its lateral margin on either side, m; its distance to a stop line, m.
+#: Lateral margin of the reference driver on either side, and its distance to a stop line, m.
 _SIDE_M, _STOP_SHORT_M = 0.3, 1.0
 #: Agents further from ego's path are ignored, m.
 _NEAR_M = 12.0
@@ -43,8 +43,8 @@ class _Others:
     """Agents near ego's path at all steps.
 
     Attributes:
-        extent: Nearest and farthest point along the path, outermost points to the right and to the left of it, m.
-        speed: Speed along the path.
+        extent: Nearest and farthest position along the path, outermost offsets to its right and left, m.
+        speed: Speed along the path, m/s.
     """
 
     extent: Float64[np.ndarray, "4 user time"]
@@ -55,9 +55,9 @@ class _Others:
 def critical_steps(
     network: RoadNetwork, motion: Motion, colour: Int8[np.ndarray, "time lane"], steps: _Steps
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the reference driver collides in each of the recordings that begin at ``steps``, even numbers.
+    """Mask of the first steps (``steps``, even numbers) of recordings in which the reference driver collides.
 
-    The driver takes over from row 0 of the motion ``CURRENT_STEP`` steps later.
+    The driver takes over from row 0 of the motion ``CURRENT_STEP`` steps after the first step.
     """
     path, motion = motion.paths[0], motion.every_nth(_STRIDE)
     others, colour, size_m = _project_others(path, motion), colour[::_STRIDE], motion.size_m[0, :2]
@@ -67,13 +67,13 @@ def critical_steps(
     hit, from_behind = np.zeros(len(step), bool), np.zeros((len(others.box), len(step)), bool)
     extent = others.extent.take(step, axis=2)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
-        gap, leader = _leader(others, extent, step, position, size_m)
+        gap, leader_speed = _leader(others, extent, step, position, size_m)
         # IDM keeps its least gap to the shifted line, and so the driver's distance to the real one.
         line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2)
         line = line + _DRIVER.min_gap_m - _STOP_SHORT_M
         target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]
-        gaps, leads = np.array((gap, line)), np.array((leader, np.zeros_like(leader)))
-        a = idm_acceleration(speed, target_mps, gaps, leads, _DRIVER).min(axis=0)
+        gaps, leader_speeds = np.array((gap, line)), np.array((leader_speed, np.zeros_like(leader_speed)))
+        a = idm_acceleration(speed, target_mps, gaps, leader_speeds, _DRIVER).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         position, speed, step = position + (speed + after) / 2 * _STRIDE * DT_S, after, step + 1
         extent = others.extent.take(step, axis=2)
@@ -108,17 +108,17 @@ def _project_others(path: Path, motion: Motion) -> _Others:
 
 
 def _leader(
-    others: _Others, extent: _Extent, now: _Steps, at: _Floats, size_m: Float64[np.ndarray, " 2"]
+    others: _Others, extent: _Extent, step: _Steps, position: _Floats, size_m: Float64[np.ndarray, " 2"]
 ) -> tuple[_Floats, _Floats]:
     """Return gap (inf: none) and speed of the next agent ahead on the path, from the others' extents at these steps."""
     if not len(others.box):
-        return np.full(len(at), np.inf), np.zeros(len(at))
-    near, far, right, left = extent
+        return np.full(len(position), np.inf), np.zeros(len(position))
+    near_m, far_m, right_m, left_m = extent
     side = size_m[1] / 2 + _SIDE_M
-    is_ahead = ((near + far) / 2 > at) & (right < side) & (left > -side)
-    gap = np.where(is_ahead, near, np.inf) - at - size_m[0] / 2
-    first = gap.argmin(axis=0), np.arange(len(at))
-    return gap[first], others.speed[:, now][first]
+    is_ahead = ((near_m + far_m) / 2 > position) & (right_m < side) & (left_m > -side)
+    gap = np.where(is_ahead, near_m, np.inf) - position - size_m[0] / 2
+    first = gap.argmin(axis=0), np.arange(len(position))
+    return gap[first], others.speed[:, step][first]
 
 
 def _stop_line_m(
@@ -135,19 +135,19 @@ def _stop_line_m(
 
 
 def _hits(
-    others: _Others, extent: _Extent, now: _Steps, path: Path, at: _Floats, size_m: Float64[np.ndarray, " 2"],
-    from_behind: Bool[np.ndarray, "user start"],
+    others: _Others, extent: _Extent, step: _Steps, path: Path, position: _Floats,
+    size_m: Float64[np.ndarray, " 2"], from_behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:  # fmt: skip
     """Whether an agent overlaps ego and did not come from behind; those that did are marked in ``from_behind``."""
     half, side = size_m / 2
-    near, far, right, left = extent
-    is_close = (near < at + half) & (far > at - half) & (right < side) & (left > -side)
-    from_behind |= is_close & ((near + far) / 2 <= at - half)
+    near_m, far_m, right_m, left_m = extent
+    is_close = (near_m < position + half) & (far_m > position - half) & (right_m < side) & (left_m > -side)
+    from_behind |= is_close & ((near_m + far_m) / 2 <= position - half)
     user, start = nonzero(is_close & ~from_behind)
-    result = np.zeros(len(at), bool)
+    result = np.zeros(len(position), bool)
     if not len(user):
         return result
-    index = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
+    index = np.minimum((position[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
     ego = boxes(path.curve.xy[index], path.curve.heading[index], size_m)
-    result[start[overlap(ego, others.box[user, now[start]])]] = True
+    result[start[overlap(ego, others.box[user, step[start]])]] = True
     return result

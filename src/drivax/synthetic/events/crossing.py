@@ -30,7 +30,7 @@ _BRAKING_MPS2 = 5.0
 #: Braking before bends and acceleration after them, and lateral acceleration in them, m/s2.
 _SLOWING_MPS2, _LATERAL_MPS2 = 2.0, 3.0
 #: Largest change of heading of a straight connector, rad, and least absolute cosine of headings on the same road.
-_TURN_RAD, _ALONG = math.radians(45.0), 0.7
+_TURN_RAD, _SAME_ROAD_COS = math.radians(45.0), 0.7
 
 
 @dataclass(frozen=True)
@@ -47,27 +47,27 @@ class _ActorPath:
         lanes = view.roles.network.lanes
         before = _chain(lanes, connector, -1, _FROM_M, rng)
         after = _chain(lanes, connector, 1, _BEYOND_M, rng)
-        ahead = [lanes[i].curve for i in reversed(before)]
-        line = sum(float(curve.arc_m[-1]) for curve in ahead)
-        curve = join_curves(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
-        limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
-        return cls(curve, line, limit)
+        approach = [lanes[i].curve for i in reversed(before)]
+        line_m = sum(float(curve.arc_m[-1]) for curve in approach)
+        curve = join_curves(*approach, lanes[connector].curve, *(lanes[i].curve for i in after))
+        limit_mps = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
+        return cls(curve, line_m, limit_mps)
 
     def distances(self, fastest_mps: float, times_s: Times) -> Times:
         """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
         arc = self.curve.arc_m
-        rising = np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc)))
-        rate = np.abs(np.gradient(self.curve.heading, rising))
-        smooth = np.convolve(np.pad(rate, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
-        cap = np.minimum(fastest_mps**2, _LATERAL_MPS2 / np.maximum(smooth, 1e-6))
+        position = np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc)))
+        curvature = np.abs(np.gradient(self.curve.heading, position))
+        smooth_curvature = np.convolve(np.pad(curvature, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
+        squared_cap = np.minimum(fastest_mps**2, _LATERAL_MPS2 / np.maximum(smooth_curvature, 1e-6))
         ramp = 2 * _SLOWING_MPS2 * arc
-        down = np.minimum.accumulate((cap + ramp)[::-1])[::-1] - ramp
-        speed = np.sqrt(np.minimum.accumulate(down - ramp) + ramp)
+        braking_cap = np.minimum.accumulate((squared_cap + ramp)[::-1])[::-1] - ramp
+        speed = np.sqrt(np.minimum.accumulate(braking_cap - ramp) + ramp)
         clock = np.concatenate([[0.0], np.cumsum(np.diff(arc) * 2 / (speed[1:] + speed[:-1]))])
-        zero = float(np.interp(self.line_m - CAR_M[0] / 2, arc, clock))
-        before_m = np.minimum(times_s + zero, 0.0) * speed[0]
-        after_m = np.maximum(times_s + zero - clock[-1], 0.0) * speed[-1]
-        return np.interp(times_s + zero, clock, arc) + before_m + after_m
+        line_s = float(np.interp(self.line_m - CAR_M[0] / 2, arc, clock))
+        before_m = np.minimum(times_s + line_s, 0.0) * speed[0]
+        after_m = np.maximum(times_s + line_s - clock[-1], 0.0) * speed[-1]
+        return np.interp(times_s + line_s, clock, arc) + before_m + after_m
 
 
 def _chain(
@@ -92,7 +92,7 @@ class CrossTraffic(EventScript):
     """A vehicle crosses ego's path in a junction although ego has right of way.
 
     Attributes:
-        turning: An oncoming vehicle turns left without yielding; else a vehicle runs a red light.
+        turning: Whether an oncoming vehicle turns left without yielding; else a vehicle runs a red light.
         speed_share: Speed of the actor before the junction as a share of its limit, low and high.
         arrival_s: Time of ego's arrival at the junction, low and high.
     """
@@ -102,7 +102,7 @@ class CrossTraffic(EventScript):
     arrival_s: tuple[float, float] = (2.5, 5.5)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: stop lines of connectors that actors may cross."""
+        """See :class:`EventScript`: beginnings of connectors that an actor may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(
@@ -120,21 +120,22 @@ class CrossTraffic(EventScript):
             return None
         lane = int(rng.choice(connectors))
         path = _ActorPath.through(view, lane, rng)
-        fastest = share * path.limit_mps
+        fastest_mps = share * path.limit_mps
         # Steps from the event's first one to the entry: at constant speed, a stop would require about 5 m/s2 or more.
-        lead = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
-        schedule = self._schedule(view, lane, path, fastest, lead, severity_mps2)
+        lead = max(3, round(float(rng.uniform(0.3, fastest_mps / (2 * _BRAKING_MPS2))) / DT_S))
+        schedule = self._schedule(view, lane, path, fastest_mps, lead, severity_mps2)
         if schedule is None:
             return None
-        entry, adversary, required = schedule
+        entry, adversary, required_mps2 = schedule
         # The label ends 1 s after the entry, which may be before the actor reaches ego's path. If it blocks the path
         # 0.8 s after the entry, the label lasts until it leaves (if it does before the recording's end).
-        leaves = int(np.argmax(~np.isfinite(first_blocked_station(view, adversary, entry))[8:])) + 8 + entry
+        is_clear = ~np.isfinite(first_blocked_station(view, adversary, entry))
+        exit_step = int(np.argmax(is_clear[8:])) + 8 + entry
         # A queue at its light would block the actor: up to 0.5 s after the entry, no vehicle is in its way.
         removed = vehicles_in_lane(view, adversary, entry + 5)
-        last = min(max(leaves, entry + 10), view.last_step)
+        last = min(max(exit_step, entry + 10), view.last_step)
         staging = Staging(extras=(adversary,), removed=removed)
-        return Proposal(staging, required, adversary, entry - lead, last)
+        return Proposal(staging, required_mps2, adversary, entry - lead, last)
 
     def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
         """Connectors that cross a straight one and have to wait for its traffic; none for a bent one."""
@@ -148,50 +149,50 @@ class CrossTraffic(EventScript):
         """Whether another lane is the connector of an actor that crosses ego's connector ``lane`` (``index``)."""
         if not other.predecessors or not other.connector:
             return False
-        along = math.cos(float(other.curve.heading[0] - lane.curve.heading[0]))
+        alignment = math.cos(float(other.curve.heading[0] - lane.curve.heading[0]))
         if self.turning:
             left = not _is_straight(other) and float(other.curve.heading[-1]) > float(other.curve.heading[0])
-            return left and along < -_ALONG and index in other.yields_to
-        signalised = other.control == lane.control == Control.SIGNAL
-        return signalised and _is_straight(other) and abs(along) < _ALONG
+            return left and alignment < -_SAME_ROAD_COS and index in other.yields_to
+        is_signalised = other.control == lane.control == Control.SIGNAL
+        return is_signalised and _is_straight(other) and abs(alignment) < _SAME_ROAD_COS
 
     def _schedule(
-        self, view: EgoView, lane: int, path: _ActorPath, fastest: float, lead: int, requested: float
+        self, view: EgoView, lane: int, path: _ActorPath, fastest_mps: float, lead: int, severity_mps2: float
     ) -> tuple[int, ScriptedUser, float] | None:
-        """Find the entry step of the actor for about this deceleration; also return its motion and severity.
+        """Return the step at which the actor enters for about this severity, its motion, and the severity, or None.
 
-        ``fastest`` is its highest speed, m/s, and ``lead`` the number of steps from the event to the entry.
+        ``fastest_mps`` is its highest speed, and ``lead`` the number of steps from the event to the entry.
         """
         first = view.first_step + EARLIEST + lead
         # The conflict follows the entry: no entry in the last 1.5 s.
         last = min(view.first_step + LATEST + lead, view.last_step - 15)
 
         def actor(entry: int) -> ScriptedUser:
-            distance = path.distances(fastest, DT_S * (np.arange(view.steps) - entry))
+            distance = path.distances(fastest_mps, DT_S * (np.arange(view.steps) - entry))
             return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 
         if first > last:
             return None
         # Blocked stations of other entry steps are those of the first one, shifted in time.
-        blocked = first_blocked_station(view, actor(first), first - lead)
-        required = np.zeros(last + 1)
+        blocked_m = first_blocked_station(view, actor(first), first - lead)
+        required_mps2 = np.zeros(last + 1)
         for entry in range(first, last + 1):
             begin = entry - lead + NOTICED
-            speed = float(view.motion.speed[0, begin])
-            if speed > SLOWEST_MPS:
-                room = blocked[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
-                required[entry] = required_on_samples(speed, room)
+            speed_mps = float(view.motion.speed[0, begin])
+            if speed_mps > SLOWEST_MPS:
+                room_m = blocked_m[NOTICED:][: view.last_step + 1 - begin] - view.track.at[begin]
+                required_mps2[entry] = required_on_samples(speed_mps, room_m)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
-        blocked_at = np.arange(last + 1) - lead + int(np.argmax(np.isfinite(blocked)))
+        blocked_at = np.arange(last + 1) - lead + int(np.argmax(np.isfinite(blocked_m)))
         is_in_time = blocked_at < view.first_step + FULL_SWING
-        candidates = np.flatnonzero((required > low) & (required < high) & is_in_time)
-        order = np.argsort(np.abs(required[candidates] - requested), kind="stable")
+        candidates = np.flatnonzero((required_mps2 > low) & (required_mps2 < high) & is_in_time)
+        order = np.argsort(np.abs(required_mps2[candidates] - severity_mps2), kind="stable")
         for entry in candidates[order[:6]].tolist():
             # Ego at constant speed may pass before the actor arrives.
             adversary = actor(entry)
             if comes_close(view, adversary, entry - lead) and self._fits_lights(view, lane, entry):
-                return entry, adversary, float(required[entry])
+                return entry, adversary, float(required_mps2[entry])
         return None
 
     def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:

@@ -14,7 +14,7 @@ from drivax.synthetic.traffic.paths import next_lanes
 from drivax.synthetic.traffic.placement import Placement
 
 #: Free speed of ego as a share of the limit.
-_PACE = 0.88
+_FREE_SPEED_SHARE = 0.88
 #: Requested road behind ego at the beginning of the recording: seconds at its free speed plus metres.
 _BEFORE_S, _BEHIND_M = 6.0, 15.0
 #: Earliest time at which ego's light turns green, and earliest time at which this green ends, s.
@@ -49,8 +49,8 @@ class Destination:
 class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
-    Its first lanes lie behind ego's start (its place after the warm-up), if there are any there; the destination is on
-    lane ``lanes[place]``.
+    The first lanes lie behind ego's start (its position after the warm-up), if the map has any there; the destination
+    is on ``lanes[place]``.
     """
 
     start: Start
@@ -93,28 +93,28 @@ def route_past(
     """
     time, position = float(rng.uniform(*destination.when_s)), float(rng.uniform(*destination.along_m))
     lane, lanes = destination.lane, [destination.lane]
-    while position < time * _pace(network, lane):
-        time -= position / _pace(network, lane)
-        before = _feeding_lanes(network, lanes)
-        if not before or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
+    while position < time * _free_mps(network, lane):
+        time -= position / _free_mps(network, lane)
+        feeders = _feeders(network, lanes)
+        if not feeders or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
             return None
-        lane = int(rng.choice(before))
+        lane = int(rng.choice(feeders))
         lanes.insert(0, lane)
         position = network.lanes[lane].length_m
     current = network.lanes[lane]
     if current.connector:
         return None
-    position = min(position - time * _pace(network, lane), current.length_m - _FROM_END_M)
+    position = min(position - time * _free_mps(network, lane), current.length_m - _FROM_END_M)
     start, room = Start(lane, position, position), position
-    while room < _BEFORE_S * _pace(network, lane) + _BEHIND_M and (before := _feeding_lanes(network, lanes)):
-        lanes.insert(0, int(rng.choice(before)))
+    while room < _BEFORE_S * _free_mps(network, lane) + _BEHIND_M and (feeders := _feeders(network, lanes)):
+        lanes.insert(0, int(rng.choice(feeders)))
         room += network.lanes[lanes[0]].length_m
     index = len(lanes) - 1
     while network.lanes[lanes[-1]].successors:
-        following = next_lanes(network, lanes)
-        if not following:
+        options = next_lanes(network, lanes)
+        if not options:
             return None
-        lanes.append(int(rng.choice(following)))
+        lanes.append(int(rng.choice(options)))
     return DestinationRoute(start, tuple(lanes), index, destination.alone, destination.followed)
 
 
@@ -128,12 +128,12 @@ def rearrange(
     places = list(zip(others.lane, others.along_m, strict=True))
     if route.alone:
         first = route.lanes.index(ego[0])
-        ahead = route.lanes[first + 1 : route.place + 2]
-        places = [p for p in places if p[0] not in ahead and not (p[0] == ego[0] and p[1] > ego[1])]
+        lanes_ahead = route.lanes[first + 1 : route.place + 2]
+        places = [p for p in places if p[0] not in lanes_ahead and not (p[0] == ego[0] and p[1] > ego[1])]
     if route.followed:
         follower = (ego[0], ego[1] - float(rng.uniform(*_FOLLOWS_M)))
-        near = [p for p in places if p[0] == ego[0] and follower[1] - _APART_M < p[1] < ego[1]]
-        places += [follower] if follower[1] > _FROM_BEGIN_M and not near else []
+        close_places = [p for p in places if p[0] == ego[0] and follower[1] - _APART_M < p[1] < ego[1]]
+        places += [follower] if follower[1] > _FROM_BEGIN_M and not close_places else []
     return Placement(tuple(lane for lane, _ in places), tuple(along for _, along in places))
 
 
@@ -144,11 +144,11 @@ def green_on_arrival(plan: SignalPlan, lane: int) -> SignalPlan:
     return replace(plan, offset_s=green_at - plan.starts_s[phase])
 
 
-def _pace(network: RoadNetwork, lane: int) -> float:
-    return _PACE * network.lanes[lane].limit_mps
+def _free_mps(network: RoadNetwork, lane: int) -> float:
+    return _FREE_SPEED_SHARE * network.lanes[lane].limit_mps
 
 
-def _feeding_lanes(network: RoadNetwork, lanes: list[int]) -> list[int]:
+def _feeders(network: RoadNetwork, lanes: list[int]) -> list[int]:
     """Predecessors of the first lane that are for cars and not part of the route."""
     before = network.lanes[lanes[0]].predecessors
     return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

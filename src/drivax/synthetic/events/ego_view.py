@@ -15,7 +15,7 @@ from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate
 from drivax.synthetic.traffic.roles import Motion, Roles
 
-#: Steps after the recording's first: earliest and latest start of an event; its actor blocks the path before the third.
+#: Earliest and latest start of an event, and step before which its actor blocks ego's path, from the recording's first.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
 #: Steps from an event's first one until the actor's behaviour is visible, and the time, s.
 NOTICED = 4
@@ -74,8 +74,8 @@ def ego_track(motion: Motion) -> Track:
     """Return the track of row 0: its trace, the rest of its path, and a straight continuation."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
     arc = Curve(xy, heading).arc_m
+    # Skip steps of at most 1 mm: rounding must not move an ego at rest.
     distinct = np.concatenate([[True], np.diff(arc) > 1e-3])
-    # Rounding must not move an ego at rest.
     points, headings, along = xy[distinct], heading[distinct], arc[distinct]
     if motion.paths:
         curve = motion.paths[0].curve
@@ -144,19 +144,19 @@ class EgoView:
         )
 
     def lane_at(self, station: float) -> int:
-        """Lane of ego at a station (-1: none), the route's where several coincide."""
+        """Lane of ego at a station (-1: none); where several coincide, the route's."""
         xy, heading = self.track.place(station)
         points, headings, lane = self._lane_points
         dx, dy = (points - xy).T
-        near = np.flatnonzero(dx * dx + dy * dy < 4.1)
-        gap = np.hypot(dx[near], dy[near])
-        is_near = (gap < 2.0) & (np.cos(headings[near] - heading) > 0.8)
+        rows = np.flatnonzero(dx * dx + dy * dy < 4.1)
+        distance_m = np.hypot(dx[rows], dy[rows])
+        is_near = (distance_m < 2.0) & (np.cos(headings[rows] - heading) > 0.8)
         if not is_near.any():
             return -1
-        lane = lane[near]
+        lane = lane[rows]
         is_on_route = is_near & np.isin(lane, self.roles.route)
         is_candidate = is_on_route if is_on_route.any() else is_near
-        return int(lane[is_candidate][np.argmin(gap[is_candidate])])
+        return int(lane[is_candidate][np.argmin(distance_m[is_candidate])])
 
     def neighbour(self, station: float, side: int) -> int:
         """Return the neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
@@ -190,10 +190,10 @@ class EgoView:
             b = np.roll(a, -1, axis=0)
             # Intersections of the edge's sides with the ray, in the frame (outward, along).
             ay, by = a @ [-outward[1], outward[0]], b @ [-outward[1], outward[0]]
-            across = (ay > 0) != (by > 0)
-            if across.any():
-                ax, bx = (a @ outward)[across], (b @ outward)[across]
-                position = ax + (bx - ax) * ay[across] / (ay[across] - by[across])
+            is_crossed = (ay > 0) != (by > 0)
+            if is_crossed.any():
+                ax, bx = (a @ outward)[is_crossed], (b @ outward)[is_crossed]
+                position = ax + (bx - ax) * ay[is_crossed] / (ay[is_crossed] - by[is_crossed])
                 best = min(best, float(np.min(position[position > 0.0], initial=math.inf)))
         return best
 
@@ -232,15 +232,15 @@ class EgoView:
     def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """Return the scenario with ego slowed by IDM behind a leader with its rear bumper at ``rear_m`` from a step on.
 
-        The leader itself is not in it.
+        The scenario does not contain the leader.
         """
-        law, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
+        idm, at, speed = self.roles.drivers.idm(slice(1)), self.track.at, self.motion.speed[0]
         leader_speed, fastest = np.gradient(rear_m, DT_S), np.maximum(speed.max(keepdims=True), 1.0)
         stations, speeds = at.copy(), speed.copy()
         for t in range(since, self.steps - 1):
             v = speeds[t : t + 1]
             gap = rear_m[t : t + 1] - stations[t] - self.ego_size_m[0] / 2
-            a = idm_acceleration(v, fastest, gap, leader_speed[t : t + 1], law)
+            a = idm_acceleration(v, fastest, gap, leader_speed[t : t + 1], idm)
             after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
             distance = (float(v[0]) + after) / 2 * DT_S
             # Ego never overtakes its motion without the leader, since bends, lights and other agents still hold it.
@@ -250,8 +250,8 @@ class EgoView:
             speeds[t + 1] = after
         xy, heading = self.track.pose(stations)
         ego = {"xy": xy, "heading": heading, "speed": speeds}
-        rows = {k: np.concatenate([own[None], getattr(self.motion, k)[1:]]) for k, own in ego.items()}
-        result = replace(self, motion=replace(self.motion, **rows))
-        # Only ego's stations change.
+        arrays = {k: np.concatenate([values[None], getattr(self.motion, k)[1:]]) for k, values in ego.items()}
+        result = replace(self, motion=replace(self.motion, **arrays))
+        # The track stays the same: only ego's stations on it change.
         result.__dict__["track"] = replace(self.track, at=stations)
         return result

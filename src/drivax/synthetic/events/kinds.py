@@ -1,4 +1,4 @@
-"""Records of events: kinds, staged events, proposals and the base class of scripts."""
+"""Data types of events: kinds, staged events, proposals and the base class of scripts."""
 
 from __future__ import annotations
 
@@ -59,11 +59,12 @@ class StagedEvent:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An event of about this severity as a script proposes it, before the checks.
+    """An event as a script proposes it, before the checks.
 
     Attributes:
+        severity_mps2: Intended severity, which the checks compare with the required deceleration.
         adversary: Undisturbed motion of the actor at all steps.
-        vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
+        vehicle: Row of the actor if it is a vehicle of the traffic; None if it is the first of the extras.
         others: Rows of further actors.
         view: The scenario in which ego reacts to the actor before the event; None where it does not.
     """

@@ -21,7 +21,7 @@ from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 _LEAST_MPS = 10.0
 #: Speed above which an existing leader may brake, m/s.
 _LEADER_MPS = 3.0
-#: Hard braking, up to locked wheels, m/s2.
+#: Range of hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
 #: Acceleration of a new leader that drives on, m/s2.
 _RESUMING_MPS2 = 1.5
@@ -41,9 +41,9 @@ def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, brakin
     Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
     the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
     """
-    required = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
-    if speed_mps / required >= leader_mps / braking_mps2:
-        return required
+    required_mps2 = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
+    if speed_mps / required_mps2 >= leader_mps / braking_mps2:
+        return required_mps2
     return braking_mps2 + max(speed_mps - leader_mps, 0.0) ** 2 / (2 * gap_m)
 
 
@@ -52,16 +52,16 @@ def draw_braking(
 ) -> tuple[float, float] | None:
     """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
 
-    The deceleration is that of a leader which stops first; one that is close and slow requires more than the severity.
+    The deceleration follows from the formula for a leader that stops before ego; a close and slow one requires more.
     Return None if that range hardly overlaps ``SEVERITY_MPS2``, or the leader would have to stop at once.
     """
     low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
         return None
-    required = float(rng.uniform(low, high))
-    room = speed_mps**2 / (2 * required) - gap_m
-    return (leader_mps**2 / (2 * room), required) if room > 0 else None
+    severity_mps2 = float(rng.uniform(low, high))
+    room_m = speed_mps**2 / (2 * severity_mps2) - gap_m
+    return (leader_mps**2 / (2 * room_m), severity_mps2) if room_m > 0 else None
 
 
 def cut_in_gap(
@@ -104,18 +104,18 @@ class LeadBrakes(EventScript):
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
             return None
-        motion, (own, speed) = view.motion, view.at_step(step)
-        station, on_path = view.on_path(step)
+        motion, (ego_station, speed) = view.motion, view.at_step(step)
+        station, is_on_path = view.on_path(step)
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
         if self.tailgater:
-            distance_m = np.where(on_path & (station < own), own - station, np.inf)
+            distance_m = np.where(is_on_path & (station < ego_station), ego_station - station, np.inf)
             follower = int(np.argmin(distance_m))
             if not distance_m[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
                 return None
             followers, tailgates = (follower,), (Tailgate(follower, tailgating),)
-        length = motion.size_m[: motion.vehicles, 0]
-        gap = np.where(on_path & (station > own), station - own - (length + length[0]) / 2, np.inf)
+        half_lengths_m = (motion.size_m[: motion.vehicles, 0] + motion.size_m[0, 0]) / 2
+        gap = np.where(is_on_path & (station > ego_station), station - ego_station - half_lengths_m, np.inf)
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
             return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
@@ -123,14 +123,14 @@ class LeadBrakes(EventScript):
         draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > _LEADER_MPS else None
         if draft is None:
             return None
-        braking, requested = draft
-        last = step + _stop_steps(speed, requested)
+        braking_mps2, severity_mps2 = draft
+        last = step + _stop_steps(speed, severity_mps2)
         if last > view.last_step:
             return None
-        staging = Staging(overrides=(Override(leader, step, last, -braking),), tailgates=tailgates)
-        adversary = brake_to_halt(motion, leader, step, braking)
-        required = severity(view, adversary, step + NOTICED)
-        return Proposal(staging, required, adversary, step, last, leader, followers)
+        staging = Staging(overrides=(Override(leader, step, last, -braking_mps2),), tailgates=tailgates)
+        adversary = brake_to_halt(motion, leader, step, braking_mps2)
+        required_mps2 = severity(view, adversary, step + NOTICED)
+        return Proposal(staging, required_mps2, adversary, step, last, leader, followers)
 
 
 @dataclass(frozen=True)
@@ -168,14 +168,14 @@ def _propose_leader(
         after the recording.
     """
     track, ego_mps = view.track, float(view.motion.speed[0, step])
-    lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
-    cruising = track.at + headway_s * ego_mps + lengths
+    half_lengths_m = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
+    cruising = track.at + headway_s * ego_mps + half_lengths_m
     if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
     first_valid = view.first_step - _BEFORE
-    behind = view.behind(cruising - CAR_M[0] / 2, first_valid)
-    speed = float(behind.motion.speed[0, step])
-    gap = float(cruising[step] - behind.track.at[step]) - lengths
+    following_view = view.behind(cruising - CAR_M[0] / 2, first_valid)
+    speed = float(following_view.motion.speed[0, step])
+    gap = float(cruising[step] - following_view.track.at[step]) - half_lengths_m
     draft = draw_braking(speed, gap, ego_mps, rng)
     if draft is None:
         return None
@@ -189,8 +189,8 @@ def _propose_leader(
     valid, left = np.arange(view.steps) >= first_valid, np.zeros(view.steps)
     adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid)
     staging = replace(departure or Staging(), extras=(adversary,))
-    required = severity(behind, adversary, step + NOTICED)
-    return Proposal(staging, required, adversary, step, last, None, others, behind)
+    required_mps2 = severity(following_view, adversary, step + NOTICED)
+    return Proposal(staging, required_mps2, adversary, step, last, None, others, following_view)
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class CutIn(EventScript):
     """A slower vehicle in the adjacent lane changes into ego's lane right in front of it and brakes.
 
     Attributes:
-        late_merge: Only where the actor's lane ends or leads off the road, shortly before its end.
+        late_merge: Whether the actor's lane must end or lead off the road shortly after the lane change.
         speed_share, slower_share: Speed of the actor before and afterwards as a share of ego's, low and high.
         braking_mps2, lasts_s: Deceleration of the actor and duration of the lane change, low and high.
         before_end_m: Largest distance from the end of a late merge to the end of the lane.
@@ -233,39 +233,39 @@ class CutIn(EventScript):
         if self.late_merge:
             step, side = self._draw_lane_end(view, rng)
         shares = rng.uniform(*self.speed_share), rng.uniform(*self.slower_share)
-        braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
+        braking, lasts_s = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
         if step is None:
             return None
-        own, speed = view.at_step(step)
-        before, after = (float(share) * speed for share in shares)
-        after = min(after, before)
-        slowed = max(after, before - braking * NOTICED_S)
-        gap = cut_in_gap(speed, slowed, after, braking, severity_mps2)
-        if gap is None:
+        ego_station, speed = view.at_step(step)
+        before_mps, after_mps = (float(share) * speed for share in shares)
+        after_mps = min(after_mps, before_mps)
+        slowed_mps = max(after_mps, before_mps - braking * NOTICED_S)
+        gap_m = cut_in_gap(speed, slowed_mps, after_mps, braking, severity_mps2)
+        if gap_m is None:
             return None
-        # Ego approaches until it notices.
-        gap += NOTICED_S * (speed - (before + slowed) / 2)
-        if not 0.5 <= gap <= 40.0:
+        # Add the distance by which ego approaches until it notices the actor.
+        gap_m += NOTICED_S * (speed - (before_mps + slowed_mps) / 2)
+        if not 0.5 <= gap_m <= 40.0:
             return None
-        start = own + gap + (view.ego_size_m[0] + CAR_M[0]) / 2
+        start = ego_station + gap_m + (view.ego_size_m[0] + CAR_M[0]) / 2
         times = DT_S * (np.arange(view.steps) - step)
-        travelled_m, _ = speed_change(before, after, braking, times)
+        travelled_m, _ = speed_change(before_mps, after_mps, braking, times)
         station = start + travelled_m
-        finish = float(np.interp(lasts, times, station))
+        finish = float(np.interp(lasts_s, times, station))
         adjacent = self._adjacent_lane(view, station, start, finish, side)
         if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
             return None
         lateral, valid = adjacent
-        left = side * lateral * (1.0 - smooth_step(times / lasts))
+        left = side * lateral * (1.0 - smooth_step(times / lasts_s))
         adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid)
         if not adversary.valid[view.first_step : step + 1].all():
             return None
         # The event ends when the actor has its new speed in the new lane.
-        last = min(step + round(max(lasts, (before - after) / braking) / DT_S), view.last_step)
+        last = min(step + round(max(lasts_s, (before_mps - after_mps) / braking) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, max(last, step + 1))
 
     def _draw_lane_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
-        """Draw a step at which ego is shortly before the end of an adjacent lane, and the side of that lane."""
+        """Draw a step (None: none) at which ego is shortly before the end of an adjacent lane, and that lane's side."""
         ends = view.lane_ends
         if not ends:
             return None, 1
@@ -281,7 +281,7 @@ class CutIn(EventScript):
     def _adjacent_lane(
         self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Return the offset of the actor's lane, and a mask of the steps with a lane there; None without one."""
+        """Return the actor lane's distance from ego's path, m, and a mask of the steps with a lane there, or None."""
         lanes, lane, reach = view.roles.network.lanes, -1, finish
         low = max(0.0, float(station.min()))
         for candidate in np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0).tolist():

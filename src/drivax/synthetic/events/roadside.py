@@ -38,19 +38,19 @@ def _is_open_street(view: EgoView, station: float) -> bool:
 
 
 def _blocked_station(view: EgoView, step: int, severity_mps2: float, length_m: float) -> tuple[float, float]:
-    """Return the station of a lasting obstacle that requires a deceleration, and ego's time to it at its speed, s."""
-    own, speed = view.at_step(step)
+    """Return the station of a lasting obstacle with this severity, m, and ego's time to it at constant speed, s."""
+    ego_station, speed = view.at_step(step)
     room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-    return own + room + (view.ego_size_m[0] + length_m) / 2, room / speed
+    return ego_station + room + (view.ego_size_m[0] + length_m) / 2, room / speed
 
 
 def _entry(
     view: EgoView, step: int, distance_m: float, pace_mps: float, rates_mps2: tuple[float, float]
 ) -> tuple[Times, Times] | None:
-    """Return :func:`gait` of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
-    gain, loss = rates_mps2
+    """Return the :func:`gait` of an obstacle that moves into ego's lane; it brakes harder on a short distance."""
+    gain_mps2, loss_mps2 = rates_mps2
     times = DT_S * (np.arange(view.steps) - step)
-    return gait(distance_m, pace_mps, (gain, max(loss, pace_mps**2 / distance_m)), times)
+    return gait(distance_m, pace_mps, (gain_mps2, max(loss_mps2, pace_mps**2 / distance_m)), times)
 
 
 def _crossing_actor(
@@ -75,87 +75,87 @@ class Jaywalker(_StreetScript):
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        pace = float(rng.uniform(*self.speed_mps))
+        pace_mps = float(rng.uniform(*self.speed_mps))
         draw_origin = self._start_behind_parked if self.hidden else self._start_at_kerb
-        origin = draw_origin(view, severity_mps2, pace, rng)
+        origin = draw_origin(view, severity_mps2, pace_mps, rng)
         if origin is None:
             return None
-        step, station, offset = origin
+        step, station, offset_m = origin
         if not _is_open_street(view, station):
             return None
         # The walk ends 0.6 m beyond the road's or median's edge on the other side, at most 14.6 m from ego's path.
-        side = -int(math.copysign(1, offset))
-        walk_m = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
+        side = -int(math.copysign(1, offset_m))
+        walk_m = abs(offset_m) + min(view.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(view.steps) - step)
-        profile = gait(walk_m, pace, (_START_MPS2, 2.0), times)
+        profile = gait(walk_m, pace_mps, (_START_MPS2, 2.0), times)
         if profile is None:
             return None
         adversary = _crossing_actor(
-            view, station, offset + side * profile[0], AgentKind.PEDESTRIAN, _PEDESTRIAN_M
+            view, station, offset_m + side * profile[0], AgentKind.PEDESTRIAN, _PEDESTRIAN_M
         )
-        last = min(step + round(travel_s(walk_m, pace, _START_MPS2) / DT_S), view.last_step)
+        last = min(step + round(travel_s(walk_m, pace_mps, _START_MPS2) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
     def _required_room(
-        self, view: EgoView, offset: float, speed: float, pace: float, requested: float
+        self, view: EgoView, offset_m: float, speed_mps: float, pace_mps: float, severity_mps2: float
     ) -> float | None:
-        """Return the distance from ego's front to the pedestrian's line at the first step.
+        """Return the distance from ego's front to the pedestrian's line at the first step, m.
 
         None if ego, at its speed, is past the line or less than 0.5 m before it when the pedestrian enters its path.
         """
         half = (view.ego_size_m[1] + _PEDESTRIAN_M[0]) / 2
-        enters = travel_s(abs(offset) - half, pace, _START_MPS2)
-        leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
-        room = speed * NOTICED_S + waiting_room(speed, requested, leaves - NOTICED_S)
-        return room if room > speed * enters + 0.5 else None
+        enter_s = travel_s(abs(offset_m) - half, pace_mps, _START_MPS2)
+        leave_s = travel_s(abs(offset_m) + half, pace_mps, _START_MPS2)
+        room_m = speed_mps * NOTICED_S + waiting_room(speed_mps, severity_mps2, leave_s - NOTICED_S)
+        return room_m if room_m > speed_mps * enter_s + 0.5 else None
 
     def _start_at_kerb(
-        self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
+        self, view: EgoView, severity_mps2: float, pace_mps: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
-        """Draw a step and find station and lateral offset of a pedestrian at the kerb."""
+        """Draw step, station (m) and lateral offset (m) of a pedestrian at the kerb, or None if this draw fails."""
         step = view.draw_step(rng)
         side = -1 if rng.random() < 0.7 else 1
         margin_m = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        own, speed = view.at_step(step)
-        front = own + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
-        station, offset = front + speed, 0.0
+        ego_station, speed_mps = view.at_step(step)
+        front = ego_station + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
+        station, offset_m = front + speed_mps, 0.0
         # Station and distance of the kerb depend on each other, so iterate twice.
         for _ in range(2):
-            offset = view.edge_m(station, side) + margin_m
-            if not offset < 10.0:
+            offset_m = view.edge_m(station, side) + margin_m
+            if not offset_m < 10.0:
                 return None
-            room = self._required_room(view, offset, speed, pace, requested)
-            if room is None:
+            room_m = self._required_room(view, offset_m, speed_mps, pace_mps, severity_mps2)
+            if room_m is None:
                 return None
-            station = front + room
-        return step, station, side * offset
+            station = front + room_m
+        return step, station, side * offset_m
 
     def _start_behind_parked(
-        self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
+        self, view: EgoView, severity_mps2: float, pace_mps: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
-        """Find a step, station and lateral offset of a pedestrian behind a parked car."""
+        """Draw step, station (m) and lateral offset (m) of a pedestrian behind a parked car, or None if none suits."""
         if not view.roles.parked:
             return None
-        station, left = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
+        station, left_m = view.track.project(np.array([car.xy[0] for car in view.roles.parked]))
         steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
         speed = view.motion.speed[0, steps]
         # Cars next to the path, from 6 m ahead of ego at the first step to 40 m ahead of it at the last one.
-        is_near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
+        is_near = (np.abs(left_m) > 1.9) & (np.abs(left_m) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
         order = rng.permutation(np.flatnonzero(is_near & (station < view.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
             # The pedestrian's centre is 0.55 m beyond the car's far end.
-            line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
-            offset = float(left[car])
+            line_m = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
+            offset_m = float(left_m[car])
             front = view.track.at[steps] + (view.ego_size_m[0] + _PEDESTRIAN_M[1]) / 2
-            rooms = [self._required_room(view, offset, float(v), pace, requested) for v in speed]
-            rooms = [math.inf if room is None else room for room in rooms]
-            error = np.where(speed > SLOWEST_MPS, rooms, math.inf) - (line - front)
-            best = int(np.argmin(np.abs(error)))
+            rooms_m = [self._required_room(view, offset_m, float(v), pace_mps, severity_mps2) for v in speed]
+            rooms_m = [math.inf if room is None else room for room in rooms_m]
+            error_m = np.where(speed > SLOWEST_MPS, rooms_m, math.inf) - (line_m - front)
+            best = int(np.argmin(np.abs(error_m)))
             # Ego is at most 0.08 s of travel from the place at which the requested severity is exact.
-            if abs(error[best]) < 0.08 * speed[best]:
-                return int(steps[best]), line, offset
+            if abs(error_m[best]) < 0.08 * speed[best]:
+                return int(steps[best]), line_m, offset_m
         return None
 
 
@@ -172,7 +172,7 @@ class LaneBlocked(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
-        pace, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
+        pace_mps, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         clearance_m = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
@@ -181,8 +181,8 @@ class LaneBlocked(EventScript):
         half = (view.ego_size_m[1] + _OBJECT_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        profile = _entry(view, step, offset - deviation, pace, (_ROLLING_MPS2, 3.0))
-        if profile is None or travel_s(offset - half, pace, _ROLLING_MPS2) > arrival_s - 0.05:
+        profile = _entry(view, step, offset - deviation, pace_mps, (_ROLLING_MPS2, 3.0))
+        if profile is None or travel_s(offset - half, pace_mps, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
         left = side * (offset - profile[0])
         adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _OBJECT_M)
@@ -198,20 +198,20 @@ class ReversingCar(_StreetScript):
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, pace = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
+        step, pace_mps = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
         overlap_m, margin_m = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
         station, arrival_s = _blocked_station(view, step, severity_mps2, CAR_M[1])
         # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
-        rear = view.edge_m(station, -1) + margin_m
-        if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
+        rear_m = view.edge_m(station, -1) + margin_m
+        if not 1.3 < rear_m < 7.0 or not _is_open_street(view, station):
             return None
-        profile = _entry(view, step, rear + overlap_m, pace, (self.gain_mps2, 2.5))
-        clears = view.ego_size_m[1] / 2
-        if profile is None or travel_s(rear - clears, pace, self.gain_mps2) > arrival_s - 0.05:
+        profile = _entry(view, step, rear_m + overlap_m, pace_mps, (self.gain_mps2, 2.5))
+        ego_half_m = view.ego_size_m[1] / 2
+        if profile is None or travel_s(rear_m - ego_half_m, pace_mps, self.gain_mps2) > arrival_s - 0.05:
             return None
-        xy, heading = view.track.pose(np.full(view.steps, station), profile[0] - (rear + CAR_M[0] / 2))
+        xy, heading = view.track.pose(np.full(view.steps, station), profile[0] - (rear_m + CAR_M[0] / 2))
         valid = np.ones(view.steps, bool)
         adversary = ScriptedUser(AgentKind.VEHICLE, CAR_M, xy, heading - math.pi / 2, -profile[1], valid)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
@@ -219,7 +219,7 @@ class ReversingCar(_StreetScript):
 
 @dataclass(frozen=True)
 class WrongWayCyclist(_StreetScript):
-    """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
+    """An oncoming cyclist at the right edge of the road swings out into ego's lane for a while.
 
     Attributes:
         out_s: Time from the first step until ego's lane is clear again, low and high.
@@ -232,31 +232,31 @@ class WrongWayCyclist(_StreetScript):
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, pace = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
-        clear, inner = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
+        step, pace_mps = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
+        clear_s, inner_m = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
         if step is None:
             return None
-        own, speed = view.at_step(step)
-        room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear - NOTICED_S)
-        start = own + (view.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
-        if not _is_open_street(view, own + room) or not _is_open_street(view, start):
+        ego_station, speed = view.at_step(step)
+        room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear_s - NOTICED_S)
+        start = ego_station + (view.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace_mps * clear_s
+        if not _is_open_street(view, ego_station + room) or not _is_open_street(view, start):
             return None
         half = (view.ego_size_m[1] + _BICYCLE_M[1]) / 2
-        edge = view.edge_m(start - pace * clear, -1)
-        outer = -max(edge - 0.45, half + 0.35)
-        if not edge < 4.5:
+        edge_m = view.edge_m(start - pace_mps * clear_s, -1)
+        outer_m = -max(edge_m - 0.45, half + 0.35)
+        if not edge_m < 4.5:
             return None
         times = DT_S * (np.arange(view.steps) - step)
         # Share of the swing that remains when ego's lane is clear again.
-        share = (half + outer) / (outer - inner) if outer < inner else 1.0
-        begin_back = clear - _inverse_smooth_step(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
-        swing = smooth_step(times / self.swing_s) - smooth_step((times - begin_back) / self.swing_s)
-        if begin_back < self.swing_s * 0.6:
+        share = (half + outer_m) / (outer_m - inner_m) if outer_m < inner_m else 1.0
+        back_begin_s = clear_s - _inverse_smooth_step(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
+        swing = smooth_step(times / self.swing_s) - smooth_step((times - back_begin_s) / self.swing_s)
+        if back_begin_s < self.swing_s * 0.6:
             return None
-        left = outer + (inner - outer) * swing
-        valid = np.ones(view.steps, bool)
-        adversary = along_track(view.track, start - pace * times, left, AgentKind.CYCLIST, _BICYCLE_M, valid)
-        last = min(step + round((begin_back + self.swing_s) / DT_S), view.last_step)
+        left = outer_m + (inner_m - outer_m) * swing
+        station, valid = start - pace_mps * times, np.ones(view.steps, bool)
+        adversary = along_track(view.track, station, left, AgentKind.CYCLIST, _BICYCLE_M, valid)
+        last = min(step + round((back_begin_s + self.swing_s) / DT_S), view.last_step)
         return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, last)
 
 

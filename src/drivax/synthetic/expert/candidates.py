@@ -164,18 +164,18 @@ def find_conflicts(
     candidate: CandidatePath, size_m: _Size, others: _Boxes, valid: _Exists,
     vulnerable: Bool[np.ndarray, " user"],
 ) -> Conflicts:  # fmt: skip
-    """Find conflicts of ego's box along a path with boxes of others, of which ``vulnerable`` walk or cycle."""
+    """Find conflicts of ego's box along a path with others; ``vulnerable`` is a mask of pedestrians and cyclists."""
     margin = np.where(vulnerable[:, None], NEAR_VULNERABLE_M, NEAR_M)
     is_static = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
     moving = _box_conflicts(ego, others, valid & ~is_static[:, None], margin)
     # Static users are tested at one step only.
-    once = _box_conflicts(ego, others[:, :1], is_static[:, None], margin)
+    static = _box_conflicts(ego, others[:, :1], is_static[:, None], margin)
     steps = others.shape[1]
-    user, point, hard = (np.repeat(values, steps) for values in (once.user, once.point, once.hard))
+    user, point, hard = (np.repeat(values, steps) for values in (static.user, static.point, static.hard))
     return Conflicts(
         user=np.concatenate([moving.user, user]),
-        step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
+        step=np.concatenate([moving.step, np.tile(np.arange(steps), len(static.step))]),
         point=np.concatenate([moving.point, point]),
         hard=np.concatenate([moving.hard, hard]),
     )
@@ -190,8 +190,8 @@ def _box_conflicts(
     user, step = nonzero(valid & _is_near_path(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
     xy = others[user, step, :2]
-    gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
-    entry, block = nonzero(gap < reach[user, None] ** 2)
+    squared_gap = (xy[:, None, 0] - coarse[:, 0]) ** 2 + (xy[:, None, 1] - coarse[:, 1]) ** 2
+    entry, block = nonzero(squared_gap < reach[user, None] ** 2)
     point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
     entry = np.repeat(entry, _STRIDE)
     is_inside = (point >= 0) & (point < len(ego))
@@ -225,7 +225,7 @@ def stop_lines(
     """Return the lines ahead of ego that it must not or should not pass at some time.
 
     ``ego_m`` is the path position of ego's centre and half its length, ``passed`` the position at each time in the last
-    run (a line with a stop sign is closed until it passes there), and ``coming`` the result of :func:`arrivals`. Times
+    run (a stop sign's line is closed until ego passes it there), and ``coming`` the result of :func:`arrivals`. Times
     are on the clock of the lights.
     """
     from_m, half_m = ego_m
@@ -255,16 +255,16 @@ def arrivals(
     network: RoadNetwork, paths: list[Path], distance_m: Float64[np.ndarray, "vehicle time"],
     valid: Bool[np.ndarray, "vehicle time"], half_m: Float64[np.ndarray, " vehicle"],
 ) -> dict[int, _Steps]:  # fmt: skip
-    """Return, for connectors to which others yield, the steps at which a vehicle is or will be on them within 2 s.
+    """Return, for connectors with priority, a mask of the steps at which a vehicle is on them or will be within 2 s.
 
-    Ego, row 0, does not count. Connectors on no other path are left out. The paths are those of the last step: before a
-    lane change or detour a vehicle's positions on them are approximate.
+    Ego, row 0, does not count. Connectors on no vehicle's path are left out. The paths are those of the last step:
+    before a lane change or detour a vehicle's positions on them are approximate.
     """
-    watched = {rival for lane in network.lanes for rival in lane.yields_to}
+    priority_lanes = {rival for lane in network.lanes for rival in lane.yields_to}
     result: dict[int, _Steps] = {}
     for vehicle in range(1, len(paths)):
         for span in paths[vehicle].spans:
-            if span.lane in watched:
+            if span.lane in priority_lanes:
                 position, half = distance_m[vehicle], half_m[vehicle]
                 end = span.begin_m + span.scale * network.lanes[span.lane].length_m
                 is_on_lane = (position + half > span.begin_m) & (position - half < end) & valid[vehicle]

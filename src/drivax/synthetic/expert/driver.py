@@ -48,9 +48,9 @@ def expert_lanes(
 ) -> tuple[tuple[int, ...], LaneChange | None]:
     """Draw ego's lanes, a predecessor of the first one included, and sometimes a change on the third or fourth lane."""
     lanes = random_lanes(network, lane, rng)
-    before = network.lanes[lane].predecessors
-    if before:
-        lanes = (before[0], *lanes)
+    predecessors = network.lanes[lane].predecessors
+    if predecessors:
+        lanes = (predecessors[0], *lanes)
     sections = [k for k in range(2, min(4, len(lanes))) if _neighbours(network, lanes[k])]
     if not sections or rng.random() >= change_share:
         return lanes, None
@@ -97,12 +97,12 @@ def drive_ego(
         The motion, and the cause of its rejection (empty: accepted).
     """
     roles, times_s = traffic.roles, traffic.times_s
-    hardest, unfixable = HARDEST_MPS2, (*_UNFIXABLE, _HARDLY_MOVES)
+    hardest_mps2, unfixable = HARDEST_MPS2, (*_UNFIXABLE, _HARDLY_MOVES)
     if is_staged(staging):
-        hardest, unfixable = HARDEST_IN_EVENT_MPS2, _UNFIXABLE
+        hardest_mps2, unfixable = HARDEST_IN_EVENT_MPS2, _UNFIXABLE
 
     def check_motion(motion: Motion) -> Violation:
-        return find_violation(roles, motion, times_s, first_step, staging, hardest)
+        return find_violation(roles, motion, times_s, first_step, staging, hardest_mps2)
 
     def is_comfortable(motion: Motion) -> bool:
         return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
@@ -132,9 +132,9 @@ def _first_steps(
 
     The first two do not precede ego's last stop at a sign, unless ego collides before it stops.
     """
-    late = max(first_step, aware_step)
+    latest_step = max(first_step, aware_step)
     stop_step = last_stop(roles, motion, first_step)
     if violation.cause == "ego_collides":
-        late = late if late < violation.step else first_step
+        latest_step = latest_step if latest_step < violation.step else first_step
         stop_step = stop_step if stop_step < violation.step else first_step
-    return max(late, stop_step), max((first_step + late) // 2, stop_step), first_step
+    return max(latest_step, stop_step), max((first_step + latest_step) // 2, stop_step), first_step

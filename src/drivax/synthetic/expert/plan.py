@@ -33,7 +33,7 @@ from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
 #: Bounds of acceleration (m/s2) and jerk (m/s3), the most comfortable first.
 _BOUNDS_BY_COMFORT = (((-3.4, 2.0), 2.6), ((-4.0, 2.3), 4.1), ((-5.9, 2.3), 25.0))
-#: Cost of the original path below which no alternatives are computed if its smooth speeds keep their bounds.
+#: Cost of the original path below which no alternatives are computed if its smooth speeds are within their bounds.
 _GOOD_COST = 12.0
 #: Costs of a shift: constant, per m of offset, per second against traffic.
 _SHIFT_COST, _OFFSET_COST, _WRONG_WAY_COST = 8.0, 2.0, 6.0
@@ -267,14 +267,14 @@ def _smooth(state: _State, option: _Option) -> SpeedProfile:
     speed[0] = state.speed
     hard = option.occupancy.hard[1:]
     index = np.arange(hard.shape[1])
-    own = np.clip(np.rint(position[1:] / SPACING_M).astype(int), 0, len(index) - 1)
-    below = np.where(hard & (index < own[:, None]), index, -1).max(axis=1)
-    above = np.where(hard & (index > own[:, None]), index, len(index)).min(axis=1)
+    ego_index = np.clip(np.rint(position[1:] / SPACING_M).astype(int), 0, len(index) - 1)
+    below = np.where(hard & (index < ego_index[:, None]), index, -1).max(axis=1)
+    above = np.where(hard & (index > ego_index[:, None]), index, len(index)).min(axis=1)
     # Steps at which even the best speeds touch something are unbounded.
-    has_contact = hard[np.arange(len(hard)), own]
+    has_contact = hard[np.arange(len(hard)), ego_index]
     low = np.where((below >= 0) & ~has_contact, (below + 1) * SPACING_M, -np.inf)
     high = np.where(has_contact, np.inf, (above - 1) * SPACING_M)
-    window = np.clip(own[:, None] + np.arange(-4, 5), 0, len(index) - 1)
+    window = np.clip(ego_index[:, None] + np.arange(-4, 5), 0, len(index) - 1)
     top = np.maximum(option.candidate.limit_mps[window].min(axis=1), speed[1:])
     profile = None
     for acceleration, jerk in _BOUNDS_BY_COMFORT:
@@ -330,51 +330,52 @@ def _shift(
 ) -> Shift | None:  # fmt: skip
     """Return the shift that passes a user, and standing users close behind it, on one side (1: left, -1: right).
 
-    Return None if the shift would be too small or too large.
+    ``margins`` are lateral gap (m) and acceleration (m/s2). Return None if the shift would be too small or too large.
     """
-    room_m, step_mps2 = margins
+    gap_m, shift_mps2 = margins
     begin, end, lateral = _extent(state, candidate, hit, side)
-    half_l, half_w = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
-    passed = {hit.user}
-    standing = [
+    half_length_m, half_width_m = state.size_m[0] / 2 + 1.0, state.size_m[1] / 2
+    passed_users = {hit.user}
+    standing_users = [
         user
         for user in np.unique(conflicts.user[conflicts.hard]).tolist()
         if np.ptp(state.others[user, state.valid[user], :2], axis=0).max() < 0.5
     ]
-    for user in sorted(standing, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
+    for user in sorted(standing_users, key=lambda u: int(conflicts.point[conflicts.user == u].min())):
         user_conflicts = conflicts.hard & (conflicts.user == user)
         index = int(conflicts.point[user_conflicts].min())
-        if user not in passed and begin < index * SPACING_M < end + 20.0:
+        if user not in passed_users and begin < index * SPACING_M < end + 20.0:
             hit_user = _Hit(user, int(conflicts.step[user_conflicts].min()), index)
             extent = _extent(state, candidate, hit_user, side)
             end, lateral = max(end, extent.end), max(lateral, extent.lateral)
-            passed.add(user)
-    lateral = lateral + half_w + room_m
+            passed_users.add(user)
+    lateral = lateral + half_width_m + gap_m
     if not 0.15 < lateral < _MAX_SHIFT_M:
         return None
     speed = max(state.speed, float(candidate.preferred_mps[hit.point]) * 0.7)
-    length = max(speed * float(np.sqrt(_STEP_CURVATURE * lateral / step_mps2)), 3.0 * lateral, 8.0)
-    gentle = max(length, speed * float(np.sqrt(_STEP_CURVATURE * lateral / _SHIFT_MPS2[0])))
-    out_begin = max(0.0, begin - half_l - length)
-    out_end = out_begin + length
-    back_begin = max(end + half_l, out_end)
-    return Shift(side * lateral, out_begin, out_end, back_begin, back_begin + gentle)
+    out_m = max(speed * float(np.sqrt(_STEP_CURVATURE * lateral / shift_mps2)), 3.0 * lateral, 8.0)
+    back_m = max(out_m, speed * float(np.sqrt(_STEP_CURVATURE * lateral / _SHIFT_MPS2[0])))
+    out_begin = max(0.0, begin - half_length_m - out_m)
+    out_end = out_begin + out_m
+    back_begin = max(end + half_length_m, out_end)
+    return Shift(side * lateral, out_begin, out_end, back_begin, back_begin + back_m)
 
 
 def _extent(state: _State, candidate: CandidatePath, hit: _Hit, side: float) -> _Extent:
-    """Return the extent of a user at a conflict, on the left (1) or right (-1) side."""
+    """Return the extent of a user in conflict, for passing it on the left (1) or right (-1) side."""
     user, step, point = hit
     box = state.others[user, step]
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))
     offset = corners(box) - candidate.xy[point]
     along, left = offset @ np.array([c, s]), offset @ np.array([-s, c])
-    # Moving users are passed over a longer stretch, which grows with their speed along the path.
-    later = min(step + 10, len(state.others[user]) - 1)
-    moved = (state.others[user, later, :2] - box[:2]) @ np.array([c, s]) / max((later - step) * DT_S, DT_S)
+    # Ego passes moving users over a longer stretch, which grows with their speed along the path.
+    later_step = min(step + 10, len(state.others[user]) - 1)
+    duration_s = max((later_step - step) * DT_S, DT_S)
+    speed_along_mps = (state.others[user, later_step, :2] - box[:2]) @ np.array([c, s]) / duration_s
     position = point * SPACING_M
-    ahead, behind = max(3.0 * moved, 0.7 * -moved, 0.0), 0.7 * abs(moved)
+    ahead_m, behind_m = max(3.0 * speed_along_mps, 0.7 * -speed_along_mps, 0.0), 0.7 * abs(speed_along_mps)
     return _Extent(
-        begin=position + float(along.min()) - behind,
-        end=position + float(along.max()) + ahead,
+        begin=position + float(along.min()) - behind_m,
+        end=position + float(along.max()) + ahead_m,
         lateral=float((side * left).max()),
     )

@@ -1,7 +1,7 @@
 """Smooth a coarse speed plan: least squares of acceleration and jerk within bounds.
 
-A quadratic programme with quadratic penalties for its bounds, solved by Newton's method with an exact line search:
-the objective is convex and piecewise quadratic, so a few steps suffice (Mangasarian, "A finite Newton method for
+Newton's method with an exact line search solves a quadratic programme with quadratic penalties for its bounds: the
+objective is convex and piecewise quadratic, so a few steps suffice (Mangasarian, "A finite Newton method for
 classification", Optim. Methods Softw. 17, 2002).
 """
 
@@ -19,7 +19,7 @@ from drivax.scenario.schema import DT_S
 _ACCELERATION, _JERK, _SPEED, _POSITION, _PENALTY = 0.3, 0.6, 0.4, 0.03, 3e5
 #: Steps from one knot of acceleration to the next.
 _KNOT_STEPS = 3
-#: Largest number of Newton steps, bisections of the line search, and largest change of a bounded value at the end.
+#: Largest number of Newton steps and of bisections per step, and change of all bounded values below which to stop.
 _NEWTON_STEPS, _BISECTIONS, _MIN_CHANGE = 40, 12, 1e-4
 
 _Series = Float64[np.ndarray, " time"]
@@ -53,7 +53,7 @@ class SpeedProfile:
 def _matrices(steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the map from accelerations at knots to stacked distances, speeds, accelerations and jerks.
 
-    Acceleration is constant within a step and linear between knots. The second matrix is that of the objective.
+    Acceleration is constant within a step and linear between knots. The second matrix is the objective's Hessian.
     """
     n, m = np.arange(steps)[:, None], np.arange(steps)
     knots = np.arange(0, steps + _KNOT_STEPS - 1, _KNOT_STEPS)
@@ -81,45 +81,45 @@ def smooth_speeds(at_m: _Series, speed: _Series, acceleration_mps2: float, bound
     ``acceleration_mps2`` is the acceleration just before the first step. Bounds that cannot be kept are exceeded.
     """
     steps = len(at_m) - 1
-    rows, base = _matrices(steps)
-    free = speed[0] * DT_S * np.arange(1, steps + 1)
-    before = np.zeros(steps)
-    before[0] = acceleration_mps2 / DT_S
+    rows, hessian = _matrices(steps)
+    coast_m = speed[0] * DT_S * np.arange(1, steps + 1)
+    offset = np.zeros(steps)
+    offset[0] = acceleration_mps2 / DT_S
     linear_terms = np.concatenate(
-        [_POSITION * (at_m[1:] - free), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * before]
+        [_POSITION * (at_m[1:] - coast_m), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * offset]
     )
     target = _matmul(rows.T, linear_terms)
     low_a, high_a = (np.full(steps, a) for a in bounds.acceleration_mps2)
     # A tenth of the weight for jerk keeps the excesses over all bounds similar.
     scale = np.repeat([1.0, 0.1], [3 * steps, steps])
     limit = np.full(steps, bounds.jerk_mps3)
-    high = np.concatenate([bounds.high_m - free, bounds.top_mps - speed[0], high_a, before + limit])
-    low = np.concatenate([bounds.low_m - free, np.full(steps, -speed[0]), low_a, before - limit])
+    high = np.concatenate([bounds.high_m - coast_m, bounds.top_mps - speed[0], high_a, offset + limit])
+    low = np.concatenate([bounds.low_m - coast_m, np.full(steps, -speed[0]), low_a, offset - limit])
     bounded = rows * scale[:, None]
-    knots = _minimise(base, target, bounded, low * scale, high * scale)
+    knots = _minimise(hessian, target, bounded, low * scale, high * scale)
     value = _matmul(bounded, knots)
     excess = float(np.maximum(np.maximum(value - high * scale, low * scale - value), 0.0).max())
     return _integrate(float(speed[0]), _matmul(rows[2 * steps : 3 * steps], knots), excess)
 
 
 def _minimise(
-    base: Float64[np.ndarray, "n n"], target: _Knots, rows: _Matrix, low: _Rows, high: _Rows
+    hessian: Float64[np.ndarray, "n n"], target: _Knots, rows: _Matrix, low: _Rows, high: _Rows
 ) -> _Knots:
-    """Minimise ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
-    a = np.linalg.solve(base, target)
+    """Minimise ``a H a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
+    a = np.linalg.solve(hessian, target)
     value = _matmul(rows, a)
     for _ in range(_NEWTON_STEPS):
         bound = np.clip(value, low, high)
         violated = value != bound
         active = rows[violated]
         penalty = _gram_matrix(active, np.full(len(active), _PENALTY))
-        step = np.linalg.solve(base + penalty, target + _PENALTY * _matmul(active.T, bound[violated]))
+        step = np.linalg.solve(hessian + penalty, target + _PENALTY * _matmul(active.T, bound[violated]))
         step -= a
         change = _matmul(rows, step)
         if np.abs(change).max() < _MIN_CHANGE:
             break
-        slope = float(np.sum(step * (_matmul(base, a) - target)))
-        curvature = float(np.sum(step * _matmul(base, step)))
+        slope = float(np.sum(step * (_matmul(hessian, a) - target)))
+        curvature = float(np.sum(step * _matmul(hessian, step)))
         step_length = _step_length(value, change, (low, high), (slope, curvature))
         a = a + step_length * step
         value = value + step_length * change
@@ -127,20 +127,20 @@ def _minimise(
 
 
 def _step_length(
-    value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], rise: tuple[float, float]
+    value: _Rows, change: _Rows, limits: tuple[_Rows, _Rows], derivatives: tuple[float, float]
 ) -> float:
     """Find the share of a Newton step that minimises the objective, by bisection of the derivative.
 
-    ``rise`` is the first and second derivative of the objective without penalties.
+    ``derivatives`` are the first and second derivative of the objective without penalties.
     """
     low, high = limits
 
     def derivative(share: float) -> float:
         shifted = value + share * change
         excess = shifted - np.clip(shifted, low, high)
-        return rise[0] + share * rise[1] + _PENALTY * float(np.sum(excess * change))
+        return derivatives[0] + share * derivatives[1] + _PENALTY * float(np.sum(excess * change))
 
-    if derivative(1.0) <= 1e-6 * abs(rise[0]):
+    if derivative(1.0) <= 1e-6 * abs(derivatives[0]):
         return 1.0
     below, above = 0.0, 1.0
     for _ in range(_BISECTIONS):

@@ -23,7 +23,7 @@ _SPEED_STEP_MPS = 0.75
 _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
 #: Costs per second of (m/s2)^2, and of (m/s)^2 below and above the preferred speed and above the limit of bends.
 _ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
-#: Costs per second of (m/s2)^2 of hard braking, and, at 5 m/s, of a short gap ahead and of a small distance.
+#: Costs per second of (m/s2)^2 of hard braking, and, at 5 m/s, of a short gap ahead and of ``Occupancy.near``.
 _HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
 #: Preferred time gap to places that ego must avoid ahead, added to 1.5 m, s.
 _HEADWAY_S = 1.1
@@ -136,14 +136,14 @@ def _trace_back(
 
 
 class _OccupiedStates:
-    """Costs of states (speed, place) by their occupancy; within half a coarse step before and after, speed is kept."""
+    """Costs of states (speed, place) by occupancy; speed counts as constant for half a coarse step before and after."""
 
     def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
         self._occupancy = occupancy
         half = COARSE // 2
         places = occupancy.hard.shape[1]
-        moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
-        self._index = np.clip(np.rint(moved / occupancy.spacing_m).astype(int), 0, places - 1)
+        position_m = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
+        self._index = np.clip(np.rint(position_m / occupancy.spacing_m).astype(int), 0, places - 1)
         # The occupancy of the last step persists.
         price = TOUCH * occupancy.hard + (_CLOSE * DT_S) * occupancy.near
         price = np.concatenate([price, np.repeat(price[-1:], COARSE + half, axis=0)]).astype(np.float32)
@@ -151,9 +151,9 @@ class _OccupiedStates:
         self._flat = self._index + (places * np.arange(COARSE))[:, None, None]
         self._ahead = _free_ahead(occupancy)
         self._column = np.clip(np.rint(grid.place / occupancy.spacing_m).astype(int), 0, places - 1)
-        pace = np.minimum(grid.speed[:, None] / 5.0, 2.0)
+        factor = np.minimum(grid.speed[:, None] / 5.0, 2.0)
         # Contact is not free at standstill.
-        self._pace, self._following = pace + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(pace, 1.0)
+        self._factor, self._following = factor + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(factor, 1.0)
         self._preferred_gap = _HEADWAY_S * grid.speed[:, None] + 0.5
 
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
@@ -162,7 +162,7 @@ class _OccupiedStates:
         contact = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
         close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
-        return contact * self._pace + close * self._following
+        return contact * self._factor + close * self._following
 
     def touches(self, step: int, v: int, s: int) -> bool:
         """Whether ego touches an obstacle around a step."""
@@ -172,7 +172,7 @@ class _OccupiedStates:
 
 
 def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
-    """Return the distance from each place to the next hard one, m (0: it is hard itself; 1 km or more: none)."""
+    """Return the distance from each place to the next hard place, m (0: this place; 1 km or more: none)."""
     places = occupancy.hard.shape[1]
     index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]

@@ -88,10 +88,10 @@ def find_violation(
     if not motion.valid[0, window].all():
         return Violation("ego_leaves_map")
     box = user_boxes(motion.from_step(first_step))
-    pairs = first_overlap_step(box, motion.valid[:, window], _tested_pairs(motion))
-    touched = np.flatnonzero(pairs[0] < box.shape[1])
-    if len(touched):
-        return Violation("ego_collides", tuple(touched.tolist()), first_step + int(pairs[0].min()))
+    overlap_step = first_overlap_step(box, motion.valid[:, window], _tested_pairs(motion))
+    users = np.flatnonzero(overlap_step[0] < box.shape[1])
+    if len(users):
+        return Violation("ego_collides", tuple(users.tolist()), first_step + int(overlap_step[0].min()))
     if np.diff(speed).min() < -(hardest_mps2 + 0.02) * DT_S:
         return Violation("ego_brakes_hard")
     if leaves_road(roles.network, box[0]):
@@ -102,7 +102,7 @@ def find_violation(
     may_pass = roles.parked or is_staged(staging)
     if not may_pass and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, window]):
         return Violation("ego_wrong_way")
-    return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
+    return Violation("others_collide" if (overlap_step < box.shape[1]).any() else "")
 
 
 def is_staged(staging: Staging) -> bool:
@@ -113,8 +113,8 @@ def is_staged(staging: Staging) -> bool:
 def _tested_pairs(motion: Motion) -> _UserPairs:
     """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     is_pedestrian = motion.kind == AgentKind.PEDESTRIAN
-    moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
-    return (moves[:, None] | moves) & ~(is_pedestrian[:, None] & is_pedestrian)
+    is_moving = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
+    return (is_moving[:, None] | is_moving) & ~(is_pedestrian[:, None] & is_pedestrian)
 
 
 def first_overlap_step(
@@ -125,16 +125,16 @@ def first_overlap_step(
     box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
     # Broad phase: bounding rectangles of the trajectories.
-    meet = np.triu(tested, 1)
+    may_meet = np.triu(tested, 1)
     for values in (box[..., 0], box[..., 1]):
         low = np.where(valid, values, np.inf).min(axis=1) - reach
         high = np.where(valid, values, -np.inf).max(axis=1) + reach
-        meet &= (low[:, None] <= high) & (high[:, None] >= low)
-    first, second = np.nonzero(meet)
+        may_meet &= (low[:, None] <= high) & (high[:, None] >= low)
+    first, second = np.nonzero(may_meet)
     dx, dy = (box[first, :, axis] - box[second, :, axis] for axis in (0, 1))
-    gap = dx * dx + dy * dy
-    near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
-    index, time = nonzero(near)
+    squared_gap = dx * dx + dy * dy
+    is_near = (squared_gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
+    index, time = nonzero(is_near)
     hit = overlap(box[first[index], time], box[second[index], time])
     result = np.full((len(box), len(box)), box.shape[1])
     np.minimum.at(result, (first[index[hit]], second[index[hit]]), time[hit])
@@ -149,9 +149,9 @@ def inside(
     x, y = points.T.copy()
     for ring in rings:
         a, b = ring, np.roll(ring, -1, axis=0)
-        near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
-        # Rays to the right meet only sides at the height of a point that reach beyond the leftmost one.
-        keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
+        is_near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
+        # Rays to the right meet only sides at the points' heights that reach beyond the leftmost point.
+        keep = is_near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
         (ax, ay), (bx, by) = a[keep].T, b[keep].T
         point, k = nonzero((ay > y[:, None]) != (by > y[:, None]))
         (ax, ay), (bx, by), x_of, y_of = (ax[k], ay[k]), (bx[k], by[k]), x[point], y[point]
@@ -189,13 +189,13 @@ def _find_rule_violation(roles: Roles, motion: Motion, times_s: _Series, first_s
         front = _front(motion, i)[window]
         for span in path.spans:
             lane = network.lanes[span.lane]
-            stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
-            if not lane.connector or not (stop or red_steps[:, span.lane].any()):
+            has_stop_sign = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
+            if not lane.connector or not (has_stop_sign or red_steps[:, span.lane].any()):
                 continue
             passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
             if np.any(passed & red_steps[:, span.lane]):
                 return "ego_runs_red" if i == 0 else "other_runs_red"
-            if stop and not _stopped_before_line(lane, motion, first_step, front, passed):
+            if has_stop_sign and not _stopped_before_line(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
         if i == 0 and _passes_red_off_route(network, path, motion.xy[0, window], front, heading, red_steps):
             return "ego_runs_red"
@@ -206,12 +206,13 @@ def _passes_red_off_route(
     network: RoadNetwork, path: Path, xy: _Points, front: _Points, heading: _Series, red_steps: _LaneSteps
 ) -> bool:
     """Whether ego, off its route, passes the line of another lane at red; the metric counts this, too."""
-    own = {span.lane for span in path.spans}
-    others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
+    route = {span.lane for span in path.spans}
+    red_lanes = np.flatnonzero(red_steps.any(axis=0))
+    others = [k for k in red_lanes if network.lanes[k].connector and k not in route]
     passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
     if not np.any(passed):
         return False
-    route_xy = np.concatenate([network.lanes[k].curve.xy for k in own])
+    route_xy = np.concatenate([network.lanes[k].curve.xy for k in route])
     off_route = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _OFF_ROUTE_M
     return bool((np.any(passed, axis=0) & off_route[1:]).any())
 
@@ -253,19 +254,19 @@ def against_traffic(
 ) -> Bool[np.ndarray, " place"]:
     """Mask of poses whose nearest lane leads the other way (headings differ by more than 135 degrees).
 
-    It must be nearer than all lanes that do not, by more than 0.5 m: where lanes cross, these decide.
+    That lane must be more than 0.5 m nearer than all lanes that do not: where lanes cross, the latter decide.
     """
     points = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
     course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
-    near = ((points >= xy.min(axis=0) - 6.0) & (points <= xy.max(axis=0) + 6.0)).all(axis=1)
-    points, course = points[near], course[near]
+    is_near = ((points >= xy.min(axis=0) - 6.0) & (points <= xy.max(axis=0) + 6.0)).all(axis=1)
+    points, course = points[is_near], course[is_near]
     if not len(points):
         return np.zeros(len(xy), bool)
     dx, dy = (np.subtract.outer(xy[:, axis], points[:, axis]) for axis in (0, 1))
     squared = dx * dx + dy * dy
-    # Only points that are at most this much further away than the nearest one decide.
-    most = np.sqrt(squared.min(axis=1)) + _AMBIGUITY_M + 1e-3
-    place, point = nonzero(squared <= (most * most)[:, None])
+    # Points further away cannot decide.
+    limit_m = np.sqrt(squared.min(axis=1)) + _AMBIGUITY_M + 1e-3
+    place, point = nonzero(squared <= (limit_m * limit_m)[:, None])
     gap = np.hypot(dx[place, point], dy[place, point])
     against = np.cos(heading[place] - course[point]) < math.cos(math.radians(135.0))
     opposed, other = np.full((2, len(xy)), np.inf)

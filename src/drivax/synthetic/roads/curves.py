@@ -203,7 +203,7 @@ def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Cu
 
 
 def _eased_bend(start: Pose, angle: float, length_m: float, easing: float, count: int) -> Curve:
-    """Bend of :func:`turn` of a length, with a number of samples."""
+    """Return the bend of :func:`turn` with a given length and number of samples."""
     share = np.linspace(0.0, 1.0, count)
     ramp = np.minimum(1.0, np.minimum(share, 1.0 - share) / easing)
     curvature = ramp * (angle / float(np.trapezoid(ramp, share)) / length_m)

@@ -54,7 +54,7 @@ class Lane:
     """A lane; links are indices into ``RoadNetwork.lanes``, -1 is none.
 
     Attributes:
-        left, right: Neighbours of the same direction.
+        left, right: Neighbours in the same direction.
         connector: Whether the lane leads across a junction; connectors may cross, and have rules at the entry.
         control: Rule at the entry of a connector; the stop line is where it begins.
         yields_to: Conflicting connectors with right of way, at lights only of the same phase; empty at all-way stops.
@@ -164,7 +164,7 @@ class RoadNetwork:
     @property
     @per_roads
     def marked_crossings(self) -> dict[int, list[tuple[int, float]]]:
-        """Index of each marked crossing on a lane, and the distance along the lane of its near side, m."""
+        """Marked crossings of each lane: index, and distance along the lane to the crossing's near side, m."""
         result: dict[int, list[tuple[int, float]]] = {}
         for number, crossing in enumerate(self.crossings):
             for lane, along in crossing.lanes if crossing.marked else ():
@@ -180,7 +180,7 @@ class RoadNetwork:
 
 
 def conflict_matrix(lanes: Sequence[Lane]) -> Bool[np.ndarray, "lane lane"]:
-    """See :attr:`RoadNetwork.conflicts`."""
+    """Mask of pairs of connectors that conflict (:attr:`RoadNetwork.conflicts`)."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     connectors = [i for i, lane in enumerate(lanes) if lane.connector]
     low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
@@ -210,7 +210,7 @@ def _squared_distances(
 
 @dataclass
 class Draft:
-    """Features of a future :class:`RoadNetwork`: families add and link them, then freeze the draft."""
+    """Features of a future :class:`RoadNetwork`: families add and link them, then call :meth:`network`."""
 
     lanes: list[Lane] = field(default_factory=list)
     edges: list[Line] = field(default_factory=list)
@@ -235,7 +235,7 @@ class Draft:
         self.change(after, predecessors=(*self.lanes[after].predecessors, before))
 
     def link_neighbours(self, left: int, right: int) -> None:
-        """Make two lanes of the same direction neighbours."""
+        """Make two lanes in the same direction neighbours."""
         self.change(left, right=right)
         self.change(right, left=left)
 

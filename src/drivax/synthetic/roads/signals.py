@@ -92,7 +92,7 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """Return the colours of ``lanes`` lanes (NONE without a light), and the rest of yellow, s (else 0)."""
+        """Return the colours of ``lanes`` lanes (NONE without a light), and the remaining yellow time, s (else 0)."""
         colour = np.zeros((len(times_s), lanes), np.int8)
         remaining_s = np.zeros((len(times_s), lanes))
         for group in self.groups:
@@ -102,14 +102,14 @@ class SignalPlan:
             cycle = self._duration_s(program)
             for phase in program:
                 # The microsecond keeps rounding from delaying a change that falls on a step.
-                since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
-                green = since < self.green_s[phase]
-                to_red = self.green_s[phase] + self.yellow_s - since
-                yellow = ~green & (to_red > 0)
+                elapsed_s = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
+                is_green = elapsed_s < self.green_s[phase]
+                to_red = self.green_s[phase] + self.yellow_s - elapsed_s
+                is_yellow = ~is_green & (to_red > 0)
                 for lane in (lane for group in self.phases[phase] for lane in self.groups[group].lanes):
-                    colour[green, lane] = Colour.GREEN
-                    colour[yellow, lane] = Colour.YELLOW
-                    remaining_s[yellow, lane] = to_red[yellow]
+                    colour[is_green, lane] = Colour.GREEN
+                    colour[is_yellow, lane] = Colour.YELLOW
+                    remaining_s[is_yellow, lane] = to_red[is_yellow]
         return colour, remaining_s
 
 

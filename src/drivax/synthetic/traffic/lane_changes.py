@@ -229,41 +229,41 @@ class LaneChanges:
     def decide(self, now: VehicleState, tables: PathTables) -> tuple[list[Change], GapPairs]:
         """Return lane changes that start now, and pairs that open gaps for mandatory ones."""
         lane, along = tables.lanes_at(now.at_m)
-        own, chains = lane[:, 0], self.chains
-        candidates = now.free & now.active & (own >= 0) & ~self._drivers.cyclist
-        candidates &= (chains.left[own] >= 0) | (chains.right[own] >= 0)
+        own_lane, chains = lane[:, 0], self.chains
+        candidates = now.free & now.active & (own_lane >= 0) & ~self._drivers.cyclist
+        candidates &= (chains.left[own_lane] >= 0) | (chains.right[own_lane] >= 0)
         vehicles = np.flatnonzero(candidates)
         if not len(vehicles):
             return [], NO_GAP_PAIRS
-        target = np.concatenate([chains.left[own[vehicles]], chains.right[own[vehicles]]])
+        target = np.concatenate([chains.left[own_lane[vehicles]], chains.right[own_lane[vehicles]]])
         sides = np.flatnonzero(target >= 0)
         vehicles = vehicles[sides % len(vehicles)]
-        options = self._options(now, vehicles, target[sides], own[vehicles], along[vehicles, 0])
+        options = self._options(now, vehicles, target[sides], own_lane[vehicles], along[vehicles, 0])
         if not len(options.vehicles):
             return [], NO_GAP_PAIRS
         chain = np.where((lane >= 0) & now.active[:, None], chains.chain[lane], -1)
         return self._choose(now, options, _ChainPositions(chain, chains.offset_m[lane] + along))
 
     def _options(
-        self, now: VehicleState, vehicles: _Indices, target: _Indices, own: _Indices, along: _Values
+        self, now: VehicleState, vehicles: _Indices, target: _Indices, lane: _Indices, along: _Values
     ) -> _Options:
-        """Return mandatory changes and those for which the lanes have room; ``along`` is the position on ``own``."""
+        """Return mandatory changes and those for which the lanes have room; ``along`` is the position on ``lane``."""
         chains = self.chains
-        chain, own_chain = chains.chain[target], chains.chain[own]
-        position = chains.offset_m[target] + along / chains.lane_length_m[own] * chains.lane_length_m[target]
-        own_position = chains.offset_m[own] + along
+        chain, own_chain = chains.chain[target], chains.chain[lane]
+        position = chains.offset_m[target] + along / chains.lane_length_m[lane] * chains.lane_length_m[target]
+        own_position = chains.offset_m[lane] + along
         remaining = chains.length_m[own_chain] - own_position
         speed = now.speed[vehicles]
         mandatory = chains.ends[own_chain] & (remaining < np.maximum(_MANDATORY_M, _MANDATORY_S * speed))
         length = np.maximum(_DURATION_S * speed, _MIN_LENGTH_M)
         length = np.where(mandatory, np.minimum(length, np.maximum(remaining - 2.0, 8.0)), length)
-        remainder = chains.length_m[chain] - position
-        possible = (remainder > length + 3.0) & (~chains.ends[own_chain] | (remaining > length))
+        target_remaining = chains.length_m[chain] - position
+        possible = (target_remaining > length + 3.0) & (~chains.ends[own_chain] | (remaining > length))
         optional = possible & (speed > _MIN_SPEED_MPS) & (position > _FROM_JUNCTION_M)
-        optional &= remainder > length + _TO_JUNCTION_M
+        optional &= target_remaining > length + _TO_JUNCTION_M
         optional &= ~chains.exit_only[target] & ~chains.ends[chain]
         possible = np.where(mandatory, possible & ~chains.ends[chain], optional)
-        limit = now.fastest[vehicles] * chains.limit_mps[target] / chains.limit_mps[own]
+        limit = now.fastest[vehicles] * chains.limit_mps[target] / chains.limit_mps[lane]
         k = np.flatnonzero(possible | mandatory)
         return _Options(
             vehicles=vehicles[k],
@@ -292,9 +292,9 @@ class LaneChanges:
         others = new_after - new_before + old_after - old_before
         gain = own_after - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
         urgency = np.where(o.mandatory, 1.0 - np.clip(o.remaining_m / _MANDATORY_M, 0.0, 1.0), 0.0)
-        safe = _SAFE_BRAKING_MPS2 + urgency * (_URGENT_BRAKING_MPS2 - _SAFE_BRAKING_MPS2)
+        safe_mps2 = _SAFE_BRAKING_MPS2 + urgency * (_URGENT_BRAKING_MPS2 - _SAFE_BRAKING_MPS2)
         follower_speed = np.where(follower.row >= 0, now.speed[np.maximum(follower.row, 0)], 0.0)
-        accepted = o.possible & (new_after > -safe) & (own_after > -safe)
+        accepted = o.possible & (new_after > -safe_mps2) & (own_after > -safe_mps2)
         accepted &= leader.gap_m > _GAP_M + _CLOSING_S * np.maximum(speed - leader.speed, 0.0)
         accepted &= follower.gap_m > _GAP_M + _FOLLOWER_S * follower_speed * (1 - _URGENT_SHARE * urgency)
         accepted &= o.mandatory | (gain > _THRESHOLD_MPS2)
@@ -398,7 +398,7 @@ def _obstacle_positions(network: RoadNetwork, boxes: Boxes) -> list[tuple[int, f
     for index in np.flatnonzero(chain >= 0).tolist():
         curve = network.lanes[index].curve
         dx, dy = (np.subtract.outer(boxes.xy[:, k], curve.xy[::2, k]) for k in (0, 1))
-        gap = dx * dx + dy * dy
-        for box in np.flatnonzero(gap.min(axis=1) < (_HALF_CAR_M + boxes.size_m[:, 1] / 2) ** 2):
-            result.append((index, float(curve.arc_m[::2][np.argmin(gap[box])])))
+        squared_gap = dx * dx + dy * dy
+        for box in np.flatnonzero(squared_gap.min(axis=1) < (_HALF_CAR_M + boxes.size_m[:, 1] / 2) ** 2):
+            result.append((index, float(curve.arc_m[::2][np.argmin(squared_gap[box])])))
     return result

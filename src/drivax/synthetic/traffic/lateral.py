@@ -58,31 +58,31 @@ def displace_path(
     stretch = np.maximum(1.0 - aside_m * np.gradient(curve.heading, step), 0.1)
     xy = curve.xy + aside_m[:, None] * left_normals(curve.heading)
     new_curve = Curve(xy, curve.heading + np.arctan2(slope, stretch))
-    old = step * np.arange(len(xy))
-    new = new_curve.arc_m
-    count = max(2, round(float(new[-1]) / STEP_M) + 1)
-    position = np.linspace(0.0, new[-1], count)
-    source = np.interp(position, new, old)
+    old_m = step * np.arange(len(xy))
+    new_m = new_curve.arc_m
+    count = max(2, round(float(new_m[-1]) / STEP_M) + 1)
+    position = np.linspace(0.0, new_m[-1], count)
+    source = np.interp(position, new_m, old_m)
     index = np.rint(source / step).astype(int)
     lane = path.lane.take(index, axis=0)
     lane_m = path.lane_m.take(index, axis=0) + np.where(lane >= 0, (source - index * step)[:, None], 0.0)
     for span in occupied:
         _enter_span(span, source, lane, lane_m)
-    new_curve, step = interpolate_curve(new_curve, new, position), float(new[-1]) / (count - 1)
-    spans = _moved_spans(path, occupied, old, new)
+    new_curve, step = interpolate_curve(new_curve, new_m, position), float(new_m[-1]) / (count - 1)
+    spans = _displaced_spans(path, occupied, old_m, new_m)
     curvature = mean_curvature(new_curve, step)
-    return Path(new_curve, step, curvature, path.limit_mps[index], spans, lane, lane_m), new
+    return Path(new_curve, step, curvature, path.limit_mps[index], spans, lane, lane_m), new_m
 
 
-def _moved_spans(
-    path: Path, occupied: tuple[LaneSpan, ...], old: _Samples, new: _Samples
+def _displaced_spans(
+    path: Path, occupied: tuple[LaneSpan, ...], old_m: _Samples, new_m: _Samples
 ) -> tuple[LaneSpan, ...]:
     """Lane spans of a displaced path, whose samples moved from the old to the new positions."""
 
     def to_new(metres: float) -> float:
         if not math.isfinite(metres) or metres < 0.0:
             return metres
-        return float(np.interp(metres, old, new)) + max(metres - float(old[-1]), 0.0)
+        return float(np.interp(metres, old_m, new_m)) + max(metres - float(old_m[-1]), 0.0)
 
     # A span is anchored at its end: what lies ahead of the displacement stays in place.
     shifts = [to_new(span.end_m) - span.end_m for span in path.spans]
@@ -99,14 +99,14 @@ def _moved_spans(
 
 
 def _enter_span(
-    span: LaneSpan, at: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
+    span: LaneSpan, source: _Samples, lane: np.ndarray, lane_m: Float64[np.ndarray, "point slot"]
 ) -> None:
     """Enter a lane into the first free slot of the samples on which it is occupied, if there is a free one."""
-    is_occupied = (at >= span.from_m) & (at <= span.until_m) & ~(lane == span.lane).any(axis=1)
+    is_occupied = (source >= span.from_m) & (source <= span.until_m) & ~(lane == span.lane).any(axis=1)
     for slot in range(SLOTS):
         is_free = is_occupied & (lane[:, slot] < 0)
         lane[is_free, slot] = span.lane
-        lane_m[is_free, slot] = (at[is_free] - span.begin_m) / span.scale
+        lane_m[is_free, slot] = (source[is_free] - span.begin_m) / span.scale
         is_occupied &= ~is_free
 
 
@@ -167,19 +167,19 @@ def lane_change_path(target: Path, present: Path, at_m: float, length_m: float) 
     heading = float(present.curve.heading[index] * (1 - share) + present.curve.heading[index + 1] * share)
     along, lateral, direction = project_on_path(target, xy)
     relative_heading = float(np.clip(wrap(heading - direction), -0.6, 0.6))
-    old = target.step_m * np.arange(len(target.curve.xy))
-    offset = quintic_step(old, (along, lateral, math.tan(relative_heading)), length_m)
-    own = {span.lane for span in target.spans}
+    old_m = target.step_m * np.arange(len(target.curve.xy))
+    offset = quintic_step(old_m, (along, lateral, math.tan(relative_heading)), length_m)
+    lanes = {span.lane for span in target.spans}
     exit_m = along + _EXIT_SHARE * length_m
     occupied = tuple(
         LaneSpan(
             s.lane, along + s.begin_m - at_m, s.scale, along - 6.0, min(exit_m, along + s.end_m - at_m + 2.0)
         )
         for s in present.spans
-        if s.lane not in own and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
+        if s.lane not in lanes and s.end_m > at_m - 3.0 and s.begin_m < at_m + length_m and s.until_m > at_m
     )
-    path, new = displace_path(target, offset, occupied)
-    return path, float(np.interp(along, old, new))
+    path, new_m = displace_path(target, offset, occupied)
+    return path, float(np.interp(along, old_m, new_m))
 
 
 class DetourPositions(NamedTuple):
@@ -196,9 +196,9 @@ def detour_path(
 ) -> Path:
     """Build a detour to the left by ``aside_m``; beyond 0.7 m to either side it occupies all ``adjacent`` lanes."""
     begin, out_end, back_begin, end = positions
-    old = path.step_m * np.arange(len(path.curve.xy))
-    out = 1.0 - quintic_step(old, (begin, 1.0, 0.0), out_end - begin)
-    back = quintic_step(old, (back_begin, 1.0, 0.0), end - back_begin)
+    position = path.step_m * np.arange(len(path.curve.xy))
+    out = 1.0 - quintic_step(position, (begin, 1.0, 0.0), out_end - begin)
+    back = quintic_step(position, (back_begin, 1.0, 0.0), end - back_begin)
     return displace_path(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUSION_M else ())[0]
 
 
@@ -247,18 +247,18 @@ class Detours:
         is_blocking &= obstacles.near_m > front - 0.5
         if not is_blocking.any():
             return None
-        first = float(obstacles.near_m[is_blocking].min())
-        if not 2.0 < first - front < LOOK_M:
+        first_m = float(obstacles.near_m[is_blocking].min())
+        if not 2.0 < first_m - front < LOOK_M:
             return None
-        last = first
+        last_m = first_m
         for k in np.argsort(obstacles.near_m, kind="stable"):
-            if is_blocking[k] and obstacles.near_m[k] < last + 2 * half_length + 14.0:
-                last = max(last, float(obstacles.far_m[k]))
-        group = is_blocking & (obstacles.near_m <= last)
-        left = float(obstacles.left_m[group].max()) + half_width + _PASSING_GAP_M
-        right = float(obstacles.right_m[group].min()) - half_width - _PASSING_GAP_M
+            if is_blocking[k] and obstacles.near_m[k] < last_m + 2 * half_length + 14.0:
+                last_m = max(last_m, float(obstacles.far_m[k]))
+        is_passed = is_blocking & (obstacles.near_m <= last_m)
+        left = float(obstacles.left_m[is_passed].max()) + half_width + _PASSING_GAP_M
+        right = float(obstacles.right_m[is_passed].min()) - half_width - _PASSING_GAP_M
         for lateral in sorted([left, right], key=abs):
-            positions = _detour_positions(request, first, last, lateral)
+            positions = _detour_positions(request, first_m, last_m, lateral)
             if positions is not None and self._is_free(request, positions, lateral, obstacles, moving):
                 return detour_path(request.path, positions, lateral, request.adjacent), positions.end
         return None
@@ -268,28 +268,28 @@ class Detours:
         moving: Boxes,
     ) -> bool:  # fmt: skip
         """Whether the detour is free of road edges, standing obstacles and oncoming, crossing or overtaking users."""
-        begin, out_end, back, end = positions
+        begin, out_end, back_begin, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M
-        is_blocking = (obstacles.near_m < back) & (obstacles.far_m > out_end)
+        is_blocking = (obstacles.near_m < back_begin) & (obstacles.far_m > out_end)
         is_blocking &= (obstacles.right_m < high) & (obstacles.left_m > low)
-        edges, _ = _extents(request, self._edge, (out_end + back) / 2, (end - begin) / 2 + 15.0)
-        is_edge_near = (edges.near_m > out_end) & (edges.near_m < back)
+        edges, _ = _extents(request, self._edge, (out_end + back_begin) / 2, (end - begin) / 2 + 15.0)
+        is_edge_near = (edges.near_m > out_end) & (edges.near_m < back_begin)
         is_edge_near &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
         if is_blocking.any() or is_edge_near.any():
             return False
         path, position = request.path, request.at_m
         duration_s = (end - position) / max(request.speed, _PASS_MPS) + 1.0
-        others, near = _extents(request, moving, (position + end) / 2, end - position + 90.0, within_m=6.0)
+        others, users = _extents(request, moving, (position + end) / 2, end - position + 90.0, within_m=6.0)
         middle = np.clip((others.near_m + others.far_m) / 2, 0, path.length_m)
-        relative_heading = wrap(near.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
-        speed = near.speed * np.cos(relative_heading)
+        relative_heading = wrap(users.heading - path.curve.heading[np.rint(middle / path.step_m).astype(int)])
+        speed = users.speed * np.cos(relative_heading)
         is_in_corridor = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
         nearest_m = others.near_m + np.minimum(speed, 0.0) * duration_s
         is_ahead = (others.far_m > position) & (nearest_m < end + 5.0)
         is_behind = (others.far_m <= position) & (others.far_m + speed * 3.0 > position - 6.0)
         # A user beyond the detour that drives on is a leader, not a conflict.
-        is_ahead &= ~((speed > 1.0) & (others.near_m > back))
+        is_ahead &= ~((speed > 1.0) & (others.near_m > back_begin))
         return not bool(np.any(is_in_corridor & (is_ahead | is_behind)))
 
 
@@ -303,12 +303,12 @@ def _detour_positions(
     half_length, offset_m = request.size_m[0] / 2, abs(lateral_m)
     out_end = first_m - half_length - _GAP_BEFORE_M
     begin = max(request.at_m, out_end - max(_MIN_RATIO * _OUT_FACTOR * offset_m, _OUT_S * request.speed))
-    back = last_m + half_length + _GAP_BEHIND_M
-    end = back + max(_MIN_RATIO * _BACK_FACTOR * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
+    back_begin = last_m + half_length + _GAP_BEHIND_M
+    end = back_begin + max(_MIN_RATIO * _BACK_FACTOR * offset_m, _BACK_S * min(request.speed, _PASS_MPS))
     is_steep, is_short = out_end - begin < _MIN_RATIO * offset_m, end > request.path.length_m - _END_MARGIN_M
     if offset_m > _MAX_OFFSET_M or is_steep or is_short:
         return None
-    return DetourPositions(begin, out_end, back, end)
+    return DetourPositions(begin, out_end, back_begin, end)
 
 
 def _densify(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:
@@ -325,6 +325,6 @@ def _extents(
     """Return the extents along the path of the boxes within a radius of a position on it, and these boxes."""
     path = request.path
     centre = path.curve.xy[min(int(max(at_m, 0.0) / path.step_m), len(path.curve.xy) - 1)]
-    near = boxes.select(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
-    obstacles, rows = extents(path, near, within_m)
-    return obstacles, near.select(rows)
+    near_boxes = boxes.select(np.sum((boxes.xy - centre) ** 2, axis=1) < radius_m**2)
+    obstacles, rows = extents(path, near_boxes, within_m)
+    return obstacles, near_boxes.select(rows)

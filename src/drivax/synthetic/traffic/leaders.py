@@ -26,7 +26,7 @@ class Leaders:
         self._worlds = worlds
         self._half_m, self._half_width_m = drivers.size_m[:, :2].T / 2
         self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
-        # Half the width of the widest car that may pass a cyclist in the middle of each lane (below 4.8 m: none may).
+        # Half the width of the widest car in the middle of each lane that may pass a cyclist (below 4.8 m: none may).
         widths = [lane.width_m for network in worlds.networks for lane in network.lanes]
         self._passing_half_m = np.array(widths) / 2 - _CYCLIST_PASSING_M
         self._nearest = np.full(len(worlds.world), np.inf), np.zeros(len(worlds.world), int)
@@ -67,11 +67,11 @@ class Leaders:
         gap_m = position[k] - self._half_m[ahead] - own_m[k] - self._half_m[row]
         gap, leader = np.full(len(world), np.inf), vehicle[entry[:, 0]][world]
         np.minimum.at(gap, row, gap_m)
-        # The first of several nearest vehicles is entered last.
+        # Enter the first of several nearest vehicles last.
         nearest = (gap_m == gap[row]).nonzero()[0][::-1]
         leader[row[nearest]] = ahead[nearest]
-        empty = (entry[:, 0] < 0)[world]
-        if empty.any():
-            gap[empty], leader[empty] = (last[empty] for last in self._nearest)
+        is_empty = (entry[:, 0] < 0)[world]
+        if is_empty.any():
+            gap[is_empty], leader[is_empty] = (last[is_empty] for last in self._nearest)
         self._nearest = gap, leader
         return self._nearest

@@ -77,23 +77,23 @@ class Extents:
 def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " box"]]:
     """Return the extents of the boxes near a path, and their rows, as if the path were straight along each box."""
     coarse = path.curve.xy[::8]
-    near_bounds = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
-    inside = np.flatnonzero(near_bounds[:, 0] & near_bounds[:, 1])
-    near, rough = np.zeros(0, int), np.zeros(0, int)
-    for first in range(0, len(inside), _BATCH_SIZE):
-        batch = inside[first : first + _BATCH_SIZE]
-        gap = _squared_distance(boxes.xy[batch, None], coarse)
-        best = gap.argmin(axis=1)
-        close = gap[np.arange(len(batch)), best] < within_m**2
-        near, rough = np.append(near, batch[close]), np.append(rough, 8 * best[close])
-    window = rough[:, None] + np.arange(-8, 9)
+    in_bounds = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
+    candidates = np.flatnonzero(in_bounds[:, 0] & in_bounds[:, 1])
+    rows, coarse_index = np.zeros(0, int), np.zeros(0, int)
+    for first in range(0, len(candidates), _BATCH_SIZE):
+        batch = candidates[first : first + _BATCH_SIZE]
+        squared_gap = _squared_distance(boxes.xy[batch, None], coarse)
+        best = squared_gap.argmin(axis=1)
+        is_close = squared_gap[np.arange(len(batch)), best] < within_m**2
+        rows, coarse_index = np.append(rows, batch[is_close]), np.append(coarse_index, 8 * best[is_close])
+    window = coarse_index[:, None] + np.arange(-8, 9)
     window = np.minimum(np.maximum(window, 0), len(path.curve.xy) - 1)
-    fine = _squared_distance(boxes.xy[near, None], path.curve.xy.take(window, axis=0))
-    index = window[np.arange(len(near)), fine.argmin(axis=1)]
-    position, lateral, angle = _relative_poses(boxes, near, path.curve.xy[index], path.curve.heading[index])
-    length, width = _half_extents(boxes.size_m[near], angle)
+    fine = _squared_distance(boxes.xy[rows, None], path.curve.xy.take(window, axis=0))
+    index = window[np.arange(len(rows)), fine.argmin(axis=1)]
+    position, lateral, angle = _relative_poses(boxes, rows, path.curve.xy[index], path.curve.heading[index])
+    length, width = _half_extents(boxes.size_m[rows], angle)
     position = position + index * path.step_m
-    return Extents(position - length, position + length, lateral - width, lateral + width), near
+    return Extents(position - length, position + length, lateral - width, lateral + width), rows
 
 
 def _squared_distance(
@@ -145,14 +145,14 @@ class StaticObstacles:
             self._enter(row)
 
     def replace(self, row: int, path: Path) -> None:
-        """Enter the path of one vehicle."""
+        """Replace the path of one vehicle."""
         boxes = self.boxes[self._worlds.world[row]]
         if len(boxes):
             self._extents[row], _ = extents(path, boxes)
             self._enter(row)
 
     def _enter(self, row: int) -> None:
-        """Enter the near ends of the obstacles in the corridor of a vehicle."""
+        """Enter the near ends of the obstacles in the corridor of a vehicle's path."""
         path_extents, half = self._extents[row], self._half[row] + _SIDE_MARGIN_M
         near_m = np.sort(path_extents.near_m[(path_extents.right_m < half) & (path_extents.left_m > -half)])
         extra = len(near_m) - self.near_m.shape[1]
@@ -195,12 +195,12 @@ def nearest_obstacles(
     position, left, relative_heading = _relative_poses(users, user, pose[:, :2], pose[:, 2])
     position = position + sample_m
     length, width = _half_extents(users.size_m[user], relative_heading)
-    vehicle = user < count
-    width = np.where(vehicle, np.minimum(width, _MAX_HALF_WIDTH_M), width)
+    is_vehicle = user < count
+    width = np.where(is_vehicle, np.minimum(width, _MAX_HALF_WIDTH_M), width)
     drift = users.speed[user] * np.sin(relative_heading)
     left_soon = left + drift * _DRIFT_S
     size = vehicles.size_m[viewer]
-    half = size[:, 1] / 2 + np.where(vehicle, _VEHICLE_MARGIN_M, _SIDE_MARGIN_M)
+    half = size[:, 1] / 2 + np.where(is_vehicle, _VEHICLE_MARGIN_M, _SIDE_MARGIN_M)
     is_inside = (np.minimum(left, left_soon) - width < half) & (np.maximum(left, left_soon) + width > -half)
     is_inside &= position > at_m[viewer] + 0.3 * size[:, 0]
     k = is_inside.nonzero()[0]
@@ -209,7 +209,7 @@ def nearest_obstacles(
     viewer, user, left, drift = viewer[k], user[k], left[k], drift[k]
     room = position[k] - length[k] - at_m[viewer] - size[k, 0] / 2
     stays = ~_leaves_corridor(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
-    # The nearest of several obstacles of a vehicle is entered last.
+    # Enter the nearest of several obstacles of a vehicle last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
     gap[viewer[order]] = room[order]
@@ -235,7 +235,7 @@ def _nearby_pairs(
     cos, sin = vehicles.direction
     ahead = dx * cos[:, None]
     ahead += dy * sin[:, None]
-    # Below 13 m/s it exceeds the comfortable stopping distance; less for vehicles, which follow others and the rules.
+    # Below 13 m/s this exceeds the comfortable stopping distance; less for vehicles, which follow others and the rules.
     reach = np.where(active, np.minimum(_RANGE_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
     is_near = ahead > 0.5
     is_near[:, :count] &= ahead[:, :count] < np.minimum(reach, _VEHICLE_RANGE_M)
@@ -254,14 +254,14 @@ def _nearest_samples(
     """Return the sample of the path ahead nearest to each point, its position, and the squared distance."""
     points, index = tables.samples_ahead(at_m, viewer, _SAMPLES_M)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
-    separation = dx * dx + dy * dy
-    nearest = np.arange(len(viewer)), separation.argmin(axis=1)
-    return points[nearest], index[nearest] * tables.step_m[viewer], separation[nearest]
+    squared_gap = dx * dx + dy * dy
+    nearest = np.arange(len(viewer)), squared_gap.argmin(axis=1)
+    return points[nearest], index[nearest] * tables.step_m[viewer], squared_gap[nearest]
 
 
 def _leaves_corridor(
-    left: _Values, drift: _Values, reach: _Values, seconds: _Values
+    left: _Values, drift: _Values, reach: _Values, arrival_s: _Values
 ) -> Bool[np.ndarray, " k"]:
-    """Mask of crossing users that leave the corridor well before the vehicle arrives, ``seconds`` from now."""
-    left_at_arrival = left + drift * np.maximum(seconds - _CLEARANCE_S, 0.0)
-    return (seconds > 2 * _CLEARANCE_S) & (np.abs(left_at_arrival) > reach) & (left_at_arrival * drift > 0)
+    """Mask of crossing users that leave the corridor well before the vehicle arrives, in ``arrival_s``."""
+    left_at_arrival = left + drift * np.maximum(arrival_s - _CLEARANCE_S, 0.0)
+    return (arrival_s > 2 * _CLEARANCE_S) & (np.abs(left_at_arrival) > reach) & (left_at_arrival * drift > 0)

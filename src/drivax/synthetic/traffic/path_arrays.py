@@ -98,7 +98,7 @@ class Worlds:
 class PathTables:
     """Lookup tables of all paths, one row per vehicle; a row is replaced when its vehicle takes another path.
 
-    Indices of lanes and crossings run through all worlds. Samples of replacing paths are appended to the others.
+    Indices of lanes and crossings run through all worlds. Samples of new paths are appended to the others.
 
     Attributes:
         worlds: The worlds of the vehicles.
@@ -201,8 +201,8 @@ class PathTables:
     def present_begin(self, at_m: PerVehicle) -> Float64[np.ndarray, "v lane"]:
         """``begin`` of the spans that vehicles occupy at their positions, nan elsewhere."""
         rows = self._is_limited.nonzero()[0]
-        own = at_m[rows, None]
-        is_occupied = (self.from_m[rows] <= own) & (own <= self.until_m[rows])
+        position = at_m[rows, None]
+        is_occupied = (self.from_m[rows] <= position) & (position <= self.until_m[rows])
         self._present[rows] = np.where(is_occupied, self.begin[rows], np.nan)
         return self._present
 

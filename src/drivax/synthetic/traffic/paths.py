@@ -114,7 +114,7 @@ def random_lanes(
     while network.lanes[lanes[-1]].successors:
         options = next_lanes(network, lanes)
         options = [lane for lane in options if lane in preferred] or options
-        # As rng.choice, several times as fast.
+        # The same draw as rng.choice, several times as fast.
         lanes.append(options[int(rng.integers(len(options)))])
     return tuple(lanes)
 
@@ -138,12 +138,12 @@ def _lane_change_path(network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, 
             continue
         curve = network.lanes[lane].curve
         if index == change.section:
-            new = lanes[index + 1]
-            curve, (entry_m, exit_m) = _lane_change_curve(curve, network.lanes[new].curve, change)
+            new_lane = lanes[index + 1]
+            curve, (entry_m, exit_m) = _lane_change_curve(curve, network.lanes[new_lane].curve, change)
             length = float(curve.arc_m[-1])
             spans += [
                 _span(network, lane, position, length, until_m=position + exit_m),
-                _span(network, new, position, length, from_m=position + entry_m),
+                _span(network, new_lane, position, length, from_m=position + entry_m),
             ]
         else:
             length = network.lanes[lane].length_m
@@ -195,7 +195,7 @@ def _lane_change_curve(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, t
 
 
 def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list[LaneSpan]) -> Path:
-    """Resample a curve and add curvature, limits and lanes; spans of a total length are stretched to the curve."""
+    """Resample a curve and add curvature, limits and lanes; spans of total length ``length_m`` are stretched to it."""
     curve = resample(curve, STEP_M)
     stretch = float(curve.arc_m[-1]) / length_m
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
@@ -203,9 +203,9 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
     position = step * np.arange(len(curve.xy))
     lane, lane_m = np.full((len(position), SLOTS), -1, np.int32), np.zeros((len(position), SLOTS))
     limit = np.full(len(position), math.inf)
-    sizes = [span.scale * network.lanes[span.lane].length_m for span in spans]
+    lengths = [span.scale * network.lanes[span.lane].length_m for span in spans]
     begins = position.searchsorted([span.begin_m - 1e-6 for span in spans]).tolist()
-    ends = position.searchsorted([s.begin_m + size - 1e-6 for s, size in zip(spans, sizes, strict=True)])
+    ends = position.searchsorted([s.begin_m + m - 1e-6 for s, m in zip(spans, lengths, strict=True)])
     # Samples beyond the last lane's end by rounding still belong to it.
     ends[-1] = len(position)
     shared, end = _shared_lanes(network), 0
@@ -221,10 +221,10 @@ def _build_path(network: RoadNetwork, curve: Curve, length_m: float, spans: list
             if until_m == math.inf and first >= end and not is_limited:
                 lane[samples, 0], lane_m[samples, 0] = shared_lane, along
             else:
-                # Positions increase unless they are limited.
+                # Positions along the lane increase unless the span is limited.
                 count = len(along) if is_limited else int(along.searchsorted(until_m))
-                near = slice(first, first + count)
-                _occupy(lane[near], lane_m[near], shared_lane, along[:count], until_m)
+                shared_samples = slice(first, first + count)
+                _occupy(lane[shared_samples], lane_m[shared_samples], shared_lane, along[:count], until_m)
         end = max(end, last)
     return Path(curve, step, mean_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 

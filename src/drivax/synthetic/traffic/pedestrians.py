@@ -106,9 +106,9 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
             leaving = current.predecessors
         for connector in (*entering, *leaving):
             curve = network.lanes[connector].curve
-            straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
-            conflicts = connector in entering or straight or connector in arrows
-            result[connector] |= conflicts and network.lanes[connector].control == Control.SIGNAL
+            is_straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
+            is_conflicting = connector in entering or is_straight or connector in arrows
+            result[connector] |= is_conflicting and network.lanes[connector].control == Control.SIGNAL
     return result
 
 
@@ -190,14 +190,14 @@ class Pedestrians:
     def _blocked_by_vehicles(
         self, pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: VehicleMask
     ) -> _Mask:
-        """Mask of pedestrians that would come too close to a vehicle and are not close to a vehicle yet."""
+        """Mask of pedestrians that are not too close to a vehicle yet, but would be 0.6 m further on."""
         x, y, angle = pose.T
-        blocked = self._is_near_vehicle(
+        is_blocked = self._is_near_vehicle(
             x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), self.world, vehicles, active
         )
-        rows = blocked.nonzero()[0]
-        blocked[rows] = ~self._is_near_vehicle(x[rows], y[rows], self.world[rows], vehicles, active)
-        return blocked
+        rows = is_blocked.nonzero()[0]
+        is_blocked[rows] = ~self._is_near_vehicle(x[rows], y[rows], self.world[rows], vehicles, active)
+        return is_blocked
 
     def _is_near_vehicle(
         self, x: _Values, y: _Values, world: _Indices, vehicles: Boxes, active: VehicleMask
@@ -300,20 +300,20 @@ def _arrivals(
         return any_s, hard_s
     is_requested = np.zeros(len(conflicts.marked), bool)
     is_requested[crossings] = True
-    at = is_requested[conflicts.crossing].nonzero()[0]
-    offset = conflicts.xy[at, None] - boxes[None, :, :2]
+    rows = is_requested[conflicts.crossing].nonzero()[0]
+    offset = conflicts.xy[rows, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = offset[..., 0] * cos + offset[..., 1] * sin
     lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
-    heading = conflicts.heading[at, None]
+    heading = conflicts.heading[rows, None]
     same_direction = np.cos(heading) * cos + np.sin(heading) * sin
     same_direction = same_direction > math.cos(_MAX_HEADING_DIFFERENCE)
-    approaching = (ahead > -1.0) & (lateral < 2.0 + math.tan(_MAX_BEARING) * np.maximum(ahead, 0.0))
-    approaching &= same_direction & (speed > _STANDING_MPS)
+    is_approaching = (ahead > -1.0) & (lateral < 2.0 + math.tan(_MAX_BEARING) * np.maximum(ahead, 0.0))
+    is_approaching &= same_direction & (speed > _STANDING_MPS)
     distance = np.maximum(np.hypot(ahead, lateral) - boxes[:, 4] / 2, 0.0)
-    time = np.where(approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
+    time = np.where(is_approaching, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
-    of_crossing = conflicts.crossing[at]
+    of_crossing = conflicts.crossing[rows]
     np.minimum.at(any_s, of_crossing, time.min(axis=1))
     np.minimum.at(hard_s, of_crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s

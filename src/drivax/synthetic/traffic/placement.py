@@ -26,8 +26,7 @@ _MIN_FROM_ENDS_M = 15.0
 _LENGTH_M, _GAP_M, _GAP_S = 10.0, 5.0, 0.9
 #: Free gaps on busy lanes relative to those elsewhere.
 _BUSY_GAP_SHARE = 0.4
-#: No cyclists start where the speed limit is higher, except on bicycle lanes, m/s; their distance from the lane's right
-#: side, m.
+#: Speed limit above which no cyclists start, except on bicycle lanes, m/s; cyclists' distance from the right side, m.
 _MAX_CYCLING_LIMIT_MPS, _KERB_M = 16.0, 0.55
 #: Time before the end of a lane with ``ends`` within which no vehicle is placed, s.
 _MERGE_S = 5.0
@@ -64,12 +63,12 @@ def parked_cars(
     """
     result = []
     for bay in network.bays:
-        # Drawn for every bay, so that cars do not depend on the share.
+        # Draw for every bay, so that the cars do not depend on the share of occupied bays.
         size = _draw_size(rng, bay.length_m)
         along, lateral = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
-        occupied = rng.random() < share
-        if occupied and size[0] < bay.length_m:
+        is_occupied = rng.random() < share
+        if is_occupied and size[0] < bay.length_m:
             clearance = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
             pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
@@ -202,10 +201,7 @@ def _least_spacing_m(lane: Lane) -> float:
 
 
 def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place, most: int) -> _Places:
-    """Drop vehicles close to an earlier one, which may be on another lane, for example where lanes fork or merge.
-
-    The first ``most`` of the others are kept.
-    """
+    """Drop vehicles close to an earlier one, even on another lane; keep at most the first ``most`` of the others."""
     centres: list[tuple[float, float]] = []
     result = []
     for lane, along in [ego, *vehicles]:
@@ -247,7 +243,7 @@ def _is_blocked(
 
 
 def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles too close to the next one across a lane's end: behind the first of that lane, or ahead of ego."""
+    """Drop vehicles too close to the next one across a lane's end: behind the next lane's first, or ahead of ego."""
     remaining = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}
@@ -285,8 +281,8 @@ def draw_drivers(
     # Types in the order of the shares; the rest are cars.
     kind = (np.searchsorted(shares, rng.random(count), side="right") + 1) % (len(shares) + 1)
     if lanes is not None:
-        fast = np.array([lane.limit_mps > _MAX_CYCLING_LIMIT_MPS for lane in lanes], bool)
-        kind[(kind == _CYCLIST) & fast] = _CAR
+        is_fast = np.array([lane.limit_mps > _MAX_CYCLING_LIMIT_MPS for lane in lanes], bool)
+        kind[(kind == _CYCLIST) & is_fast] = _CAR
         kind[np.array([lane.kind == RoadKind.LANE_BIKE for lane in lanes], bool)] = _CYCLIST
     size = rng.uniform(_SIZES[kind, 0], _SIZES[kind, 1])
     is_heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST

@@ -25,10 +25,9 @@ from drivax.synthetic.traffic.roles import Drivers
 
 #: Braking with which a driver can still stop when it requests a connector, m/s2, and reserves of time and distance.
 _REQUEST_MPS2, _REQUEST_S, _REQUEST_M = 2.0, 0.7, 3.5
-#: Required braking below which a driver does not brake yet for blockers that clear in time, m/s2, and their top speed
-#: while they do, m/s.
+#: Required braking below which drivers do not brake for blockers that clear in time, m/s2; blockers' top speed, m/s.
 _WAITING_MPS2, _TURNING_MPS = 3.4, 7.0
-#: Largest required braking to stop: for others, at red, and at yellow that turns red before the line is reached, m/s2.
+#: Largest braking to stop at a line: for others, at red, and at yellow that turns red before the line is reached, m/s2.
 _HARDEST_MPS2, _RED_MPS2, _LATE_YELLOW_MPS2 = 6.5, 8.0, 5.0
 #: A vehicle has stopped at a sign below this speed, m/s, and within this distance of the line, m.
 _STOPPED_MPS, _STOPPED_M = 0.2, 4.5
@@ -89,12 +88,12 @@ def conflict_zones(
     box = {i: (xy.min(axis=0), xy.max(axis=0)) for i, xy in points.items()}
     for a, xy_a in points.items():
         origin = set(network.lanes[a].predecessors)
-        for b, other in points.items():
+        for b, xy_b in points.items():
             if b <= a or origin & set(network.lanes[b].predecessors):
                 continue
             if np.any(box[a][0] > box[b][1] + CLEARANCE_M) or np.any(box[b][0] > box[a][1] + CLEARANCE_M):
                 continue
-            dx, dy = (np.subtract.outer(xy_a[:, k], other[:, k]) for k in (0, 1))
+            dx, dy = (np.subtract.outer(xy_a[:, k], xy_b[:, k]) for k in (0, 1))
             is_near = dx * dx + dy * dy < CLEARANCE_M**2
             for i, j, hit in ((a, b, is_near.any(axis=1)), (b, a, is_near.any(axis=0))):
                 if hit.any():
@@ -189,26 +188,26 @@ class RightOfWay:
         """Decide all requests and return the distance to the next line at which to stop (infinite: none)."""
         begin = state.tables.connector_begin
         connectors = begin.shape[1]
-        entered = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
-        self._grants = np.maximum(self._grants, entered)
-        stop, closed_slot = self._closed_lines(state)
-        self._grants = np.maximum(np.minimum(self._grants, closed_slot), entered)
+        entered_count = np.add.reduce(begin < state.front_m[:, None], axis=1, dtype=np.int64)
+        self._grants = np.maximum(self._grants, entered_count)
+        stop_m, closed_slot = self._closed_lines(state)
+        self._grants = np.maximum(np.minimum(self._grants, closed_slot), entered_count)
         for row, count in state.committed.items():
-            self._grants[row] = max(count, entered[row])
-        near = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
+            self._grants[row] = max(count, entered_count[row])
+        request_m = state.speed**2 / (2 * _REQUEST_MPS2) + _REQUEST_S * state.speed + _REQUEST_M
         index = np.minimum(self._grants, connectors - 1)
         # Without a connector ahead the distance is infinite.
         distance = begin.ravel().take(index + connectors * self._rows) - state.front_m
-        requests = (distance >= 0) & (distance <= near) & state.active & (closed_slot > index)
+        is_requesting = (distance >= 0) & (distance <= request_m) & state.active & (closed_slot > index)
         for row in state.committed:
-            requests[row], stop[row] = False, np.inf
-        self._is_denied &= requests
-        rows = requests.nonzero()[0]
+            is_requesting[row], stop_m[row] = False, np.inf
+        self._is_denied &= is_requesting
+        rows = is_requesting.nonzero()[0]
         if len(rows):
             holders = self._holders(state)
-            for world, requested in groupby(self._requests(state, rows, index), self._world):
-                self._grant(state, world, list(requested), holders[world], stop)
-        return stop
+            for world, requests in groupby(self._requests(state, rows, index), self._world):
+                self._grant(state, world, list(requests), holders[world], stop_m)
+        return stop_m
 
     def _world(self, request: _Request) -> int:
         return int(self._worlds.world[request.row])
@@ -257,11 +256,11 @@ class RightOfWay:
         return np.where(has_line, distance.ravel().take(flat), np.inf), np.where(has_line, first, count)
 
     def _grant(
-        self, state: TrafficState, world: int, requests: list[_Request], holders: _Holders, stop: PerVehicle
+        self, state: TrafficState, world: int, requests: list[_Request], holders: _Holders, stop_m: PerVehicle
     ) -> None:
         """Grant or deny requests, nearest in time first, at all-way stops in the order of arrival.
 
-        A request that only waits for blockers which clear in time is postponed.
+        A denial enters the distance to the line in ``stop_m``. A request is postponed if its blockers clear in time.
         """
         rules = self._rules[world]
         for request in requests:
@@ -285,7 +284,7 @@ class RightOfWay:
                 self._stopped_at_s[i] = np.inf
                 holders.append((i, connector))
             else:
-                stop[i] = min(stop[i], request.distance_m)
+                stop_m[i] = min(stop_m[i], request.distance_m)
                 if rules.control[connector] == _ALL_WAY_STOP and self._stopped_at_s[i] < np.inf:
                     waiting.append(connector)
 
@@ -297,31 +296,31 @@ class RightOfWay:
             if rules.control[r.connector] == _ALL_WAY_STOP
         ]
         key = {request.row: request.distance_m / max(request.speed, 1.0) for request in requests}
-        for request, stood in stops:
+        for request, stopped_s in stops:
             # Of vehicles that arrived simultaneously, the one with none to its right goes first.
-            tied = (r.connector for r, since in stops if abs(since - stood) < _TIE_S)
+            tied = (r.connector for r, other_s in stops if abs(other_s - stopped_s) < _TIE_S)
             angles = (wrap(rules.heading[c] - rules.heading[request.connector]) for c in tied)
             to_right = any(math.pi / 4 < angle < 3 * math.pi / 4 for angle in angles)
-            key[request.row] = 1e3 + min(stood, 1e6) + 0.5 * _TIE_S * to_right
+            key[request.row] = 1e3 + min(stopped_s, 1e6) + 0.5 * _TIE_S * to_right
         return sorted(requests, key=lambda request: (key[request.row], request.row))
 
     def _may_enter(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
         """Whether its stop, its leader, conflicts, room beyond the connector and priority permit a vehicle to enter."""
-        i, connector, line = request.row, request.connector, request.line_m
+        i, connector, line_m = request.row, request.connector, request.line_m
         control = rules.control[connector]
         if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
             return False
-        tail = float(state.front_m[i] + state.room_m[i])
-        if tail < line and self._is_denied[state.leader[i]]:
+        leader_rear_m = float(state.front_m[i] + state.room_m[i])
+        if leader_rear_m < line_m and self._is_denied[state.leader[i]]:
             return False
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
         exit_m = state.tables.connector_end[i, request.slot]
-        is_full = tail < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
+        is_full = leader_rear_m < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
         # Behind a leader that is not yet in the junction, or without a rule, vehicles follow as on other lanes.
-        if is_full and tail >= line - 1.0 and control != _NONE:
+        if is_full and leader_rear_m >= line_m - 1.0 and control != _NONE:
             return False
         return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)
 
@@ -346,8 +345,8 @@ class RightOfWay:
         if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
         blockers = self._blockers(state, rules, request, holders)
-        prior = set(rules.yields_to[connector].tolist())
-        if not blockers or any(blocker.connector in prior for blocker in blockers):
+        priority_connectors = set(rules.yields_to[connector].tolist())
+        if not blockers or any(blocker.connector in priority_connectors for blocker in blockers):
             return False
         for blocker in blockers:
             speed = float(state.speed[blocker.row])
@@ -375,15 +374,15 @@ class RightOfWay:
             return True
         rows, columns = np.nonzero(is_coming)
         speed, rivals = state.speed[vehicles][rows], others[columns]
-        arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
-        departure = clear[rows, columns] / np.maximum(speed, 0.3)
+        arrival_s = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
+        departure_s = clear[rows, columns] / np.maximum(speed, 0.3)
         top = float(tables.interpolate(np.array([request.line_m + 5.0]), slice(i, i + 1))[0, 3])
         own_speed, acceleration = request.speed, float(self._drivers.acceleration_mps2[i])
         to_zone = request.distance_m + rules.zone_begin[connector, rivals]
         through_zone = request.distance_m + rules.zone_end[connector, rivals] + self._length[i]
-        enter = time_to_cover(to_zone, own_speed, acceleration, top)
-        leave = time_to_cover(through_zone, own_speed, acceleration, top)
+        enter_s = time_to_cover(to_zone, own_speed, acceleration, top)
+        leave_s = time_to_cover(through_zone, own_speed, acceleration, top)
         wait_s = state.step * DT_S - self._stopped_at_s[i] if self._stopped_at_s[i] < np.inf else 0.0
         patience = 1.0 - min(wait_s / _IMPATIENT_S, 1.0) / 3.0
-        least_gap = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
-        return not np.any((arrival < least_gap) & (departure > enter - 0.3))
+        least_gap_s = np.maximum(self._drivers.critical_gap_s[i] * patience, leave_s + 0.5)
+        return not np.any((arrival_s < least_gap_s) & (departure_s > enter_s - 0.3))

@@ -75,7 +75,7 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
 def add_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
     """Add the lanes that lead to any of several lanes within 160 m.
 
-    The search is depth first: a lane that it reaches on the longer of two ways first may lack feeders.
+    The search is depth first: a lane that it first reaches by the longer of two paths may lack feeders.
     """
     result: set[int] = set()
     queue = [(lane, 0.0) for lane in sorted(lanes)]
@@ -130,7 +130,7 @@ def assign_roles(
         paths=paths,
         drivers=drivers,
         distance_m=distance,
-        speed_mps=_first_speeds(network, paths, drivers, distance, rng),
+        speed_mps=_initial_speeds(network, paths, drivers, distance, rng),
         route=lanes,
         pedestrians=place_pedestrians(network, float(rng.uniform(*domain.pedestrians)), rng, times_s),
         parked=parked,
@@ -141,7 +141,7 @@ def _draw_route(
     network: RoadNetwork, driver: Drivers, first_s: float, lane_change_share: float, rng: np.random.Generator,
     destination_route: DestinationRoute | None, attempts: int = 0,
 ) -> tuple[tuple[int, ...], Path, float]:  # fmt: skip
-    """Draw ego's lanes, path and position before the warm-up, up to ``attempts`` times more until it must give way."""
+    """Draw ego's lanes, path and position before the warm-up; redraw up to ``attempts`` times until it must yield."""
     if destination_route is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
         lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
@@ -180,10 +180,10 @@ def _shift_lights(
     return replace(plan, offset_s=float(green_at) - plan.starts_s[phase])
 
 
-def _first_speeds(
+def _initial_speeds(
     network: RoadNetwork, paths: list[Path], drivers: Drivers, distance: _Values, rng: np.random.Generator
 ) -> _Values:
-    """Draw speeds at which each vehicle can stop 2 m before its next connector with 1.5 m/s2."""
+    """Draw speeds at which each vehicle can stop 2 m before its next connector at 1.5 m/s2."""
     speeds = []
     for i, path in enumerate(paths):
         fastest = driver_profile(path, drivers, i)

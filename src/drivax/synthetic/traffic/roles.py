@@ -131,7 +131,7 @@ class Roles:
 
     Attributes:
         paths: Paths of vehicles and of cyclists on lanes.
-        distance_m, speed_mps: Initial positions of their centres along the paths, and speeds.
+        distance_m, speed_mps: Initial positions of the vehicles' centres along the paths, and initial speeds.
         route: Lanes of ego's intended route, in order.
         parked: Cars parked next to or in the lanes.
     """
@@ -158,7 +158,7 @@ class Override:
 
 @dataclass(frozen=True)
 class Tailgate:
-    """Time gap of a vehicle to its leader, in place of its driver's."""
+    """Time gap of a vehicle to its leader, which replaces its driver's headway."""
 
     vehicle: int
     headway_s: float

@@ -62,7 +62,7 @@ _LINE_GAP_M = 1.0
 _OBSTACLE_GAP_M = 5.0
 #: Gap that the IDM keeps, and distance kept to the end of a lane in addition to it, m.
 _IDM_GAP_M, _LANE_END_GAP_M = 2.0, 10.0
-#: Largest speed of a vehicle that starts a detour; in worlds with a stuck vehicle or a halted user, m/s.
+#: Largest speed of a vehicle that starts a detour, in general and in worlds with a stuck vehicle or halted user, m/s.
 _DETOUR_MPS, _SLOW_DETOUR_MPS = 9.0, 3.0
 #: Speed below which vehicles and users count as halted, m/s, and length of users that need a detour, m.
 _HALTED_MPS, _LARGE_M = 0.05, 1.2
@@ -205,7 +205,7 @@ def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     remaining = iter(enumerate(tasks))
     results: dict[int, _T] = {}
     waiting: dict[int, tuple[Generator[Run, Motion, _T], Run]] = {}
-    first = 0
+    next_number = 0
 
     def advance(number: int, task: Generator[Run, Motion, _T], motion: Motion | None) -> None:
         try:
@@ -216,9 +216,9 @@ def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     while True:
         while len(waiting) < _BATCH_RUNS and (entry := next(remaining, None)):
             advance(*entry, None)
-        while first in results:
-            yield results.pop(first)
-            first += 1
+        while next_number in results:
+            yield results.pop(next_number)
+            next_number += 1
         if not waiting:
             return
         batch, waiting = waiting, {}
@@ -240,7 +240,7 @@ class _Simulation:
         self._tables = PathTables(worlds, [path for r in roles for path in r.paths], drivers)
         self._gather_obstacles(runs)
         self._right_of_way = RightOfWay(worlds, drivers)
-        self._changes = LaneChanges(worlds, drivers, self._standing.boxes)
+        self._changes = LaneChanges(worlds, drivers, self._obstacles.boxes)
         self._leaders = Leaders(worlds, drivers)
         self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _MAX_REACTION_STEPS)
         for first_row, run in zip(self._ego_rows.tolist(), runs, strict=True):
@@ -258,8 +258,8 @@ class _Simulation:
             static = tuple(user for user in run.staging.extras if user.is_static)
             boxes.append(run.traffic.parked.concatenate(boxes_at(static, 0)))
             path_extents += run.traffic.extents(boxes[-1]) if static else run.traffic.parked_extents
-        self._standing = StaticObstacles(self._worlds, boxes, path_extents, self._width_m)
-        self._has_standing = np.array([len(standing) > 0 for standing in boxes])
+        self._obstacles = StaticObstacles(self._worlds, boxes, path_extents, self._width_m)
+        self._has_obstacles = np.array([len(standing) > 0 for standing in boxes])
 
     def _gather_pedestrians(self, runs: Sequence[Run]) -> None:
         """Gather pedestrians and the state of crossings."""
@@ -286,7 +286,7 @@ class _Simulation:
         self._busy_m, self._rest_until = np.full(count, -np.inf), np.zeros(count, int)
         self._gap_pairs = NO_GAP_PAIRS
         # Gap to and speed of the next leader, line and obstacle.
-        self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
+        self._gaps, self._leader_speeds = np.full((3, count), np.inf), np.zeros((3, count))
         self._moving_users = self._vehicles = _NO_BOXES
         self._user_world, self._users_by_world = self._pedestrian_world, self._pedestrians_by_world
         self._colour = np.concatenate(pad_steps([traffic.colour for traffic in traffics]), axis=1)
@@ -354,9 +354,9 @@ class _Simulation:
         world = int(self._worlds.world[row])
         crossings = self._tables.crossings[world]
         self._tables.replace(row, path)
-        self._standing.replace(row, path)
+        self._obstacles.replace(row, path)
         self._position_m[row] = position_m
-        # Where a path has more crossings than any before, all vehicles of its world decide again: stored sets need it.
+        # With more crossings than on any path before, all vehicles of its world decide again: stored sets depend on it.
         widened = self._tables.crossings[world] > crossings
         self._brakes_for_crossing[self._worlds.vehicles(world) if widened else row] = False
         self._right_of_way.reset_vehicle(row, self._tables, position_m + self._half_m[row])
@@ -381,9 +381,9 @@ class _Simulation:
         self, t: int, fastest: PerVehicle, fastest_ahead: PerVehicle, active: VehicleMask
     ) -> PerVehicle:
         """Return the least acceleration for leaders, lines, obstacles, gaps to open, and top speeds here and ahead."""
-        gaps, leads = self._gaps, self._leads
+        gaps, leader_speeds = self._gaps, self._leader_speeds
         gaps[0], leader = self._leaders.find(self._tables, self._position_m, active)
-        leads[0] = self._speed[leader]
+        leader_speeds[0] = self._speed[leader]
         # Lines and obstacles are updated in alternate steps and extrapolated in the others.
         if t % 2 or t == 0:
             gaps[1] = self._stop_gap(t, active, leader)
@@ -391,14 +391,14 @@ class _Simulation:
             gaps[1] -= self._speed * DT_S
         if t % 2 == 0:
             others = self._moving_users, self._users_by_world
-            gaps[2], leads[2] = nearest_obstacles(
+            gaps[2], leader_speeds[2] = nearest_obstacles(
                 self._tables, self._vehicles, self._position_m, active, *others
             )
         else:
-            gaps[2] += (leads[2] - self._speed) * DT_S
+            gaps[2] += (leader_speeds[2] - self._speed) * DT_S
         # Only an ego on a plan could reverse; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
-        accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
+        accelerations = idm_acceleration(speed, fastest, gaps, np.maximum(leader_speeds, 0.0), self._idm)
         # Braking for a line is limited to a little more than it takes to stop there.
         to_stop = speed**2 / (2 * np.maximum(gaps[1] - (_IDM_GAP_M - _LINE_GAP_M), 0.1))
         lines = np.maximum(accelerations[1], -_LINE_BRAKING_FACTOR * to_stop - 0.5)
@@ -438,15 +438,15 @@ class _Simulation:
             active=active,
             room_m=self._gaps[0],
             leader=leader,
-            leader_speed=self._leads[0],
+            leader_speed=self._leader_speeds[0],
             committed=committed,
         )
         room = self._right_of_way.stop_line_m(state) + _IDM_GAP_M - _LINE_GAP_M
         if np.count_nonzero(self._occupied_crossings):
             room = np.minimum(room, self._crossing_gap(front) + _IDM_GAP_M - _LINE_GAP_M)
         room = np.minimum(room, tables.stop_m - front - _LANE_END_GAP_M)
-        if self._has_standing.any():
-            room = np.minimum(room, self._standing.gap(front) + _IDM_GAP_M - _OBSTACLE_GAP_M)
+        if self._has_obstacles.any():
+            room = np.minimum(room, self._obstacles.gap(front) + _IDM_GAP_M - _OBSTACLE_GAP_M)
         return room
 
     def _crossing_gap(self, front: PerVehicle) -> PerVehicle:
@@ -476,7 +476,7 @@ class _Simulation:
         return result
 
     def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
-        """Advance by one step and return the accelerations (until the stop, where a vehicle stops)."""
+        """Advance by one step and return the accelerations (of a vehicle that stops: until it stands)."""
         last, jerk = self._last_acceleration, self._drivers.jerk_mps3 * DT_S
         braking_jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.minimum(np.maximum(preferred, last - braking_jerk), last + jerk)
@@ -518,7 +518,7 @@ class _Simulation:
         while network.lanes[lanes[-1]].successors:
             options = next_lanes(network, lanes)
             on_path = [lane for lane in options if lane in old_lanes]
-            # Other branches take turns, which draws no random number.
+            # Otherwise vehicles take the branches in turn, without a random draw.
             lanes.append(on_path[0] if on_path else options[(number + len(lanes)) % len(options)])
         # One wave of 8 cm, 90 m long, with a phase of the vehicle's own.
         sway = Sway((0.08,), (0.07,), (float(number),))
@@ -536,16 +536,16 @@ class _Simulation:
         is_large = is_halted & (self._moving_users.size_m[:, 0] > _LARGE_M)
         has_stuck = worlds.mask(worlds.world[is_stuck])
         has_halted = has_stuck | worlds.mask(self._user_world[is_large])
-        considered = has_halted | self._has_standing
-        if not considered.any():
+        may_detour = has_halted | self._has_obstacles
+        if not may_detour.any():
             return
         front = self._position_m + self._half_m
         slow_only = (has_stuck | worlds.mask(self._user_world[is_halted]))[worlds.world]
-        is_looking = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._standing.gap(front) < LOOK_M)
-        is_looking &= may_decide & considered[worlds.world] & (self._speed < _DETOUR_MPS)
+        is_looking = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._obstacles.gap(front) < LOOK_M)
+        is_looking &= may_decide & may_detour[worlds.world] & (self._speed < _DETOUR_MPS)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
         for row in is_looking.nonzero()[0].tolist():
-            if has_halted[worlds.world[row]] or self._standing.is_blocked(
+            if has_halted[worlds.world[row]] or self._obstacles.is_blocked(
                 row, front[row], half_m[row], LOOK_M
             ):
                 self._start_detour(t, row, is_stuck, is_large)
@@ -558,7 +558,7 @@ class _Simulation:
         own_users, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= _HALTED_MPS
         is_other = (self._position_m > 0.0) & ~is_stuck & (worlds.world == world)
         is_other[row] = False
-        standing = self._standing.boxes[world].concatenate(
+        standing = self._obstacles.boxes[world].concatenate(
             self._vehicles.select(is_stuck & (worlds.world == world))
         )
         standing = standing.concatenate(self._moving_users.select(is_large & own_users))

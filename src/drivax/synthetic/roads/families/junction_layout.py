@@ -121,7 +121,7 @@ class Approach:
 
 @dataclass(frozen=True)
 class Move:
-    """A connector, the numbers of the approaches from which (``arm``) and to which it leads, and its turn."""
+    """A connector lane, the numbers of the approaches from which (``arm``) and ``to`` which it leads, and its turn."""
 
     lane: int
     arm: int
@@ -166,7 +166,7 @@ class Geometry:
     """Geometry of a junction.
 
     Attributes:
-        skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre.
+        skew, offset_m: Largest deviation of an arm from its direction, rad, and from the centre, m.
         corner_m: Radius of the corners' kerbs, low and high.
         sidewalk_m: Distance of sidewalks from the edge, low and high.
     """
@@ -225,7 +225,7 @@ def _intersection(before: Arm, after: Arm) -> tuple[float, float]:
 
 
 def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
-    """Add an arm that leads off the map."""
+    """Add an arm that leads off the map, and return its approach."""
     middle = reach.draw(rng, arm.base.ahead(mouth_m + arm.street.stop_line_m))
     side = join_curves(straight(arm.base.ahead(mouth_m), arm.street.stop_line_m), middle)
     return Approach(arm, mouth_m, middle, side, *add_lanes(draft, arm.street, middle))
@@ -284,8 +284,8 @@ def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
                 pairs = [(lanes[j], targets[shift + j]) for j in range(first, len(lanes)) if shift + j >= 0]
             else:
                 pairs = [(lanes[0], targets[0]) if turn == Turn.LEFT else (lanes[-1], targets[-1])]
-            ends = (approach.arm.street.stop_line_m, site.approaches[k].arm.street.stop_line_m)
-            moves += [Move(_add_connector(draft, a, b, ends), i, k, turn) for a, b in pairs]
+            ends_m = (approach.arm.street.stop_line_m, site.approaches[k].arm.street.stop_line_m)
+            moves += [Move(_add_connector(draft, a, b, ends_m), i, k, turn) for a, b in pairs]
     return Site(site.approaches, tuple(moves))
 
 
@@ -386,10 +386,10 @@ def _add_crossings(draft: Draft, site: Site) -> None:
         if street.marked:
             draft.crosswalk(near.aside(left), far.aside(left), far.aside(right), near.aside(right))
         # Connectors begin and end at the stop line.
-        inside = street.stop_line_m - (begin + end) / 2
-        entering = [(move.lane, inside) for move in site.moves if move.arm == i]
+        to_axis_m = street.stop_line_m - (begin + end) / 2
+        entering = [(move.lane, to_axis_m) for move in site.moves if move.arm == i]
         leaving = [
-            (move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i
+            (move.lane, draft.lanes[move.lane].length_m - to_axis_m) for move in site.moves if move.to == i
         ]
         middle = near.ahead((end - begin) / 2)
         axis = points(middle.aside(left), middle.aside(right))

@@ -67,10 +67,10 @@ def set_priorities(draft: Draft, site: Site, major: Sequence[int], sign: Control
 
 @dataclass(frozen=True)
 class LeftTurns:
-    """Phases of the left turns of two opposing approaches: the first of these that is set and possible.
+    """Phases of the left turns of two opposing approaches: the first that is set and possible, else split phases.
 
-    Protected: in a phase of their own, with arrows. Permissive: together with oncoming traffic, to which they yield.
-    Neither: one approach at a time.
+    Protected left turns have a phase of their own, with arrows. Permissive ones are green together with oncoming
+    traffic, to which they yield. Split phases serve one approach at a time.
     """
 
     protected: bool
@@ -115,7 +115,7 @@ def set_lights(
 def _yields_to(
     move: Move, others: Sequence[Move], conflicts: Conflicts, major: Sequence[int]
 ) -> tuple[int, ...]:
-    """Return the conflicting moves with right of way: by priority road, then turn, then approach."""
+    """Return the connectors of conflicting moves with right of way: by priority road, then turn, then approach."""
 
     def order(m: Move) -> tuple[bool, Turn, int]:
         return m.arm not in major, m.turn, m.arm
@@ -194,15 +194,15 @@ class TJunction:
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a junction."""
         limit = float(rng.choice(style.limits_mps))
-        slower = min(limit, float(rng.choice(style.limits_mps)))
+        stem_limit = min(limit, float(rng.choice(style.limits_mps)))
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main_marked, stem_marked = rng.random(2) < (self.marked_share, 2 * self.marked_share)
         main = draw_street(rng, style, (lanes, lanes), limit, bool(main_marked))
         stem_lanes = (2, 1) if rng.random() < self.stem_lanes_share else (1, 1)
-        stem = draw_street(rng, style, stem_lanes, slower, bool(stem_marked))
+        stem = draw_street(rng, style, stem_lanes, stem_limit, bool(stem_marked))
         first = float(rng.uniform(-math.pi, math.pi))
-        across = first + math.pi / 2 + float(rng.uniform(-self.stem_skew, self.stem_skew))
-        arms = self.geometry.arms(rng, (first, across, first + math.pi), (main, stem, main))
+        stem_heading = first + math.pi / 2 + float(rng.uniform(-self.stem_skew, self.stem_skew))
+        arms = self.geometry.arms(rng, (first, stem_heading, first + math.pi), (main, stem, main))
         draft, site = open_site(rng, arms, self.geometry)
         site = connect(draft, site, [bool(rng.random() < 0.5)] * 3)
         finish_sites(rng, style, draft, (site,), {}, self.geometry)
@@ -259,16 +259,16 @@ class UnprotectedLeft:
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draw a junction with dense oncoming traffic; ego starts on the main road, mostly in a left-turn lane."""
-        lights = bool(rng.random() < self.signal_share)
+        has_lights = bool(rng.random() < self.signal_share)
         limit = float(rng.choice(style.limits_mps))
-        slower = min(limit, float(rng.choice(style.limits_mps)))
-        main = draw_street(rng, style, draw_layout(rng, _LEFT_LAYOUTS), limit, lights)
-        side = draw_street(rng, style, (1, 1), slower)
+        side_limit = min(limit, float(rng.choice(style.limits_mps)))
+        main = draw_street(rng, style, draw_layout(rng, _LEFT_LAYOUTS), limit, has_lights)
+        side = draw_street(rng, style, (1, 1), side_limit)
         draft, site = open_crossroads(rng, (main, side), self.geometry, self.cross_skew)
         site = connect(draft, site, (True, False) * 2)
         finish_sites(rng, style, draft, (site,), {}, self.geometry)
         signals, lefts = None, [LeftTurns(protected=False, permissive=True)] * 2
-        if lights:
+        if has_lights:
             signals = set_lights(rng, draft, site, lefts, self.green_s)
         else:
             set_priorities(draft, site, (0, 2), Control.STOP)
@@ -280,7 +280,7 @@ class UnprotectedLeft:
 
 @dataclass(frozen=True)
 class _Plot:
-    """A junction without lanes; arm 0 leads to the other junction."""
+    """A junction before its lanes are added; arm 0 leads to the other junction."""
 
     kind: str
     arms: list[Arm]
@@ -314,9 +314,9 @@ class _Plot:
 class Corridor:
     """Settings of the family ``corridor``: a main road with two junctions.
 
-    Each has lights, or gives the main road priority over two side roads or one. The junctions share the lanes between
-    them. Two lights may be coordinated: the same cycle, and the second one begins its first phase when vehicles arrive
-    that left the first one at the beginning of its first phase.
+    Each junction has lights, or gives the main road priority over one or two side roads. The junctions share the lanes
+    between them. Two lights may be coordinated: they have the same cycle, and the second one begins its first phase
+    when vehicles arrive that left the first one at the beginning of its first phase.
 
     Attributes:
         side_reach: Shape of side roads: nearly straight, which keeps those of both junctions separate.

@@ -175,7 +175,7 @@ class Roundabout:
 
 
 def _solve_join(radius: float, lateral: float) -> tuple[float, float]:
-    """Find the angle from an arm at which its lane joins the circle, and the distance at which the bend begins.
+    """Find the angle from an arm at which its lane joins the circle, and the distance from the centre to the bend.
 
     The arm's lane (at a distance ``lateral`` from the arm) and the circle's tangent at angle d intersect at a distance
     ``t = (r sin d - lateral) / cos d`` from the tangent point; their fillet has the radius ``t / tan(45° - d/2)``.
@@ -237,10 +237,10 @@ def _set_priorities(draft: Draft) -> None:
     """Give circulating traffic right of way over entries, and over exits across the outer circle."""
     lanes, conflicts = draft.lanes, conflict_matrix(draft.lanes)
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
-    passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
+    circulating = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):
-        yields_to = tuple(int(k) for k in np.flatnonzero(conflicts[i]) if k in passes)
-        if yields_to and i not in passes:
+        yields_to = tuple(int(k) for k in np.flatnonzero(conflicts[i]) if k in circulating)
+        if yields_to and i not in circulating:
             draft.change(i, control=Control.YIELD, yields_to=yields_to)
 
 
@@ -250,9 +250,9 @@ def _add_boundary(draft: Draft, plan: _Plan, chains: list[list[Curve]], sidewalk
     for chain in chains:
         line = join_curves(*chain)
         ends = np.cumsum([curve.arc_m[-1] for curve in chain])
-        wide = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
-        wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
-        reach = plan.width_m / 2 + plan.shoulder_m + wide * (plan.circle_m - plan.width_m) / 2
+        circle_share = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
+        circle_share -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
+        reach = plan.width_m / 2 + plan.shoulder_m + circle_share * (plan.circle_m - plan.width_m) / 2
         sides.append(line.offset_by(-reach))
         if sidewalk_m is not None:
             draft.sidewalks.append(line.offset_by(-reach - sidewalk_m))

@@ -98,14 +98,14 @@ class Street:
         """Return the share of a strip's width at every sample, which grows along a fork and shrinks on a taper."""
         index = np.arange(len(self.middle.xy))
         inside = (index >= self.cuts[strip.first]) & (index <= self.cuts[strip.last])
-        present = inside.astype(float)
+        share = inside.astype(float)
         if strip.fork:
             begin, end = self.cuts[strip.first - 1], self.cuts[strip.first]
-            present = np.where(index < end, smooth_step((index - begin) / (end - begin)), present)
+            share = np.where(index < end, smooth_step((index - begin) / (end - begin)), share)
         if strip.ends:
             taper = (index - self.cuts[strip.last]) * STEP_M / self.taper_m
-            present = np.where(taper > 0, 1.0 - smooth_step(taper), present)
-        return present
+            share = np.where(taper > 0, 1.0 - smooth_step(taper), share)
+        return share
 
     def build(self) -> None:
         """Add the lanes, the edges and the markings."""
@@ -239,12 +239,12 @@ class Street:
     def add_bays(self, margin_m: float, rng: np.random.Generator) -> None:
         """Add bays in the parking rows, away from the road's ends, with gaps for driveways and at crossings."""
         end_m = STEP_M * self.cuts[-1] - margin_m
-        for side, row in zip((-1, 1), self.rows_m, strict=True):
+        for side, row_m in zip((-1, 1), self.rows_m, strict=True):
             places = [strip.place for strip in self.strips if strip.place * side > 0]
-            if not row:
+            if not row_m:
                 continue
             outer = max(places, key=abs) if places else -side
-            lateral = side * (self.median_m / 2 + len(places) * self.width_m + row / 2)
+            lateral = side * (self.median_m / 2 + len(places) * self.width_m + row_m / 2)
             position, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
             # In bends the inner row is shorter than the middle line.
             stretch = 1.0 - lateral * np.gradient(self.middle.heading, STEP_M)

@@ -44,7 +44,7 @@ class CurvedRoad(StreetFamily):
         middle = self.draw_middle(rng, style.curvature)
         limit = float(rng.choice(style.limits_mps))
         parking = limit < _PARKING_LIMIT_MPS and rng.random() < style.parking_share
-        row = float(rng.uniform(2.1, 2.4)) if parking else 0.0
+        row_m = float(rng.uniform(2.1, 2.4)) if parking else 0.0
         street = Street(
             middle=middle,
             cuts=self.cuts,
@@ -53,7 +53,7 @@ class CurvedRoad(StreetFamily):
             limit_mps=limit,
             shoulder_m=float(rng.uniform(*style.shoulder_m)),
             median_m=float(rng.uniform(1.5, 3.0)) if back and rng.random() < self.median_share else 0.0,
-            rows_m=(row, row if back else 0.0),
+            rows_m=(row_m, row_m if back else 0.0),
         )
         street.build()
         if rng.random() < style.sidewalk_share:
@@ -106,13 +106,13 @@ class LaneDrop(StreetFamily):
 
     def _strips(self, rng: np.random.Generator, sections: int) -> tuple[Strip, ...]:
         """Draw the lanes; the rightmost one, or the one left of the middle line, changes."""
-        lanes, where = int(rng.integers(2, 4)), int(rng.integers(3, 5))
+        lanes, section = int(rng.integers(2, 4)), int(rng.integers(3, 5))
         both_ways = rng.random() < self.two_way_share
         gains, left = rng.random() < self.gain_share, rng.random() < self.left_share
         if left and not both_ways and not gains:
-            return (Strip(1, True, 0, where, ends=True), *strips(lanes - 1, 0, sections))
+            return (Strip(1, True, 0, section, ends=True), *strips(lanes - 1, 0, sections))
         *remainder, outer = strips(lanes, 0, sections)
-        outer = replace(outer, first=where, fork=True) if gains else replace(outer, last=where, ends=True)
+        outer = replace(outer, first=section, fork=True) if gains else replace(outer, last=section, ends=True)
         return (*remainder, outer, *strips(0, int(both_ways), sections))
 
 
@@ -139,7 +139,7 @@ class MidblockCrosswalk(StreetFamily):
         """Draw a street with sidewalks on both sides and one or two crossings."""
         ahead, back = draw_layout(rng, _CROSSWALK_LAYOUTS)
         middle = self.draw_middle(rng, style.curvature)
-        row = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
+        row_m = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
         limits = [v for v in style.limits_mps if v < _CROSSING_LIMIT_MPS] or [min(style.limits_mps)]
         street = Street(
             middle=middle,
@@ -149,7 +149,7 @@ class MidblockCrosswalk(StreetFamily):
             limit_mps=float(rng.choice(limits)),
             shoulder_m=float(rng.uniform(*style.shoulder_m)),
             median_m=float(rng.uniform(1.8, 3.0)) if back and rng.random() < self.median_share else 0.0,
-            rows_m=(row, row if back else 0.0),
+            rows_m=(row_m, row_m if back else 0.0),
         )
         street.build()
         street.add_sidewalks(rng)
@@ -181,7 +181,7 @@ class ParkedStreet(StreetFamily):
         """Draw a narrow street with one of the two lowest limits of the style, of which repeated ones count twice."""
         one_way = rng.random() < self.one_way_share
         middle = self.draw_middle(rng, style.curvature)
-        row = float(rng.uniform(*self.row_m))
+        row_m = float(rng.uniform(*self.row_m))
         sides = (1, 1) if rng.random() < self.both_sides_share else [(1, 0), (0, 1)][int(rng.integers(2))]
         narrowest = style.width_m[0]
         street = Street(
@@ -191,7 +191,7 @@ class ParkedStreet(StreetFamily):
             width_m=float(rng.uniform(narrowest - 0.1, narrowest + 0.2)),
             limit_mps=float(rng.choice(sorted(style.limits_mps)[:2])),
             shoulder_m=float(rng.uniform(0.1, 0.4)),
-            rows_m=(row * sides[0], row * sides[1]),
+            rows_m=(row_m * sides[0], row_m * sides[1]),
         )
         street.build()
         street.add_sidewalks(rng)
@@ -249,11 +249,11 @@ class Highway(StreetFamily):
         lanes = int(rng.integers(2, 5))
         # At most five lanes and the auxiliary lane fit the map of a stored scenario.
         back = int(rng.integers(2, 6 - lanes)) if lanes < 4 and rng.random() < self.two_way_share else 0
-        extra = self._draw_auxiliary_lane(rng, lanes)
+        strip = self._draw_auxiliary_lane(rng, lanes)
         street = Street(
             middle=middle,
             cuts=self.cuts,
-            strips=(*strips(lanes, back, len(self.cuts) - 1), extra),
+            strips=(*strips(lanes, back, len(self.cuts) - 1), strip),
             width_m=max(3.4, float(rng.uniform(*style.width_m))),
             limit_mps=float(rng.choice(style.fast_limits_mps)),
             shoulder_m=float(rng.uniform(*self.shoulder_m)),
@@ -262,10 +262,10 @@ class Highway(StreetFamily):
             kind=RoadKind.LANE_FREEWAY,
         )
         street.add_lanes()
-        on_ramp = None if extra.fork else self._ramp(rng, street, extra, direction=-1)
-        off_ramp = self._ramp(rng, street, extra, direction=1) if extra.exit_only else None
-        _add_boundary(street, extra, on_ramp, off_ramp)
-        _add_markings(street, extra, on_ramp, off_ramp)
+        on_ramp = None if strip.fork else self._ramp(rng, street, strip, direction=-1)
+        off_ramp = self._ramp(rng, street, strip, direction=1) if strip.exit_only else None
+        _add_boundary(street, strip, on_ramp, off_ramp)
+        _add_markings(street, strip, on_ramp, off_ramp)
         starts = [Start(street.lanes[-j - 1, 2], 20.0, 65.0) for j in range(lanes)]
         if on_ramp is not None:
             starts += [Start(on_ramp.lane, self.ramp_m[0] - 110.0, self.ramp_m[0] - 30.0)] * 2
@@ -281,25 +281,25 @@ class Highway(StreetFamily):
             return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
         return Strip(place, True, 3, 3 + length, exit_only=True)
 
-    def _ramp(self, rng: np.random.Generator, street: Street, extra: Strip, direction: int) -> _Ramp:
+    def _ramp(self, rng: np.random.Generator, street: Street, strip: Strip, direction: int) -> _Ramp:
         """Add a ramp at the beginning of the auxiliary lane (``direction`` -1) or at its end (1)."""
-        auxiliary = street.lanes[extra.place, extra.first if direction < 0 else extra.last - 1]
-        cut = street.cuts[extra.first if direction < 0 else extra.last]
+        auxiliary_lane = street.lanes[strip.place, strip.first if direction < 0 else strip.last - 1]
+        cut = street.cuts[strip.first if direction < 0 else strip.last]
         length = self.ramp_m[0 if direction < 0 else 1]
-        line = street.draft.lanes[auxiliary].curve
+        line = street.draft.lanes[auxiliary_lane].curve
         gore = line.start.turned() if direction < 0 else line.end
         # Followed away from the highway, an on-ramp bends to the left and an off-ramp to the right.
         curvature = np.gradient(street.middle.heading, STEP_M)[cut::direction] * direction
-        side = curvature[: round(length / STEP_M) + 1]
+        road_curvature = curvature[: round(length / STEP_M) + 1]
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
-        outward = from_curvature(side - direction * bend, STEP_M, gore)
+        outward = from_curvature(road_curvature - direction * bend, STEP_M, gore)
         curve = outward if direction > 0 else outward.reversed()
         limit = street.limit_mps * float(rng.uniform(*self.ramp_limit))
         lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=direction > 0)
-        street.draft.link(*((lane, auxiliary) if direction < 0 else (auxiliary, lane)))
+        street.draft.link(*((lane, auxiliary_lane) if direction < 0 else (auxiliary_lane, lane)))
         half = street.width_m / 2
         left, right = curve.parallel(half + _RAMP_SHOULDER_M), curve.parallel(-half - street.shoulder_m)
-        nose, sample = _nose(street, extra, left if direction > 0 else left.reversed())
+        nose, sample = _nose(street, strip, left if direction > 0 else left.reversed())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if direction > 0 else left.piece(0, last - nose)
         return _Ramp(lane, left, right, sample)
@@ -314,38 +314,38 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
     return np.interp(position, knots, [0.0, peak, peak, 0.0])
 
 
-def _main_edge(street: Street, extra: Strip) -> Curve:
+def _main_edge(street: Street, strip: Strip) -> Curve:
     """Return the right edge of the highway without its auxiliary lane."""
-    reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
+    reach = street.reach_m[0] - street.width_m * street.presence(strip) + street.shoulder_m
     return street.middle.offset_by(-reach)
 
 
-def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
+def _nose(street: Street, strip: Strip, left: Curve) -> tuple[int, int]:
     """Find the first sample of a ramp's left edge beyond the highway's edge, and the nearest sample of that edge."""
-    edge = _main_edge(street, extra)
+    edge = _main_edge(street, strip)
     # The nose lies within 150 m of the beginning of the ramp.
     span = round(150.0 / STEP_M)
     gore = int(np.argmin(np.sum((edge.xy - left.xy[0]) ** 2, axis=-1)))
     first, points = max(0, gore - span), left.xy[:span]
     window = edge.xy[first : gore + span]
     x, y = (np.subtract.outer(points[:, axis], window[:, axis]) for axis in (0, 1))
-    near = first + np.argmin(x**2 + y**2, axis=1)
-    dx, dy = (points - edge.xy[near]).T
-    lateral = -dx * np.sin(edge.heading[near]) + dy * np.cos(edge.heading[near])
+    nearest = first + np.argmin(x**2 + y**2, axis=1)
+    dx, dy = (points - edge.xy[nearest]).T
+    lateral = -dx * np.sin(edge.heading[nearest]) + dy * np.cos(edge.heading[nearest])
     sample = int(np.argmax(lateral < -0.05))
-    return sample, int(near[sample])
+    return sample, int(nearest[sample])
 
 
-def _add_boundary(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
+def _add_boundary(street: Street, strip: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
     """Add the median, and the boundary: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
-    main, full, last = _main_edge(street, extra), street.middle.offset_by(-right), len(right) - 1
+    main, full, last = _main_edge(street, strip), street.middle.offset_by(-right), len(right) - 1
     # The main edge stops a metre from a nose, which blunts its tip.
     pieces, begin = [], 0
     if on_ramp is not None:
-        begin = street.cuts[extra.first]
+        begin = street.cuts[strip.first]
         pieces += [main.piece(0, on_ramp.nose - 2), on_ramp.left.reversed(), on_ramp.right]
-    end = last if off_ramp is None else street.cuts[extra.last]
+    end = last if off_ramp is None else street.cuts[strip.last]
     pieces.append(full.piece(begin, end))
     if off_ramp is not None:
         pieces += [off_ramp.right, off_ramp.left.reversed(), main.piece(off_ramp.nose + 2, last)]
@@ -354,14 +354,14 @@ def _add_boundary(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp:
     street.add_median()
 
 
-def _add_markings(street: Street, extra: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
+def _add_markings(street: Street, strip: Strip, on_ramp: _Ramp | None, off_ramp: _Ramp | None) -> None:
     """Add the markings of the highway and its ramps."""
     street.add_markings()
     inset = replace(street, shoulder_m=0.1)
     right, left = inset.edge_m
-    main, last = _main_edge(inset, extra), len(right) - 1
-    begin = 0 if on_ramp is None else street.cuts[extra.first]
-    end = last if off_ramp is None else street.cuts[extra.last]
+    main, last = _main_edge(inset, strip), len(right) - 1
+    begin = 0 if on_ramp is None else street.cuts[strip.first]
+    end = last if off_ramp is None else street.cuts[strip.last]
     lines = [] if on_ramp is None else [main.piece(0, on_ramp.nose)]
     lines.append(street.middle.offset_by(-right).piece(begin, end))
     if off_ramp is not None:
