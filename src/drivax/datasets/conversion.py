@@ -45,7 +45,7 @@ _Result = TypeVar("_Result")
 _WITHOUT_EFFECT = ("workers", "strict", "overwrite")
 #: Scenarios that are audited together.
 _BATCH = 64
-#: Bytes of the head and of the tail of a source that identify it.
+#: Bytes of the head and of the tail of a file that are hashed to identify it.
 _ENDS = 1 << 16
 #: A scenario or bad record, and the place after it: file number, items read of that file.
 _Item = tuple[Scenario | BadRecord, tuple[int, int]]
@@ -53,7 +53,7 @@ _Item = tuple[Scenario | BadRecord, tuple[int, int]]
 Progress = Callable[[int, int, int], None]
 #: Returns the audit of each scenario as a dictionary.
 Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
-#: In place of a record that is in the spool file.
+#: Placeholder of a record that is in the spool file.
 _SPOOLED = np.zeros(())
 
 
@@ -132,7 +132,7 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
     except DataError as error:
         yield BadRecord.of(error, path)
         return
-    keys: set[tuple[str, str]] = set()  # of a file's duplicates the set keeps one
+    keys: set[tuple[str, str]] = set()  # the set keeps one of duplicates, so count them once
     for item in _read(with_steps(reader, options.sizes.steps), path):
         for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, options):
             yield result
@@ -143,41 +143,41 @@ def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadReco
 
 
 def _key(scenario: Scenario) -> tuple[str, str]:
-    """Return data set and id of a scenario, which no two scenarios of a set share."""
+    """Return the key of a scenario, data set and id, which is unique in a set."""
     return scenario.text("dataset"), scenario.id
 
 
 def _read(reader: Reader, path: Path) -> Iterator[Recording | BadRecord]:
     """Yield the recordings of a file, and a bad record for a file or disk that cannot be read.
 
-    Limits of this process (open files, memory) and missing packages are raised, but Argoverse and nuPlan take a lack of
-    memory for damage.
+    Limits of this process (open files, memory) and missing packages are raised, but the readers of Argoverse and nuPlan
+    report a lack of memory as damage.
     """
     try:
         yield from reader.read(path)
     except DataError as error:  # the file cannot be opened
         yield BadRecord.of(error, path)
     except OSError as error:
-        if (unreachable := explain_system(error, path)) is None or not isinstance(unreachable, DataError):
+        if not isinstance(failure := explain_system(error, path), DataError):
             raise
-        yield BadRecord.of(unreachable, path)
+        yield BadRecord.of(failure, path)
 
 
 def _scenarios(recording: Recording, path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
     """Yield the scenario of each window of a recording, or a bad record in its place."""
     capacity = options.sizes
-    cut = _attempt(
+    recordings = _attempt(
         lambda: list(windows(recording, options.stride, capacity.steps)), path, recording.scenario_id
     )
-    if isinstance(cut, BadRecord):
-        yield cut
+    if isinstance(recordings, BadRecord):
+        yield recordings
         return
-    for window in cut:
+    for window in recordings:
         yield _attempt(partial(assemble, window, capacity, options.routes), path, window.scenario_id)
 
 
 def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    """Call a function; return the bad record of any error but a lack of memory in place of a result."""
+    """Return the result of a function, or a bad record for any error but a lack of memory."""
     try:
         return function()
     except DrivaxError as error:
@@ -292,7 +292,7 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return what a conversion shares with one that it resumes.
+    """Return what must be equal for a conversion to resume an interrupted one.
 
     That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
     companions (maps, poses, tables) included.
@@ -361,22 +361,22 @@ class _Sink:
                 for row in note["skipped"]:
                     path = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
                     self.skipped.append(BadRecord(path, row["record"], str(row["problem"]), row["cure"]))
-        self._notes = len(self.skipped)
+        self._noted_count = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
 
     @property
     def scenarios(self) -> int:
-        """Number of scenarios written or waiting; some that wait may be duplicates or fail the filters."""
+        """Number of scenarios written or waiting; some of the latter may be duplicates or fail the filters."""
         return len(self._writer) + self._scenarios_waiting
 
     @property
     def full(self) -> bool:
-        """Whether the limit is reached."""
+        """Whether the set holds as many scenarios as the limit."""
         return self._options.limit is not None and len(self._writer) >= self._options.limit
 
     def take(self, item: Scenario | BadRecord, place: tuple[int, int]) -> None:
-        """Keep a scenario or bad record; raise for a bad record if strict."""
+        """Queue an item, and write the batch if it is full; raise a bad record's error if strict."""
         if isinstance(item, BadRecord) and self._options.strict:
             raise item.error()
         self._waiting.append((item, place))
@@ -385,7 +385,7 @@ class _Sink:
             self._write_batch()
 
     def flush(self) -> None:
-        """Audit and write all that wait, up to the limit."""
+        """Audit and write all waiting items, up to the limit."""
         while self._waiting and not self.full:
             self._write_batch()
 
@@ -409,7 +409,7 @@ class _Sink:
         return min(_BATCH, self._writer.room, remaining)
 
     def _write_batch(self) -> None:
-        """Audit all that wait; write them up to the end of the shard or the limit, the rest is audited again."""
+        """Audit all waiting items, and write them up to the end of the shard or the limit; queue the rest again."""
         batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
         items = self._drop_duplicates(batch)
         scenarios = [item for item in items if isinstance(item, Scenario)]
@@ -449,8 +449,8 @@ class _Sink:
         if self._writer.room > 1:
             self._writer.add(scenario)
             return False
-        rows = [_row(self._data, record) for record in self.skipped[self._notes :]]
-        self._notes = len(self.skipped)
+        rows = [_row(self._data, record) for record in self.skipped[self._noted_count :]]
+        self._noted_count = len(self.skipped)
         self._writer.add(scenario, {"place": place, "filtered": self.filtered, "skipped": rows})
         return True
 
@@ -519,8 +519,8 @@ def convert_ahead(
     """Yield the scenarios and bad records of each task in order; read them before asking for the next task's.
 
     Args:
-        tasks: Arguments of ``convert``, which can be sent to other processes.
-        convert: What a worker does, a function of a module.
+        tasks: Arguments of ``convert``, which can be pickled.
+        convert: A function of a module, which workers call.
         capacity: Padded sizes of the scenarios.
         workers: Number of processes.
         folder: An existing folder for the records of about ``workers + 2`` tasks.
@@ -549,7 +549,7 @@ def convert_ahead(
 def _spool(
     task: tuple[Any, ...], convert: Callable[..., Iterator[Scenario | BadRecord]], path: Path
 ) -> list[Scenario | BadRecord]:
-    """Run one task in a worker: write the records of its scenarios to ``path``, return all else."""
+    """Run one task in a worker: write the records of its scenarios to ``path``, return the items without them."""
     items: list[Scenario | BadRecord] = []
     with path.open("wb") as file:
         for item in convert(*task):

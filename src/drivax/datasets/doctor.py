@@ -36,10 +36,10 @@ _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 @dataclass(frozen=True)
 class Part:
-    """Files of one format, data set and version: ``sample_size`` of them are described, ``whole`` if all intact ones.
+    """Files of one format, data set and version.
 
-    ``recordings`` of the description is the sum over these files, or None if it is unknown for some file; ``notes`` are
-    the most frequent ones, ``missing`` those of all of them. ``convertible`` says whether some file lacks nothing.
+    ``description`` merges those of ``sample_size`` files (all intact ones if ``whole``): sum of ``recordings`` (None if
+    unknown for a file), most frequent ``notes``, all ``missing`` files. ``convertible`` means that a file lacks none.
     """
 
     format: str
@@ -62,8 +62,8 @@ class Diagnosis:
         scenarios: Estimated number of scenarios after conversion; ``set_bytes`` is their size.
         free_bytes: Free space on the disk of ``path``.
         shards: One sentence per family of numbered shards.
-        notes: What else is to know about the folder.
-        problems: What is wrong, and what to do about it: the folder, files of unknown format, damaged files.
+        notes: Remarks about the folder.
+        problems: Problems, with cures, of the folder, files of unknown format, and damaged files.
         convertible: Whether ``drivax convert`` can convert some of it.
     """
 
@@ -180,18 +180,18 @@ def _notes(sample: Sequence[Description]) -> Iterator[str]:
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
-    """Return a sentence per folder and family of numbered shards (``NAME-00003-of-00150``): how many are there.
+    """Return a sentence per folder and family of numbered shards (``NAME-00003-of-00150``): how many it has.
 
-    Missing numbers are named if they form at most 8 runs, families of one name with their folder.
+    Missing numbers are listed if they form at most 8 runs; families with the same name are listed with their folder.
     """
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
         if match := _SHARD.fullmatch(path.name):
             families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
-    sentences, folders = [], Counter(prefix for _, prefix, _ in families)
+    sentences, family_counts = [], Counter(prefix for _, prefix, _ in families)
     root = os.path.commonpath([folder for folder, _, _ in families]) if families else ""
     for (folder, prefix, total), numbers in sorted(families.items()):
-        name = prefix if folders[prefix] == 1 else (folder / prefix).relative_to(root).as_posix()
+        name = prefix if family_counts[prefix] == 1 else (folder / prefix).relative_to(root).as_posix()
         missing = sorted(set(range(total)) - numbers)
         if not missing:
             sentences.append(f"{name}: all {total:,} shards")
@@ -225,11 +225,11 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
     """Estimate a conversion without filters by counting scenarios, in a sample of the files where there are many.
 
     Args:
-        data: What is converted.
-        out: Where the set will lie; the folder need not exist.
+        data: The files to convert.
+        out: Folder of the set, which need not exist.
         capacity: Padded sizes.
         stride: Steps between the starts of two windows.
-        limit: The most scenarios, None for all.
+        limit: Largest number of scenarios; None for all.
     """
     total = 0.0
     for name in data.formats:
@@ -243,7 +243,7 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
 
 
 def _count(reader: Reader, path: Path, stride: int, length: int) -> int:
-    """Return about how many scenarios a file becomes; 0 if it cannot be read."""
+    """Estimate the number of scenarios that a file becomes; 0 if it cannot be read."""
     try:
         scenarios = reader.count(path)
         if (stride, length) == (STRIDE, STEPS) or scenarios == 0:

@@ -35,7 +35,7 @@ READERS: tuple[Reader, ...] = (
 AUTO = "auto"
 _NAME_FILE = "name a file"
 #: Endings of sensor data and texts, which data sets hold by the hundred thousand: in folders they are never opened.
-_NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
+_UNREAD = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
 
 def find_reader(name: str) -> Reader:
@@ -69,7 +69,7 @@ def detect(path: str | Path) -> Reader:
 
 @dataclass(frozen=True)
 class Input:
-    """One file to read; its format is None if no reader recognises it, but the user or its name says to read it."""
+    """A file to read; ``format`` is None if the user or its name says to read the file, but no reader recognises it."""
 
     path: Path
     format: str | None
@@ -108,8 +108,8 @@ class Survey:
 def survey(src: str | Path, name: str = AUTO) -> Survey:
     """Find the files to read, and their formats.
 
-    A file given by name is always read. In a folder (searched to any depth, without hidden names and links to folders)
-    these are the files that a reader recognises, and those with the name of a format's files, so that damaged ones are
+    A file given by name is always read. In a folder (searched to any depth, without hidden files and links to folders)
+    these are the files that a reader recognises, and those named like a format's files, so that damaged ones are
     reported.
 
     Args:
@@ -121,14 +121,14 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
         UsageError: There is no such format.
     """
     src = Path(src)
-    only = None if name == AUTO else find_reader(name)
+    requested_reader = None if name == AUTO else find_reader(name)
     if not src.exists():
         raise DataError("does not exist", file=src, cure="check the path")
     if not src.is_dir():
         check_regular(src, _NAME_FILE)
-        reader = only or recognise(src)
+        reader = requested_reader or recognise(src)
         return Survey(src, (Input(src, None if reader is None else reader.name),))
-    readers = READERS if only is None else (only,)
+    readers = READERS if requested_reader is None else (requested_reader,)
     kinds = [_kind(path, readers) for path in sorted(src.rglob("*")) if _is_visible_file(path, src)]
     inputs = tuple(kind for kind in kinds if isinstance(kind, Input))
     companions = kinds.count("companion")
@@ -139,7 +139,7 @@ def survey(src: str | Path, name: str = AUTO) -> Survey:
 
 def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
     """Classify a file of a folder: input, companion of one, or ignored."""
-    if path.name.lower().endswith(_NEVER):
+    if path.name.lower().endswith(_UNREAD):
         return "ignored"
     by_name = any(_matches(path, reader.patterns) for reader in readers)
     if len(readers) == 1:

@@ -40,9 +40,9 @@ _MOST_STEPS = 1000
 _INVALID = -10_000.0
 #: Largest plausible number (metres, m/s, radians).
 _LARGEST = 1e7
-#: Plausible lengths, widths and heights; others are replaced by that of the class.
+#: Range of plausible lengths, widths and heights; others are replaced by the default of the class.
 _SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
-#: Public tools store ids in 31 bits.
+#: Upper bound of ids, which public tools store in 31 bits.
 _ID_END = 2**31
 _AGENTS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST}
 #: Kind by ``type`` of a road without a known ``map_element_id``.
@@ -55,7 +55,7 @@ _ROADS = {
     "stop_sign": RoadKind.STOP_SIGN,
     "driveway": RoadKind.DRIVEWAY,
 }
-#: Fields of objects and roads that are read, or need not be.
+#: Known fields of objects and roads; some are not read.
 _FIELDS = {
     "position", "heading", "velocity", "valid", "length", "width", "height", "type", "id", "geometry", "map_element_id",
     "goalPosition", "mark_as_expert", "is_sdc",
@@ -68,10 +68,10 @@ _ROAD_TYPES = {
     **{kind: name for name, kind in _ROADS.items()},
 }
 _KINDS = {int(kind): kind for kind in RoadKind}
-#: Points of the published files are 0.5 m apart: twice that is a jump where the map was clipped, unless the median
-#: spacing is above the second number, because points were thinned.
+#: Gap at which polylines are split, and largest median spacing of files in which they are. Points of published files
+#: are 0.5 m apart: twice that is a jump where the map was clipped. In files with a larger spacing points were thinned.
 _SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
-#: Fields that other converters to this form omit: heights of the map, of agents and of boxes.
+#: Fields that other converters to this format omit: heights of the map, of agents and of boxes.
 _OPTIONAL = ("z", "height")
 #: Decimals of metres (a tenth of a millimetre) and of headings.
 _DIGITS, _HEADING_DIGITS = 4, 6
@@ -86,7 +86,7 @@ class GpuDrive:
     companions: tuple[str, ...] = ("export.json",)
 
     def recognise(self, path: Path) -> bool:
-        """Whether the file begins like a GPUDrive scenario."""
+        """Return whether the file begins like a GPUDrive scenario."""
         head = read_head(path, _HEAD_BYTES)
         keys = ((b'"objects"', b'"position"'), (b'"roads"', b'"geometry"'))
         return head.lstrip().startswith(b"{") and any(a in head and b in head for a, b in keys)
@@ -156,7 +156,7 @@ def decode(content: Any) -> Recording:
         features=features,
         lights=lights,
         to_predict=_row_numbers(to_predict, count, "tracks_to_predict"),
-        # These are ids, tracks_to_predict are rows.
+        # Objects of interest are given by id, tracks to predict by row.
         of_interest=tuple(rows[track] for track in ids if track in rows),
         tags={"source_format": "gpudrive"},
         lost=parsing.nonzero(
@@ -197,7 +197,7 @@ def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
-    """Return numbers of a list of dictionaries, ``[row, key]``; zeros for an optional key that the first one lacks."""
+    """Return numbers of a list of dictionaries, ``[row, key]``; zeros for an optional key that the first row lacks."""
     try:
         columns = [i for i, key in enumerate(keys) if key not in _OPTIONAL or not rows or key in rows[0]]
         values = np.array([[row[keys[i]] for i in columns] for row in rows], np.float64)
@@ -233,7 +233,7 @@ def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
 def _tracks(objects: Sequence[Mapping[str, Any]]) -> tuple[Tracks, int]:
     """Return the tracks, and the number of those with an implausible length, width or height.
 
-    Each of these becomes 0, which stands for that of the class. Missing heights are not counted.
+    Implausible values become 0, which stands for the default of the class. Missing heights are not counted.
     """
     table, valid = _states(objects)
     valid &= ~(table[..., :2] == _INVALID).all(axis=-1)
@@ -267,7 +267,7 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
     steps = len(first) if isinstance(first, list) else 0
     if not CURRENT_STEP < steps <= _MOST_STEPS:
         raise DataError(f"has {steps} steps, not {CURRENT_STEP + 1} to {_MOST_STEPS}", cure=_SKIP)
-    tables, marks = [], []
+    tables, masks = [], []
     for row, states in enumerate(objects):
         names = ("position", "heading", "velocity", "valid")
         position, heading, velocity, valid = _columns(states, names, f"object {row}")
@@ -280,8 +280,8 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
             _table(velocity, "xy", f"the velocity of object {row}"),
         )
         tables.append(np.concatenate(columns, axis=1))
-        marks.append([mark == 1 for mark in valid])
-    return np.stack(tables), np.array(marks, bool)
+        masks.append([mark == 1 for mark in valid])
+    return np.stack(tables), np.array(masks, bool)
 
 
 def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...], int]:
@@ -350,7 +350,7 @@ def gpudrive_content(scenario: Scenario, name: str) -> dict[str, Any]:
     index = {row: number for number, row in enumerate(rows)}
     ids = recording.tracks.track_id
     lights: dict[str, dict[str, list[Any]]] = {}
-    for light in recording.lights:  # of several of one lane the first, which is nearest to the log, counts
+    for light in recording.lights:  # of several lights of a lane keep the first, which is nearest to the log
         lights.setdefault(str(light.lane_id), _light(light))
     return {
         "name": name,
@@ -403,7 +403,7 @@ def _object(recording: Recording, row: int) -> dict[str, Any]:
 
 
 def _light(light: Light) -> dict[str, list[Any]]:
-    """Return lists with an entry per observation, as GPUDrive's converter writes them."""
+    """Return a light as lists with an entry per observation, as GPUDrive's converter writes it."""
     steps = np.flatnonzero(light.states >= 0)
     (point,) = _points(light.stop_point[None])
     return {

@@ -1,4 +1,4 @@
-"""Common parts of readers: city names, ids of windows, lights by lane, checks, counts of losses, heights."""
+"""Helpers of readers: city names, ids of windows, lights by lane, checks, counts of losses, heights."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, STEPS, AgentKind, 
 
 Array = np.ndarray[Any, Any]
 
-#: Cities (the tag ``place``), and other names of them in data sets: of nuScenes' and nuPlan's maps, which may cover a
-#: part of a city, and codes of three letters in Argoverse 2's sensor maps.
+#: Cities (the tag ``place``), and their other names: those of nuScenes' and nuPlan's maps, which may cover a part of a
+#: city, and the three-letter codes of Argoverse 2's sensor maps.
 PLACES: Mapping[str, tuple[str, ...]] = {
     "austin": ("atx",),
     "boston": ("boston-seaport", "us-ma-boston"),
@@ -44,9 +44,9 @@ _LAST_STATE = int(max(LightState))
 #: Ids of windows: ``scene-0001_<token>`` of nuScenes, with one or two tokens; of drivax ``<id>@<first step>`` or, with
 #: another ego, ``<id>@<first step>#<track>``.
 _WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
-#: Note of ``drivax doctor`` where the frames of a recording do not come evenly.
+#: Note of ``drivax doctor`` on recordings whose frames are not evenly spaced.
 UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
-#: Spacing of the samples of map lines among which the nearest point is searched, m; wider if there would be too many.
+#: Spacing of samples of map lines for nearest-point queries, m; wider if there would be too many samples.
 _SPACING_M = 1.0
 _MOST_SAMPLES = 1_000_000
 
@@ -74,7 +74,7 @@ class Lights:
         self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
-        """Note one observation; of several for one lane and step the first that is not UNKNOWN counts.
+        """Add one observation; of several for one lane and step the first that is not UNKNOWN counts.
 
         The stop point of a lane is the first that is not zero; states that WOMD lacks count as UNKNOWN.
         """
@@ -86,8 +86,7 @@ class Lights:
     def collect(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
         """Return the lights in order of first observation, and the number of those dropped without a position.
 
-        States are -1 where a light is not observed. A stop point of zeros is none: the light then stands where its lane
-        begins.
+        States are -1 where a light is not observed. A light whose stop point is all zeros stands where its lane begins.
         """
         starts = {f.feature_id: f.points[0] for f in features if f.kind in LANE_KINDS}
         entries = [(lane, p if any(p) else starts.get(lane), s) for lane, (p, s) in self._lights.items()]
@@ -100,7 +99,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str, rows_of: str = "track") -> tuple[int, ...]:
-    """Return numbers of rows (``rows_of`` says of what) as ints; refuse those that are not from 0 to ``count - 1``."""
+    """Return row numbers as ints; refuse those outside 0 to ``count - 1``; ``rows_of`` says of what they are rows."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names {rows_of} {row}, there are {count}", cure="skip this record")
@@ -172,10 +171,10 @@ def check_within(most: float, *arrays: np.ndarray[Any, Any]) -> None:
 
 
 def lift(tracks: Tracks, features: Sequence[MapFeature]) -> Tracks:
-    """Set agents of a source without heights on its 3-D map: at the nearest map line, plus half their height.
+    """Place agents of a source without heights on its 3-D map: at the nearest map line, plus half their height.
 
-    Where roads cross above each other the nearest line in the plane decides, which may be of the other level. Without
-    a map the ground is at 0.
+    The line is the nearest in the plane, so where roads cross above each other it may be of the other level. Without a
+    map the ground is at 0.
     """
     z = np.where(tracks.valid, _half_heights(tracks), 0.0)
     ground = _samples(features)
@@ -188,13 +187,13 @@ def lift(tracks: Tracks, features: Sequence[MapFeature]) -> Tracks:
 
 
 def flatten(tracks: Tracks, features: Sequence[MapFeature]) -> tuple[Tracks, tuple[MapFeature, ...]]:
-    """Set agents of a source with a 2-D map on the plane z = 0, box centres at half their height, and the map too."""
+    """Place agents and map of a source with a 2-D map on the plane z = 0, box centres at half the agent's height."""
     flat = tuple(replace(f, points=np.pad(f.points[:, :2], ((0, 0), (0, 1)))) for f in features)
     return replace(tracks, z=np.where(tracks.valid, _half_heights(tracks), 0.0)), flat
 
 
 def _half_heights(tracks: Tracks) -> Float[Array, "track time"]:
-    """Return half the height of every track and step; of its class if it was not measured."""
+    """Return half the height of every track at every step; the default of the class where it was not measured."""
     default = np.array([DEFAULT_SIZES[AgentKind(kind)][2] for kind in tracks.kind]).reshape(-1, 1)
     return np.where(tracks.size[..., 2] > 0.0, tracks.size[..., 2], default) / 2
 

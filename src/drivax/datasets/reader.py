@@ -60,7 +60,7 @@ class Description:
     """Description of one file of a format by ``drivax doctor``.
 
     Attributes:
-        dataset: Full name of the public data set; ``flavour`` is its form, ``version`` as far as the file tells.
+        dataset: Full name of the public data set; ``flavour`` describes the file, ``version`` is None if it is unknown.
         recordings: Number of recordings; None for a file that would have to be read whole.
         notes: What the file holds or lacks that its user should know, one short sentence each.
         missing: Files that it needs next to it and that are not there.
@@ -79,8 +79,8 @@ class Reader(Protocol):
     """One public format: a module with such a class, listed in ``formats.READERS``.
 
     Readers hold no state and no open files: worker processes receive them by name. They read one file at a time, the
-    one that names the recording or recordings (a shard, a pickle, a parquet, a database), and find what belongs to it
-    (a map, poses) next to or above it. Packages of extras are imported when they are needed.
+    one that names the recordings (a shard, pickle, parquet file or database), and find its companions (a map, poses)
+    next to or above it. Packages of extras are imported when they are needed.
     """
 
     @property
@@ -99,7 +99,7 @@ class Reader(Protocol):
         ...
 
     def recognise(self, path: Path) -> bool:
-        """Whether a file is of this format, by its name, first bytes, tables or first record; never raises."""
+        """Return whether a file is of this format, by its name, first bytes, tables or first record; never raises."""
         ...
 
     def describe(self, path: Path) -> Description:
@@ -112,7 +112,7 @@ class Reader(Protocol):
         ...
 
     def count(self, path: Path) -> int:
-        """Return about how many scenarios the file becomes, quickly; 0 if it cannot be read."""
+        """Estimate quickly how many scenarios the file becomes; 0 if it cannot be read."""
         ...
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:

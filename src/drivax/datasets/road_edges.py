@@ -17,13 +17,13 @@ Array = np.ndarray[Any, Any]
 #: A drivable polygon: exterior and holes, rings of any orientation, closed or not, in metres, two or three columns.
 Area = tuple[Float[Array, "_ _"], Sequence[Float[Array, "_ _"]]]
 
-#: Gaps up to this width are errors of drawing, not islands: areas that were projected or rounded to centimetres leave
-#: a few millimetres between them (those of Argoverse 2 touch exactly).
+#: Gaps up to this width are drawing errors, not islands: areas that were projected or rounded to centimetres leave a
+#: few millimetres between them (those of Argoverse 2 touch exactly).
 GAP_M = 0.1
-#: Smaller pieces and holes are leftovers of drawing.
+#: Smaller pieces and holes are drawing errors.
 LEAST_PIECE_M2 = 1.0
 LEAST_HOLE_M2 = 0.05
-#: No map frame reaches further.
+#: Largest plausible coordinate of a map.
 _FARTHEST_M = 1e8
 _AGAIN = "download the map again"
 
@@ -33,8 +33,8 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
 
     Rings of fewer than three different points are dropped, self-intersecting polygons repaired, overlapping or touching
     ones joined, gaps of up to 10 cm closed (morphological closing), then pieces below 1 m2 and holes below 0.05 m2
-    dropped. Exteriors become anticlockwise, holes clockwise, the first point is repeated at the end.
-    Heights are interpolated along the nearest edge of a ring with three columns, 0 if there is none. Feature ids count
+    dropped. Exteriors become anticlockwise, holes clockwise, the first point is repeated at the end. Heights are
+    interpolated along the nearest edge of a ring with three columns; without such a ring they are 0. Feature ids count
     up from ``first_id``.
     """
     shapely = import_extra("shapely")
@@ -94,6 +94,6 @@ def _heights(
     edges = shapely.linestrings(np.stack((a[:, :2], b[:, :2]), axis=1))
     points = shapely.points(xy)
     nearest = shapely.STRtree(edges).nearest(points)
-    # NaN on an edge without length.
+    # The fraction is NaN on an edge without length.
     fraction = np.nan_to_num(shapely.line_locate_point(edges[nearest], points, normalized=True))
     return a[nearest, 2] + fraction * (b[nearest, 2] - a[nearest, 2])

@@ -102,7 +102,7 @@ def _tfrecord(path: Path) -> DataError:
 
 
 def _is_frame(payload: bytes) -> bool:
-    """Whether it is a ``Frame`` of WOMD perception."""
+    """Return whether a payload is a ``Frame`` of the Waymo perception data set."""
     frame = parse("Frame", payload)
     if frame is None or not frame.HasField("timestamp_micros"):
         return False
@@ -111,7 +111,7 @@ def _is_frame(payload: bytes) -> bool:
 
 
 def _is_end_to_end(payload: bytes) -> bool:
-    """Whether it is an ``E2EDFrame``: a ``Frame`` with past or future states of the ego."""
+    """Return whether a payload is an ``E2EDFrame``: a ``Frame`` with past or future states of the ego."""
     message = parse("E2EDFrame", payload)
     if message is None or not (message.HasField("future_states") or message.HasField("past_states")):
         return False
@@ -120,7 +120,7 @@ def _is_end_to_end(payload: bytes) -> bool:
 
 
 def _is_example(payload: bytes) -> bool:
-    """Whether it is a ``tf.Example`` with some feature."""
+    """Return whether a payload is a ``tf.Example`` with some feature."""
     message = parse("Example", payload)
     entries = () if message is None else message.features.feature
     return any(entry.HasField("key") and entry.HasField("value") for entry in entries)
@@ -133,7 +133,7 @@ _RECORDS: tuple[tuple[Callable[[bytes], bool], str], ...] = (
 )
 
 
-#: Tests of a folder, problems and cures.
+#: Kinds of folders: tests, problems and cures.
 _Folders = tuple[tuple[Callable[[Path], bool], str, str], ...]
 
 
@@ -153,7 +153,7 @@ def _first_match(folder: Path, kinds: _Folders) -> DataError | None:
 
 
 def _is_scenario_set(folder: Path) -> bool:
-    """Whether a folder is a scenario set of drivax, of any version."""
+    """Return whether a folder is a scenario set of drivax, of any version."""
     try:
         manifest = read_json(folder / MANIFEST, AGAIN)
     except DataError:

@@ -19,18 +19,18 @@ from drivax.scenario.schema import RoadKind
 
 Array = np.ndarray[Any, Any]
 
-#: Name of a map next to a log.
+#: File-name pattern of the map of a scenario or log.
 MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
-#: A local map spans some hundred metres; a point this far from the others is damage.
+#: Largest plausible distance of a point from the median point; a local map spans some hundred metres.
 _SPREAD_M = 20_000.0
-#: Largest spacing of points on a centre line between boundaries, and length of the shortest line that is used.
+#: Largest spacing of centre line points interpolated between boundaries, and length of the shortest usable line.
 _SPACING_M, _SHORTEST_M = 2.0, 1e-3
-#: Ids are below this, so that those of edges and lines, which follow the largest, fit into 64 bits.
+#: Upper bound of lane ids: ids of edges, lines and crosswalks, which follow the largest one, must fit in 64 bits.
 _ID_END = 2**62
 _LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
-#: WOMD has no white lines that are dashed on one side and solid on the other, which become double solid, and no double
-#: dashed ones, which become single.
+#: ``RoadKind`` has WOMD's kinds, which lack two: white lines that are dashed on one side and solid on the other become
+#: double solid, double dashed white lines become single.
 _MARKS = {
     "DASHED_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
     "DOUBLE_DASH_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
@@ -44,7 +44,7 @@ _MARKS = {
     "DOUBLE_SOLID_YELLOW": RoadKind.LINE_SOLID_DOUBLE_YELLOW,
     **dict.fromkeys(("DASH_SOLID_YELLOW", "SOLID_DASH_YELLOW"), RoadKind.LINE_PASSING_DOUBLE_YELLOW),
 }
-#: Names of elements of a map that are read.
+#: Fields of map elements that are read.
 _FIELDS = frozenset((
     "id", "is_intersection", "lane_type", "centerline", "predecessors", "successors", "area_boundary", "edge1", "edge2",
     *(f"{side}_{name}" for side in ("left", "right") for name in ("lane_boundary", "lane_mark_type", "neighbor_id")),
@@ -52,7 +52,7 @@ _FIELDS = frozenset((
 
 
 class ArgoverseMap(NamedTuple):
-    """A map's features, and counts of what is lost."""
+    """Features of a map, and counts of lost elements by name."""
 
     features: tuple[MapFeature, ...]
     lost: dict[str, int]
@@ -61,7 +61,7 @@ class ArgoverseMap(NamedTuple):
 def read_map(path: Path) -> ArgoverseMap:
     """Read a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
 
-    Lanes keep their ids, their links (some dangle) and all neighbours, oncoming ones included.
+    Lanes keep their ids, their links (some lead outside the map) and all neighbours, oncoming lanes included.
     """
     try:
         return _decode(parsing.load_json(path))
@@ -74,38 +74,38 @@ def _decode(content: Any) -> ArgoverseMap:
     groups = ("lane_segments", "drivable_areas", "pedestrian_crossings")
     if not isinstance(content, dict) or not all(isinstance(content.get(group), dict) for group in groups):
         raise DataError(f"is not an Argoverse 2 map with {', '.join(groups)}", cure=_AGAIN)
-    segments, areas, crossings = ([*content[group].values()] for group in groups)
+    segments, drivable_areas, crossings = ([*content[group].values()] for group in groups)
     lanes = [lane for segment in segments if (lane := _lane(segment)) is not None]
     lines = _lines(segments)
-    rings: list[Area] = [(_points(area, "area_boundary"), ()) for area in areas]
-    # A crossing has two edges in the same direction.
+    areas: list[Area] = [(_points(area, "area_boundary"), ()) for area in drivable_areas]
+    # Both edges of a crossing run in the same direction, so reverse one to close the outline.
     outlines = [np.concatenate((_points(item, "edge1"), _points(item, "edge2")[::-1])) for item in crossings]
     outlines = [outline for outline in outlines if len(outline) >= 3]
     _check_extent(
-        [*(lane.points for lane in lanes), *(line for _, line in lines), *(r for r, _ in rings), *outlines]
+        [*(lane.points for lane in lanes), *(line for _, line in lines), *(r for r, _ in areas), *outlines]
     )
     first_id = 1 + max((lane.feature_id for lane in lanes), default=0)
-    edges = road_edges(rings, first_id)
+    edges = road_edges(areas, first_id)
     shapes = [*lines, *((RoadKind.CROSSWALK, outline) for outline in outlines)]
-    drawn = (MapFeature(id, kind, points) for id, (kind, points) in enumerate(shapes, first_id + len(edges)))
-    names = (content.keys() - {*groups}).union(*segments, *areas, *crossings)
+    markings = (MapFeature(id, *shape) for id, shape in enumerate(shapes, first_id + len(edges)))
+    fields = (content.keys() - {*groups}).union(*segments, *drivable_areas, *crossings)
     lost = parsing.nonzero(
-        lanes_without_length=len(segments) - len(lanes), unknown_fields=len(names - _FIELDS)
+        lanes_without_length=len(segments) - len(lanes), unknown_fields=len(fields - _FIELDS)
     )
-    return ArgoverseMap((*lanes, *edges, *drawn), lost)
+    return ArgoverseMap((*lanes, *edges, *markings), lost)
 
 
 def _lane(segment: Any) -> MapFeature | None:
-    """Build a lane; None for a segment with a boundary of no length."""
+    """Return the lane of a segment; None if a boundary has no length."""
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     lengths = [arc_lengths(line).max(initial=0.0) for line in (left, right)]
     if min(lengths) < _SHORTEST_M:
         return None
-    # Sampled at the same fractions of their lengths, points of one row face each other.
-    # A longer line is damage, which ``_check_extent`` refuses; until then it takes little memory.
+    # Points at the same fraction of both boundaries face each other. The cap bounds the memory of damaged lines until
+    # ``_check_extent`` refuses them.
     count = int(min(max(lengths), 2 * _SPREAD_M) / _SPACING_M) + 2
-    fraction = np.linspace(0.0, 1.0, max(len(left), len(right), count))
-    left, right = _at(left, fraction), _at(right, fraction)
+    fractions = np.linspace(0.0, 1.0, max(len(left), len(right), count))
+    left, right = _sample(left, fractions), _sample(right, fractions)
     return MapFeature(
         feature_id=_id(segment.get("id")),
         kind=_LANES.get(str(segment.get("lane_type")), RoadKind.LANE_UNDEFINED),
@@ -119,21 +119,21 @@ def _lane(segment: Any) -> MapFeature | None:
     )
 
 
-def _at(line: Float[Array, "point 3"], fraction: Float[Array, " sample"]) -> Float[Array, "sample 3"]:
+def _sample(line: Float[Array, "point 3"], fractions: Float[Array, " sample"]) -> Float[Array, "sample 3"]:
     """Interpolate points at fractions of a line's length."""
     arc = arc_lengths(line)
-    return np.column_stack([np.interp(fraction * arc[-1], arc, line[:, axis]) for axis in range(3)])
+    return np.column_stack([np.interp(fractions * arc[-1], arc, line[:, axis]) for axis in range(3)])
 
 
 def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "centre 3"]:
-    """Return the segment's own centre line at the height of the middle (some have z = 0), else the middle."""
+    """Return the segment's centre line with heights from ``middle`` (some have z = 0); without one, ``middle``."""
     if segment.get("centerline") is None:
         return middle
     centre = _points(segment, "centerline")
     arc = arc_lengths(centre)
     if arc.max(initial=0.0) < _SHORTEST_M:
         return middle
-    centre[:, 2] = _at(middle, arc / arc[-1])[:, 2]
+    centre[:, 2] = _sample(middle, arc / arc[-1])[:, 2]
     return centre
 
 
@@ -155,24 +155,24 @@ def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]
 
 
 def _points(record: Any, name: str) -> Float[Array, "point 3"]:
-    """Read a list of points of the map."""
+    """Read the points ``record[name]``: x, y, z in metres."""
     try:
         rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
         points = np.array(rows, np.float64).reshape(-1, 3)
         parsing.check_within(FARTHEST_M, points)
     except (TypeError, KeyError, ValueError, OverflowError, IndexError) as error:
-        raise DataError(f"{name} is not a list of points", record=_name(record), cure=_AGAIN) from error
+        raise DataError(f"{name} is not a list of points", record=_record_id(record), cure=_AGAIN) from error
     return points
 
 
-def _name(record: Any) -> str | None:
+def _record_id(record: Any) -> str | None:
     return str(record.get("id"))[:40] if isinstance(record, dict) else None
 
 
 def _ids(record: Any, name: str) -> tuple[int, ...]:
     links = record.get(name)
     if not isinstance(links, list):
-        raise DataError(f"{name} is not a list of ids", record=_name(record), cure=_AGAIN)
+        raise DataError(f"{name} is not a list of ids", record=_record_id(record), cure=_AGAIN)
     return tuple(_id(link) for link in links)
 
 

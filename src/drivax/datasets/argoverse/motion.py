@@ -24,18 +24,18 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
 Array = np.ndarray[Any, Any]
 
 EGO = "AV"
-#: Value of ``object_category`` of the tracks that the data set's benchmark scores besides the focal one.
+#: ``object_category`` of tracks that the data set's benchmark scores in addition to the focal track.
 _SCORED = 2
 _STATE = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 _COLUMNS: dict[str, Kind] = {
     **dict.fromkeys(("track_id", "object_type", "scenario_id", "focal_track_id", "city", "slice_id"), "text"),
-    **dict.fromkeys(("object_category", "timestep", "num_timestamps"), "whole"),
+    **dict.fromkeys(("object_category", "timestep", "num_timestamps"), "integer"),
     **dict.fromkeys((*_STATE, "start_timestamp", "end_timestamp"), "number"),
 }
-#: Columns that are not needed: the split at step 50, and the number of the city.
-_OTHERS = {"observed", "map_id"}
-#: Kind and size (length, width, height in metres) of each ``object_type``: the files hold no sizes. Medians of the
-#: boxes of sensor logs; cyclists with the length of their vehicle and the height of a person.
+#: Known columns that are not read: the split at step 50, and the number of the city.
+_UNUSED_COLUMNS = {"observed", "map_id"}
+#: Kind and size (length, width, height in metres) of each ``object_type``, because the files hold no sizes. Sizes are
+#: medians of boxes of sensor logs; a cyclist has the length of the cycle and the height of a person.
 _TYPES: dict[str, tuple[AgentKind, tuple[float, float, float]]] = {
     "vehicle": (AgentKind.VEHICLE, (4.1, 1.9, 1.6)),
     "bus": (AgentKind.VEHICLE, (11.6, 2.9, 3.0)),
@@ -61,7 +61,7 @@ class ArgoverseMotion:
     companions: tuple[str, ...] = (MAP_PATTERN,)
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is a parquet file with the name of a scenario."""
+        """Return whether the file is parquet and named like a scenario."""
         return path.match(self.patterns[0]) and bool(self.count(path))
 
     def describe(self, path: Path) -> Description:
@@ -81,7 +81,7 @@ class ArgoverseMotion:
         )
 
     def count(self, path: Path) -> int:
-        """Return 1, since every scenario becomes one window; 0 for another kind of file."""
+        """Return 1, because every scenario becomes one window; 0 if the file is not parquet."""
         return int(read_head(path, 4) == tables.PARQUET_MAGIC)
 
     def companion_files(self, path: Path) -> tuple[Path, ...]:
@@ -101,8 +101,8 @@ def _map_path(path: Path) -> Path:
 def decode(path: Path) -> Recording:
     """Return the recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
-    In the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; agents stand
-    on the map, sizes are those of the class (of the ego the car's), velocities as the source smoothed them.
+    Positions are in the city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box;
+    agents stand on the map. Sizes are those of the class (the ego's is the car's); the source smoothed the velocities.
     """
     table = read_table(path, _COLUMNS, optional=("slice_id",))
     local_map = read_map(_map_path(path))
@@ -113,7 +113,7 @@ def decode(path: Path) -> Recording:
     steps = tracks.valid.shape[1]
     scenario_id, names = table.texts["scenario_id"].text(0), table.texts["track_id"]
     focal = table.texts["focal_track_id"].text(0)
-    category = _of_track(table.numbers["object_category"], names)
+    categories = _per_track(table.numbers["object_category"], names)
     return Recording(
         scenario_id=scenario_id,
         dataset=tables.DATASET,
@@ -124,25 +124,25 @@ def decode(path: Path) -> Recording:
         tracks=lift(tracks, local_map.features),
         features=local_map.features,
         to_predict=tuple(row for row, name in enumerate(names.words) if name == focal),
-        of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
+        of_interest=tuple(row for row, code in enumerate(categories) if code == _SCORED),
         tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
         lost=parsing.nonzero(
             local_map.lost,
             repeated_rows=table.rows - int(tracks.valid.sum()),
-            unknown_fields=len(table.unread - _OTHERS),
+            unknown_fields=len(table.unread - _UNUSED_COLUMNS),
         ),
         flags=Flag.DEFAULT_SIZES,
     )
 
 
-def _of_track(values: Array, names: Words) -> Array:
+def _per_track(values: Array, names: Words) -> Array:
     """Return the value of the first row of each track."""
     _, first = np.unique(names.of_row, return_index=True)
     return values[first]
 
 
 def _tracks(table: Table) -> tuple[Tracks, int]:
-    """Return all tracks in order of appearance, in the plane, and the row of the ego."""
+    """Return all tracks in order of appearance, with z = 0, and the row of the ego."""
     names, step = table.texts["track_id"], table.numbers["timestep"]
     if EGO not in names.words:
         raise DataError(f"has no track {EGO}")
@@ -158,8 +158,8 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     parsing.check_within(tables.FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
-    at_ego = ego, valid[ego]
-    xy[at_ego] = parsing.box_centre(xy[at_ego], heading[at_ego], tables.CENTRE_AHEAD_M)
+    ego_steps = ego, valid[ego]
+    xy[ego_steps] = parsing.box_centre(xy[ego_steps], heading[ego_steps], tables.CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,
@@ -174,8 +174,8 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
 
 
 def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array, "track 3"]]:
-    """Return kinds and sizes of all tracks."""
-    classes = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
+    """Return kinds and sizes (length, width, height, metres) of all tracks."""
+    classes = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _per_track(types.of_row, names)]
     sizes = np.array([size for _, size in classes], np.float64)
     sizes[ego] = tables.EGO_SIZE
     return np.array([kind for kind, _ in classes], np.int8), sizes
@@ -192,7 +192,7 @@ def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
 
 
 def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
-    """Return the time of every step, seconds: evenly spaced, by the file's first and last time and number of steps."""
+    """Return evenly spaced times of all steps, seconds, from the file's first and last time and their number."""
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
     step_s = (end - start) / intervals if intervals > 0 else DT_S

@@ -25,14 +25,14 @@ Array = np.ndarray[Any, Any]
 EGO = "EGO_VEHICLE"
 POSES = "city_SE3_egovehicle.feather"
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_AHEAD = np.array([1.0, 0.0, 0.0])
+_FORWARD = np.array([1.0, 0.0, 0.0])
 _SIZE = ("length_m", "width_m", "height_m")
-_POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "whole", **dict.fromkeys(_POSE, "number")}
+_POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "integer", **dict.fromkeys(_POSE, "number")}
 _BOX_COLUMNS: dict[str, Kind] = {
     **_POSE_COLUMNS, **dict.fromkeys(_SIZE, "number"), "track_uuid": "text", "category": "text"
 }  # fmt: skip
-#: Columns that are not needed.
-_OTHERS = {"num_interior_pts"}
+#: Known columns that are not read.
+_UNUSED_COLUMNS = {"num_interior_pts"}
 _VEHICLES = (
     EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
     "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
@@ -43,7 +43,7 @@ _THINGS = (
     "BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "SIGN", "STOP_SIGN", "MESSAGE_BOARD_TRAILER",
     "MOBILE_PEDESTRIAN_CROSSING_SIGN", "TRAFFIC_LIGHT_TRAILER",
 )  # fmt: skip
-#: Animals and categories of later versions are OTHER.
+#: Kind by category; animals, and categories that later versions may add, are OTHER.
 _KINDS = {
     **dict.fromkeys(_VEHICLES, AgentKind.VEHICLE),
     **dict.fromkeys(_PEOPLE, AgentKind.PEDESTRIAN),
@@ -65,18 +65,18 @@ class ArgoverseSensor:
     )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is a feather file with the name of a log's annotations."""
+        """Return whether the file is feather and named like the annotations of a log."""
         return path.name in self.patterns and read_head(path, 6) == b"ARROW1"
 
     def describe(self, path: Path) -> Description:
         """Describe frames, tracks and city of the log, and whether its poses and map are present."""
-        table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
+        table = read_table(path, {"timestamp_ns": "integer", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
         files = {POSES: path.with_name(POSES).is_file(), f"map/{MAP_PATTERN}": map_path is not None}
         return Description(
             dataset="Argoverse 2 Sensor",
-            flavour=f"one log of {frames} frames in {_places(map_path).get('place', 'an unknown city')}",
+            flavour=f"one log of {frames} frames in {_place_tags(map_path).get('place', 'an unknown city')}",
             recordings=1,
             notes=(f"{tracks} tracks", "there are no speed limits, lights or stop signs"),
             missing=tuple(name for name, exists in files.items() if not exists),
@@ -85,7 +85,7 @@ class ArgoverseSensor:
     def count(self, path: Path) -> int:
         """Return the number of windows of a log; 0 if its annotations cannot be read."""
         try:
-            times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
+            times = read_table(path, {"timestamp_ns": "integer"}).numbers["timestamp_ns"]
         except DataError:
             return 0
         return parsing.windows_of(len(np.unique(times)))
@@ -104,8 +104,8 @@ def _map_path(path: Path) -> Path | None:
     return next(iter(sorted((path.parent / "map").glob(MAP_PATTERN))), None)
 
 
-def _places(map_path: Path | None) -> dict[str, str]:
-    """Return tags of the place in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
+def _place_tags(map_path: Path | None) -> dict[str, str]:
+    """Return the tags of the city in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
     _, _, ending = ("" if map_path is None else map_path.stem).partition("____")
     return place_tags(ending.split("_")[0])
 
@@ -113,8 +113,8 @@ def _places(map_path: Path | None) -> dict[str, str]:
 def decode(path: Path) -> Recording:
     """Return the recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and its map.
 
-    In the city's frame, metres. Boxes are moved from the car's frame with its pose of the same time stamp, the ego from
-    its rear axle to the middle of its box; velocities are differences of positions.
+    Positions are in the city's frame, metres. Boxes are transformed from the car's frame by the pose of the same
+    timestamp, the ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
     """
     boxes = read_table(path, _BOX_COLUMNS)
     poses = read_table(path.with_name(POSES), _POSE_COLUMNS)
@@ -125,32 +125,32 @@ def decode(path: Path) -> Recording:
     local_map = read_map(map_path)
     log_id = path.resolve().parent.name
     try:
-        clock, lost_frames = _clock(boxes, poses)
-        tracks, repeated = _tracks(boxes, poses, clock)
+        times_ns, lost_frames = _frame_times(boxes, poses)
+        tracks, repeated = _tracks(boxes, poses, times_ns)
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure or _SKIP) from error
     return Recording(
         scenario_id=log_id,
         dataset=tables.DATASET,
         segment=log_id,
-        timestamps_s=clock * 1e-9,
-        current_step=min(CURRENT_STEP, len(clock) - 1),
+        timestamps_s=times_ns * 1e-9,
+        current_step=min(CURRENT_STEP, len(times_ns) - 1),
         ego=0,
         tracks=tracks,
         features=local_map.features,
-        tags={"source_format": "av2-sensor"} | _places(map_path),
+        tags={"source_format": "av2-sensor"} | _place_tags(map_path),
         lost=parsing.nonzero(
             local_map.lost,
             frames_without_pose=lost_frames,
             repeated_rows=repeated,
-            unknown_fields=len((boxes.unread - _OTHERS) | poses.unread),
+            unknown_fields=len((boxes.unread - _UNUSED_COLUMNS) | poses.unread),
         ),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
 
-def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
-    """Return time stamps of the frames with a pose, nanoseconds, and how many frames have none."""
+def _frame_times(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
+    """Return the timestamps of frames that have a pose, and the number of frames without one."""
     frames = np.unique(boxes.numbers["timestamp_ns"])
     has_pose = np.isin(frames, poses.numbers["timestamp_ns"])
     if not has_pose.any():
@@ -158,23 +158,23 @@ def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
     return frames[has_pose], int((~has_pose).sum())
 
 
-def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> tuple[Tracks, int]:
-    """Return all tracks in the city's frame, and the number of boxes of a track that has another one in the frame.
+def _tracks(boxes: Table, poses: Table, times_ns: Int[Array, " step"]) -> tuple[Tracks, int]:
+    """Return all tracks, ego in row 0 and valid at every step, and the number of repeated boxes.
 
-    The ego is row 0 and valid at every step.
+    Positions are in the city's frame. Of several boxes of a track at one time the last one counts.
     """
-    pose = _poses(poses, clock)
+    pose = _poses(poses, times_ns)
     stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row
     category = boxes.texts["category"]
     is_ego = np.array([name == EGO for name in category.words])[category.of_row]
-    rows = np.flatnonzero(np.isin(stamp, clock) & ~is_ego)
-    # ``first``: a box of each track; ``row``: the track of each box, without the ego.
+    rows = np.flatnonzero(np.isin(stamp, times_ns) & ~is_ego)
+    # ``first`` is the first box of each track, ``row`` the track of each box; both leave the ego out.
     codes, first, row = np.unique(code[rows], return_index=True, return_inverse=True)
-    if (1 + len(codes)) * len(clock) > tables.MOST_STATES:
-        raise DataError(f"{len(codes)} tracks of {len(clock)} frames are too many")
-    step = np.searchsorted(clock, stamp[rows])
+    if (1 + len(codes)) * len(times_ns) > tables.MOST_STATES:
+        raise DataError(f"{len(codes)} tracks of {len(times_ns)} frames are too many")
+    step = np.searchsorted(times_ns, stamp[rows])
     table = _boxes(boxes, rows, pose[step])
-    states = np.zeros((1 + len(codes), len(clock), table.shape[1]))
+    states = np.zeros((1 + len(codes), len(times_ns), table.shape[1]))
     valid = np.zeros(states.shape[:2], bool)
     states[1 + row, step], valid[1 + row, step] = table, True
     states[0], valid[0] = _ego(boxes, np.flatnonzero(is_ego), pose), True
@@ -184,7 +184,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> tuple[Tra
         xy=states[..., :2].copy(),
         z=states[..., 2].copy(),
         heading=states[..., 3].copy(),
-        velocity=differentiate(states[..., :2], valid, clock * 1e-9),
+        velocity=differentiate(states[..., :2], valid, times_ns * 1e-9),
         size=states[..., 4:].copy(),
         valid=valid,
         kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),
@@ -193,12 +193,12 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> tuple[Tra
     return tracks, repeated
 
 
-def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
+def _poses(poses: Table, times_ns: Int[Array, " step"]) -> Float[Array, "step 7"]:
     """Return the pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
     stamps, rows = np.unique(poses.numbers["timestamp_ns"], return_index=True)
-    pose = poses.stack(_POSE)[rows[np.searchsorted(stamps, clock)]]
+    pose = poses.stack(_POSE)[rows[np.searchsorted(stamps, times_ns)]]
     parsing.check_within(tables.FARTHEST_M, pose[:, 4:])
-    pose[:, :4] = _unit(pose[:, :4])
+    pose[:, :4] = _normalise(pose[:, :4])
     return pose
 
 
@@ -207,31 +207,31 @@ def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) 
     table = boxes.stack((*_POSE, *_SIZE))[rows]
     parsing.check_within(tables.FARTHEST_M, table[:, 4:7])
     parsing.check_within(tables.LARGEST_M, table[:, 7:])
-    forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), _AHEAD))
+    forward = rotate(pose[:, :4], rotate(_normalise(table[:, :4]), _FORWARD))
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return np.column_stack((rotate(pose[:, :4], table[:, 4:7]) + pose[:, 4:], heading, table[:, 7:]))
 
 
 def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
-    """Return the ego's boxes in the form of :func:`_boxes`."""
-    # Some logs hold boxes of the car itself: the sizes are right, the centres are the rear axle again.
+    """Return the ego's boxes with the columns of :func:`_boxes`."""
+    # Some logs hold boxes of the ego: use only their sizes, because their centres are at the rear axle, too.
     size = np.median(boxes.stack(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)
     parsing.check_within(tables.LARGEST_M, size)
     offset = np.array([tables.CENTRE_AHEAD_M, 0.0, size[2] / 2 - tables.AXLE_HEIGHT_M])
     centre = rotate(pose[:, :4], offset) + pose[:, 4:]
-    forward = rotate(pose[:, :4], _AHEAD)
+    forward = rotate(pose[:, :4], _FORWARD)
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return np.column_stack((centre, heading, np.broadcast_to(size, (len(pose), 3))))
 
 
 def rotate(quaternion: Float[Array, "row 4"], vector: Float[Array, "*rows 3"]) -> Float[Array, "row 3"]:
-    """Turn vectors v by unit quaternions (w, u): v + 2 w (u x v) + 2 u x (u x v)."""
+    """Rotate vectors v by unit quaternions (w, u): v + 2 w (u x v) + 2 u x (u x v)."""
     axis = quaternion[:, 1:]
     normal = 2.0 * np.cross(axis, np.broadcast_to(vector, axis.shape))
     return vector + quaternion[:, :1] * normal + np.cross(axis, normal)
 
 
-def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
+def _normalise(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
     """Normalise quaternions; refuse those that are far from unit length."""
     parsing.check_within(2.0, quaternion)
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)

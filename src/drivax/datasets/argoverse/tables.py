@@ -18,22 +18,22 @@ from drivax.reading import DAMAGE, check_regular
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
 EGO_SIZE = (4.877, 2.0, 1.473)
-#: Its poses are those of the middle of the rear axle, one wheel radius above ground: on real logs the axis that does
-#: not slip sideways in turns is within 0.3 m of the pose, and the map 0.33 m below it. The body's middle is half the
-#: wheelbase of 2.85 m ahead, less 0.09 m, because the rear overhang is longer than the front one.
+#: Distance of the box centre ahead of the car's pose, and height of the pose. Poses are at the middle of the rear axle,
+#: one wheel radius above ground: on real logs the axis that does not slip sideways in turns is within 0.3 m of them,
+#: and the map 0.33 m below. The centre is half the wheelbase of 2.85 m ahead, less 0.09 m: the rear overhang is longer.
 CENTRE_AHEAD_M = 1.34
 AXLE_HEIGHT_M = 0.33
-#: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
+#: Largest plausible values: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
 PARQUET_MAGIC = b"PAR1"
 _AGAIN = "download it again"
 Array = np.ndarray[Any, Any]
-Kind = Literal["number", "whole", "text"]
+Kind = Literal["number", "integer", "text"]
 
 
 @dataclass(frozen=True)
 class Words:
-    """A column of text: its words in order of appearance, and the index of the word of every row."""
+    """A dictionary-encoded text column: distinct texts in order of appearance, and the index of each row's text."""
 
     words: tuple[str, ...]
     of_row: Int[Array, " row"]
@@ -45,7 +45,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a table by name, float64 or int64 arrays or :class:`Words`; ``unread`` are the names of the others."""
+    """Columns of a table by name: float64 or int64 arrays, and texts; ``unread`` names the other columns."""
 
     rows: int
     numbers: Mapping[str, Array]
@@ -58,9 +58,9 @@ class Table:
 
 
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
-    """Read columns of a parquet or feather file, by name and kind: any number, integers, or text.
+    """Read columns of a parquet or feather file; ``columns`` gives the kind of each by name.
 
-    ``optional`` columns, which not every version of the format has, may be missing.
+    ``optional`` columns, which not every version of the format has, may be missing from a parquet file.
 
     Raises:
         DataError: The file is missing or damaged, has no rows, or lacks a column.
@@ -75,7 +75,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
         kinds = [(name, columns[name], table.column(name)) for name in table.column_names]
         texts = {name: _words(column) for name, kind, column in kinds if kind == "text"}
         numbers = {
-            name: _numbers(column, kind == "whole", name) for name, kind, column in kinds if kind != "text"
+            name: _numbers(column, kind == "integer", name) for name, kind, column in kinds if kind != "text"
         }
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure=_AGAIN) from error
@@ -89,9 +89,9 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
 
 
 def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:
-    """Return the columns as a validated Arrow table, and the names of the others.
+    """Return the columns as an Arrow table, and the names of the columns that were not read.
 
-    String offsets of damaged files may point anywhere.
+    The table is validated, because string offsets of damaged files may point anywhere.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -100,16 +100,16 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
         if read_head(path, 4) == PARQUET_MAGIC:
             unpacked_size.check_footer(source)
             file = pq.ParquetFile(source)
-            schema, places = file.schema_arrow, file.schema
+            schema, parquet_schema = file.schema_arrow, file.schema
             names = _check(schema, columns, optional)
-            read = [number for number in range(len(places)) if places.column(number).path in names]
-            unpacked_size.check_pages(source, read)
-            # Text stays in dictionaries: a text of a megabyte may be that of all rows.
+            indices = [i for i in range(len(parquet_schema)) if parquet_schema.column(i).path in names]
+            unpacked_size.check_pages(source, indices)
+            # Text stays dictionary-encoded: every row may repeat one text of a megabyte.
             texts = [name for name in names if columns[name] == "text"]
             file = pq.ParquetFile(source, metadata=file.metadata, read_dictionary=texts)
             table = file.read(columns=names, use_threads=False)
         else:
-            # The file is read as the stream in it: its footer may point elsewhere.
+            # Read the stream inside the file and not its footer, which may point elsewhere.
             unpacked_size.check_messages(source)
             schema = pa.ipc.open_stream(source).schema
             names = _check(schema, columns)
@@ -122,34 +122,34 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
 
 
 def _check(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> list[str]:
-    """Return the columns that a table has; refuse it if it lacks one, or has one twice or of another type.
+    """Return the names of the columns to read; refuse a missing one, a repeated one, and one of another type.
 
-    Columns of other types could repeat a value, and those with dots in their names be read with others.
+    A column of another type could repeat one value without limit; pyarrow would read ``a.b`` together with ``a``.
     """
     names = [name for name in columns if name in schema.names or name not in optional]
     for name in names:
         if schema.names.count(name) != 1:
             problem = f"has {'several columns' if name in schema.names else 'no column'} {name}"
             raise DataError(problem, cure="name a table of Argoverse 2, or download it again")
-        if not _is_plain(column := schema.field(name).type, columns[name]):
-            raise DataError(f"column {name} contains {str(column)[:80]}", cure=_AGAIN)
+        if not _is_plain(arrow_type := schema.field(name).type, columns[name]):
+            raise DataError(f"column {name} contains {str(arrow_type)[:80]}", cure=_AGAIN)
     if any("." in name for name in schema.names):
         raise DataError("has a column with a dot in its name", cure=_AGAIN)
     return names
 
 
-def _is_plain(column: Any, kind: Kind) -> bool:
-    """Return whether an Arrow type is one of a kind of column."""
+def _is_plain(arrow_type: Any, kind: Kind) -> bool:
+    """Return whether columns of a kind may have this Arrow type."""
     import pyarrow as pa
 
     if kind == "text":
-        column = column.value_type if pa.types.is_dictionary(column) else column
-        return pa.types.is_string(column) or pa.types.is_large_string(column)
-    return pa.types.is_integer(column) or (kind == "number" and pa.types.is_floating(column))
+        arrow_type = arrow_type.value_type if pa.types.is_dictionary(arrow_type) else arrow_type
+        return pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type)
+    return pa.types.is_integer(arrow_type) or (kind == "number" and pa.types.is_floating(arrow_type))
 
 
 def _numbers(column: Any, is_integer: bool, name: str) -> Array:
-    """Return a column of integers or, unless ``is_integer``, of any numbers."""
+    """Return a numeric column as int64 if ``is_integer``, else as float64; refuse null values."""
     if column.null_count:
         raise DataError(
             f"column {name} contains {column.type} with {column.null_count} null values", cure=_AGAIN
@@ -158,16 +158,16 @@ def _numbers(column: Any, is_integer: bool, name: str) -> Array:
 
 
 def _words(column: Any) -> Words:
-    """Return a column of text, whose dictionary may have words of no row or the same word twice."""
+    """Return a text column, with "" for null; its Arrow dictionary may hold unused or repeated words."""
     import pyarrow as pa
 
     is_dictionary = pa.types.is_dictionary(column.type)
-    codes = (column.unify_dictionaries() if is_dictionary else column.dictionary_encode()).combine_chunks()
-    rows = codes.indices.cast(pa.int64()).fill_null(-1).to_numpy()
-    used, first, of_row = np.unique(rows, return_index=True, return_inverse=True)
+    array = (column.unify_dictionaries() if is_dictionary else column.dictionary_encode()).combine_chunks()
+    codes = array.indices.cast(pa.int64()).fill_null(-1).to_numpy()
+    unique_codes, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    texts = codes.dictionary.take(pa.array(used[order], mask=used[order] < 0)).to_pylist()
+    texts = array.dictionary.take(pa.array(unique_codes[order], mask=unique_codes[order] < 0)).to_pylist()
     words: dict[str, int] = {}
-    numbers = np.empty(len(used), np.int64)
-    numbers[order] = [words.setdefault(text or "", len(words)) for text in texts]
-    return Words(tuple(words), numbers[of_row])
+    word_index = np.empty(len(unique_codes), np.int64)
+    word_index[order] = [words.setdefault(text or "", len(words)) for text in texts]
+    return Words(tuple(words), word_index[inverse])

@@ -1,6 +1,6 @@
-"""What parquet and feather files unpack to, from the headers of their parts, before pyarrow takes the memory.
+"""Checks of the unpacked size of parquet and feather files, by their headers, before pyarrow allocates memory.
 
-pyarrow believes these headers and no other sizes. Formats: Apache Parquet, ``parquet.thrift`` in Thrift's compact
+pyarrow trusts these headers and no other sizes. Formats: Apache Parquet, ``parquet.thrift`` in Thrift's compact
 protocol; Apache Arrow, ``Message.fbs`` in FlatBuffers, of which a feather file (version 2) holds a stream.
 """
 
@@ -12,21 +12,22 @@ from typing import Any
 
 from drivax.files import format_bytes
 
-#: The longest logs have some ten thousand rows, which take a few megabytes; damaged files can claim any number.
+#: Limits of a file: the longest logs have some ten thousand rows, which take a few megabytes; damaged files can claim
+#: any number.
 MOST_ROWS, MOST_BYTES = 1_000_000, 128 << 20
-#: Longest description of a file and of a page or batch, bytes; those of Argoverse 2 have up to 5,000. Each value in one
-#: may take some thousand bytes of memory.
+#: Longest footer of a file, and longest header of a page or batch, bytes; those of Argoverse 2 have up to 5,000. Each
+#: value in one may take some thousand bytes of memory.
 _LONGEST_FOOTER, _LONGEST_HEADER = 1 << 18, 1 << 16
-#: Most pages or messages; files of Argoverse 2 have up to a hundred. They take time even if they are empty.
+#: Most pages or messages, which take time even if they are empty; files of Argoverse 2 have up to a hundred.
 _MOST_PARTS = 1 << 14
-#: Encodings of parquet pages: all but deltas of texts (7), which repeat the beginning of the text before.
+#: Accepted encodings of parquet pages: all but DELTA_BYTE_ARRAY (7), which repeats the beginning of the previous text.
 _ENCODINGS = (0, 2, 3, 4, 5, 6, 8, 9)
-#: Compact protocol: kinds of values, and the fields of a page header that hold the header of its content.
+#: Compact protocol: types of values, and the fields of a page header that hold the header of its content.
 _TRUE, _FALSE, _BYTE, _I32, _I64, _DOUBLE, _BINARY, _LIST, _STRUCT = (
     1, 2, 3, 5, 6, 7, 8, 9, 12,
 )  # fmt: skip
 _DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
-#: Arrow streams: where they begin in a file, what precedes a message, and kinds of messages.
+#: Arrow streams: offset of the stream in a feather file, continuation marker before a message, types of messages.
 _STREAM, _CONTINUES = 8, 0xFFFFFFFF
 _SCHEMA, _DICTIONARY_BATCH, _RECORD_BATCH = 1, 2, 3
 
@@ -35,7 +36,7 @@ def check_footer(source: Any) -> None:
     """Refuse a parquet file whose footer has an implausible length.
 
     Raises:
-        Exception: Of ``reading.DAMAGE``, as of all functions of this module.
+        Exception: One of ``reading.DAMAGE``, as in all functions of this module.
     """
     if (length := _footer_length(source)) > _LONGEST_FOOTER:
         raise ValueError(f"a footer of {format_bytes(length)}")
@@ -48,42 +49,41 @@ def _footer_length(source: Any) -> int:
 
 
 def check_pages(source: Any, columns: Sequence[int]) -> None:
-    """Refuse a parquet file if some columns, given by their place, have too many rows or unpack to too much.
+    """Refuse a parquet file if the columns with these indices have too many rows or unpack to too many bytes.
 
-    The footer is read here: pyarrow's own objects abort the process if its sizes contradict its schema.
+    The footer is decoded here, because pyarrow aborts the process if the sizes in it contradict its schema.
     """
     length = _footer_length(source)
     source.seek(source.size() - 8 - length)
     footer, _ = _read_struct(source.read(length), 0)
     groups = footer[4, _LIST]
-    room, rows = _Room(), sum(group[3, _I64] for group in groups)
-    room.take(rows, 0)
-    groups = groups if rows else []  # the columns of empty files have no place
+    budget, rows = _Budget(), sum(group[3, _I64] for group in groups)
+    budget.take(rows, 0)
+    groups = groups if rows else []  # columns of empty files have no offsets
     previous_end = 0
     for start, end in sorted(_extent(group[1, _LIST][number]) for group in groups for number in columns):
         if not 0 <= start <= end <= source.size():
             raise ValueError("a column outside the file")
-        if start < previous_end:  # Row groups that share their pages would repeat them.
+        if start < previous_end:  # row groups that share pages would repeat them
             raise ValueError("columns that overlap")
         previous_end = end
         while start < end:
-            start += _check_page(source, start, room)
+            start += _check_page(source, start, budget)
     source.seek(0)
 
 
 def _extent(column: Mapping[tuple[int, int], Any]) -> tuple[int, int]:
-    """Return the first byte of a column of a row group, and the one after its last."""
-    described = column[3, _STRUCT]
-    start = described[9, _I64]
-    start = min(
-        start, described.get((11, _I64), start)
-    )  # the page of a dictionary comes before those of data
-    return start, start + described[7, _I64]
+    """Return the byte range of a column of a row group: first byte, and one past the last."""
+    metadata = column[3, _STRUCT]
+    start = metadata[9, _I64]
+    # The page of a dictionary comes before the pages of data.
+    start = min(start, metadata.get((11, _I64), start))
+    return start, start + metadata[7, _I64]
 
 
 def check_messages(source: Any) -> None:
-    """Refuse a feather file if it has too many rows or unpacks to too much; leave it at the beginning of its stream."""
-    room, position = _Room(), _STREAM
+    """Refuse a feather file with too many rows or unpacked bytes; leave ``source`` at the start of its stream."""
+    budget, position = _Budget(), _STREAM
     while position + 8 <= source.size():
         source.seek(position)
         mark, length = struct.unpack("<II", source.read(8))
@@ -91,14 +91,14 @@ def check_messages(source: Any) -> None:
             raise ValueError("a message of odd length")
         if not length:
             break
-        room.take_part(length)
+        budget.take_part(length)
         header, body = source.read(length), position + 8 + length
         message = _root(header)
         kind, content = _scalar(header, message, 1, "<B"), _table(header, message, 2)
         if kind == _DICTIONARY_BATCH:
             content = _table(header, content, 1)
         if kind in (_DICTIONARY_BATCH, _RECORD_BATCH):
-            _check_batch(source, header, content, body, room, kind == _RECORD_BATCH)
+            _check_batch(source, header, content, body, budget, kind == _RECORD_BATCH)
         elif kind != _SCHEMA:
             raise ValueError(f"a message of kind {kind}")
         if not 0 <= (size := _scalar(header, message, 3, "<q")) <= source.size() - body:
@@ -107,14 +107,14 @@ def check_messages(source: Any) -> None:
     source.seek(_STREAM)
 
 
-class _Room:
-    """Rows, bytes and parts that are left."""
+class _Budget:
+    """Rows, bytes and parts that a file may still use."""
 
     def __init__(self) -> None:
         self._rows, self._bytes, self._parts = MOST_ROWS, MOST_BYTES, _MOST_PARTS
 
     def take_part(self, length: int) -> None:
-        """Take the room of a page or message with a header of ``length`` bytes, whatever its content."""
+        """Deduct a page or message with a header of ``length`` bytes, without its content."""
         self._parts -= 1
         self.take(0, length)
         if self._parts < 0:
@@ -131,15 +131,15 @@ class _Room:
             raise ValueError(f"unpacks to more than {format_bytes(MOST_BYTES)}")
 
 
-def _check_page(source: Any, start: int, room: _Room) -> int:
-    """Take the room of a page; return the length of the page in the file."""
+def _check_page(source: Any, start: int, budget: _Budget) -> int:
+    """Deduct a page from the budget; return its length in the file, bytes."""
     source.seek(start)
     fields, length = _read_struct(source.read(_LONGEST_HEADER), 0)
     size = fields[3, _I32]
     if size < 0:
         raise ValueError("a page of negative length")
-    room.take_part(length)
-    room.take(0, fields[2, _I32])
+    budget.take_part(length)
+    budget.take(0, fields[2, _I32])
     for field, encoding in ((_DATA, 2), (_DICTIONARY, 2), (_DATA_V2, 4)):
         content = fields.get((field, _STRUCT), {})
         if content and content[encoding, _I32] not in _ENCODINGS:
@@ -150,9 +150,9 @@ def _check_page(source: Any, start: int, room: _Room) -> int:
 
 
 def _read_struct(data: bytes, position: int, depth: int = 8) -> tuple[dict[tuple[int, int], Any], int]:
-    """Read a structure of the compact protocol: its fields by number and kind, and the position after it.
+    """Read a struct of the compact protocol: its fields by number and type, and the position after it.
 
-    As for pyarrow, a field of an unexpected kind is another field, and the last of several counts.
+    As in pyarrow, a field of an unexpected type does not count, and the last of repeated fields does.
     """
     if not depth:
         raise ValueError("nested too deeply")
@@ -194,7 +194,7 @@ def _read_list(data: bytes, position: int, depth: int) -> tuple[list[Any], int]:
     if count == 15:
         count, position = _read_varint(data, position)
     values: list[Any] = []
-    for _ in range(count):  # Each takes a byte or more, also truth values, which are bytes here.
+    for _ in range(count):  # Each takes a byte or more: booleans in lists are bytes.
         value, position = _read_value(data, position, _BYTE if kind in (_TRUE, _FALSE) else kind, depth)
         values.append(value)
     return values, position
@@ -216,10 +216,10 @@ def _read_signed(data: bytes, position: int) -> tuple[int, int]:
     return value >> 1 ^ -(value & 1), position
 
 
-def _check_batch(source: Any, header: bytes, batch: int, body: int, room: _Room, has_rows: bool) -> None:
-    """Take the room of a record batch or of the batch of a dictionary."""
+def _check_batch(source: Any, header: bytes, batch: int, body: int, budget: _Budget, has_rows: bool) -> None:
+    """Deduct a record batch, or the batch of a dictionary (without rows), from the budget."""
     rows = _scalar(header, batch, 0, "<q")
-    room.take(rows * has_rows, 0)
+    budget.take(rows * has_rows, 0)
     is_compressed = _field(header, batch, 3) is not None
     start = _field(header, batch, 2)
     if start is None:
@@ -231,7 +231,7 @@ def _check_batch(source: Any, header: bytes, batch: int, body: int, room: _Room,
             source.seek(body + offset)
             unpacked = int.from_bytes(source.read(8), "little", signed=True)
             size = size if unpacked == -1 else unpacked
-        room.take(0, size)
+        budget.take(0, size)
 
 
 def _root(data: bytes) -> int:
@@ -239,18 +239,18 @@ def _root(data: bytes) -> int:
 
 
 def _field(data: bytes, table: int, number: int) -> int | None:
-    """Return the position of a field of a FlatBuffers table; None without it."""
-    directory = table - _unpack("<i", data, table)
+    """Return the position of a field of a FlatBuffers table; None if the table lacks it."""
+    vtable = table - _unpack("<i", data, table)
     entry = 4 + 2 * number
-    if entry >= _unpack("<H", data, directory):
+    if entry >= _unpack("<H", data, vtable):
         return None
-    offset = _unpack("<H", data, directory + entry)
+    offset = _unpack("<H", data, vtable + entry)
     return table + offset if offset else None
 
 
-def _scalar(data: bytes, table: int, number: int, form: str) -> int:
+def _scalar(data: bytes, table: int, number: int, format_code: str) -> int:
     position = _field(data, table, number)
-    return 0 if position is None else _unpack(form, data, position)
+    return 0 if position is None else _unpack(format_code, data, position)
 
 
 def _table(data: bytes, table: int, number: int) -> int:
@@ -260,7 +260,7 @@ def _table(data: bytes, table: int, number: int) -> int:
     return position + _unpack("<I", data, position)
 
 
-def _unpack(form: str, data: bytes, position: int) -> int:
+def _unpack(format_code: str, data: bytes, position: int) -> int:
     if position < 0:
         raise ValueError("a position before the message")
-    return struct.unpack_from(form, data, position)[0]
+    return struct.unpack_from(format_code, data, position)[0]

@@ -1,8 +1,8 @@
-"""From a stored scenario back to a recording, which exporters write and tests compare.
+"""Restore the recording of a stored scenario, for exporters and for tests.
 
-Some information is lost. Stored polylines are simplified to 5 cm and, lanes of routes aside, cropped to 100 m around
-ego's log; boxes have one size; parked agents have one pose and no marks; stop signs have no ids and heights, and lights
-without a lane on the map no lane id. ``scenario.build.assemble`` says what is kept.
+Some information is lost. Stored polylines are simplified to 5 cm and, except for lanes of routes, cropped to 100 m
+around ego's log; boxes have one size; parked agents have one pose and no marks; stop signs have no ids and no heights;
+lights whose lane is not on the map have no lane id. ``scenario.build.assemble`` says what is kept.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario
 
 _Array = np.ndarray[Any, Any]
-#: Flags that readers set; all others are measured again.
-_READERS_FLAGS = ~MEASURED & ~(Flag.NO_FUTURE | Flag.JITTERED_TIME)
+#: Flags that readers set; assembly determines all others again.
+_READER_FLAGS = ~MEASURED & ~(Flag.NO_FUTURE | Flag.JITTERED_TIME)
 
 
 def restore(scenario: Scenario) -> Recording:
@@ -51,32 +51,32 @@ def restore(scenario: Scenario) -> Recording:
         to_predict=tuple(np.flatnonzero(marks & PREDICT_BIT).tolist()),
         of_interest=tuple(np.flatnonzero(marks & INTEREST_BIT).tolist()),
         tags=scenario.tags,
-        flags=Flag(scenario.has & _READERS_FLAGS),
+        flags=Flag(scenario.has & _READER_FLAGS),
     )
 
 
-def _over_time(scenario: Scenario, moving: _Array, parked: _Array, name: str) -> Bool[_Array, "track time"]:
-    """Return a mask of both blocks in the order of tracks."""
+def _mask(scenario: Scenario, moving: _Array, parked: _Array, name: str) -> Bool[_Array, "track time"]:
+    """Return the mask ``name`` of moving and parked agents, in the order of tracks."""
     steps = int(scenario.steps)
     agents, parked_agents = scenario.record["agent_" + name], scenario.record["parked_" + name]
     return np.concatenate((agents[:steps, moving], parked_agents[:steps, parked]), axis=1).T
 
 
 def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
-    """Return tracks of the agents in some slots of both blocks, in the source's frame."""
+    """Return tracks of the moving and parked agents in these slots, in the source's frame."""
     steps = int(scenario.steps)
-    repeat = np.zeros((steps, len(parked), 1))
-    valid = _over_time(scenario, moving, parked, "valid")
+    zeros = np.zeros((steps, len(parked), 1))
+    valid = _mask(scenario, moving, parked, "valid")
     mask = valid.T[..., None]
 
     def join_steps(agents: _Array, poses: _Array) -> _Array:
-        """Join time series of moving agents and poses of parked ones: [track, time, number], zero where not valid."""
+        """Join time series of moving agents and poses of parked ones: [track, time, column], zero where not valid."""
         series = agents[:steps, moving].reshape(steps, len(moving), -1)
-        series = np.concatenate((series, poses + repeat), axis=1)
+        series = np.concatenate((series, poses + zeros), axis=1)
         return np.swapaxes(np.where(mask, series, 0.0), 0, 1).astype(np.float64)
 
     def join(agents: _Array, parked_agents: _Array) -> _Array:
-        """Join constants of both blocks."""
+        """Join constants of moving and parked agents."""
         return np.concatenate((agents[moving], parked_agents[parked]))
 
     size = join(scenario.agent_size, scenario.parked_size).astype(np.float64)
@@ -94,8 +94,8 @@ def _tracks(scenario: Scenario, moving: _Array, parked: _Array) -> Tracks:
 
 
 def _seen_mask(scenario: Scenario, moving: _Array, parked: _Array) -> Bool[_Array, "track time"] | None:
-    """Return the mask of what ego's sensors saw; None for all that is valid."""
-    seen, valid = (_over_time(scenario, moving, parked, name) for name in ("seen", "valid"))
+    """Return the mask of states that ego's sensors saw; None if they saw all valid ones."""
+    seen, valid = (_mask(scenario, moving, parked, name) for name in ("seen", "valid"))
     return None if np.array_equal(seen, valid) else seen.copy()
 
 
@@ -106,7 +106,7 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
     feature, lane, kind = (
         getattr(scenario, f"segment_{name}")[:count].astype(np.int64) for name in ("feature", "lane", "kind")
     )
-    # Without a row in the feature table only kind, lane and ends tell features apart; numbers above all rows hold both.
+    # Segments without a feature row are grouped by kind and lane, packed into a number above all rows.
     group = np.where(feature >= 0, feature, np.iinfo(np.int16).max + (kind + 1) * 2**16 + lane + 1)
     chains: list[list[int]] = []
     open_ends: dict[tuple[int, bytes], list[int]] = {}
@@ -121,19 +121,19 @@ def _polylines(scenario: Scenario) -> list[tuple[Float[_Array, "point 3"], int]]
 
 
 def _features(scenario: Scenario, new_ids: Iterator[int]) -> list[MapFeature]:
-    """Return a feature per polyline; only the first one of a source's feature keeps its id and links."""
-    features, numbers = [], set()
+    """Return a feature per polyline; only the first polyline of a source's feature keeps its id and links."""
+    features, source_ids = [], set()
     for local, segment in _polylines(scenario):
         kind = RoadKind(int(scenario.segment_kind[segment]))
         row, lane = int(scenario.segment_feature[segment]), int(scenario.segment_lane[segment])
-        number = int(scenario.lane_id[lane] if lane >= 0 else scenario.feature_id[row] if row >= 0 else -1)
-        is_first = number >= 0 and number not in numbers
-        numbers.add(number)
+        source_id = int(scenario.lane_id[lane] if lane >= 0 else scenario.feature_id[row] if row >= 0 else -1)
+        is_first = source_id >= 0 and source_id not in source_ids
+        source_ids.add(source_id)
         points = local + scenario.origin
         if kind in POLYGON_KINDS and np.array_equal(points[0], points[-1]):
             points = points[:-1]
         links = _links(scenario, lane) if is_first and kind in LANE_KINDS and lane >= 0 else {}
-        features.append(MapFeature(number if is_first else next(new_ids), kind, points, **links))
+        features.append(MapFeature(source_id if is_first else next(new_ids), kind, points, **links))
     return features
 
 

@@ -35,17 +35,17 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: Most tracks to predict that come before all others; sort key of tracks that are not valid now, from which their
-#: number of valid steps is subtracted.
+#: Most tracks to predict that precede all others; sort key of tracks that are not valid at the current step, from which
+#: their number of valid steps is subtracted.
 _FIRST, _ABSENT_RANK = 8, 1e9
-#: Spacing of map points just under 1 m, so that rounding makes no longer gap, where readers cut polylines; and the
+#: Spacing of map points, just under 1 m so that rounding makes no longer gap, at which readers cut polylines; and the
 #: factor by which it grows until the points fit.
 _SPACING_M, _WIDEN = 0.998, 1.1
 #: Largest absolute coordinate that is written; up to it float32 is exact to half a millimetre.
 _ABSOLUTE_M = 16_384.0
-#: Ends of the whole numbers that float32 and int32 hold.
+#: Upper bounds of the integers that float32 and int32 hold.
 _FLOAT_ID_END, _INT_ID_END = 2**24, 2**31
-#: Order of the official writer; readers that take fewer points cut off the end.
+#: Order of features in Waymo's files; readers that take fewer points cut off the end.
 _ORDER = (
     *LANE_KINDS, *LINE_KINDS, RoadKind.STOP_SIGN, RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, *EDGE_KINDS,
     RoadKind.DRIVEWAY,
@@ -56,7 +56,7 @@ _ON_ROUTE_M, _ON_ROUTE_SHARE = 1.5, 0.95
 
 @dataclass(frozen=True)
 class Paths:
-    """Number, points and spacing of ``path_samples``."""
+    """Number of ``path_samples``, and number and spacing of their points."""
 
     count: int
     points: int
@@ -72,35 +72,35 @@ def tf_example(
     """Return the features of a scenario and counts of what did not fit, both by name.
 
     Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
-    current step: UTM coordinates would be rounded to half a metre. That position is then ``scenario/origin``, a text,
-    which Waymax and V-Max skip. Ids that their type cannot hold exactly (agents: float32, map: int32) are replaced by
-    running numbers.
+    current step: UTM coordinates would be rounded to half a metre. ``scenario/origin`` then holds that position as
+    text, which Waymax and V-Max skip. Where an id does not fit its type exactly (agents: float32, map: int32), running
+    numbers replace all ids of that kind.
     """
     recording = restore(scenario)
-    tracks, lost = _over_time(recording)
+    tracks, lost = _align_tracks(recording)
     origin = _origin(recording, scenario.origin)
     order = _order(tracks, recording)
     lost["agents"] += max(len(order) - AGENTS, 0)
     micros = np.round(np.arange(STEPS) * float(scenario.dt_s) * 1e6).astype(np.int64)
-    numbers = _numbers(recording)
+    file_ids = _file_ids(recording)
     features: dict[str, bytes | _Array] = {"scenario/id": recording.scenario_id.encode()}
     features |= {ORIGIN: " ".join(map(repr, origin.tolist())).encode()} if origin.any() else {}
     features |= _states(tracks, order[:AGENTS], micros, origin) | _marks(tracks, recording, order[:AGENTS])
-    features |= _lights(recording, numbers, micros, origin, lost)
-    features |= _map(recording.features, numbers, origin)
-    features |= _paths(scenario, numbers, scenario.origin - origin, paths)
+    features |= _lights(recording, file_ids, micros, origin, lost)
+    features |= _map(recording.features, file_ids, origin)
+    features |= _paths(scenario, file_ids, scenario.origin - origin, paths)
     return features, +lost
 
 
-def _origin(recording: Recording, local: _Array) -> _Array:
-    """Return the point that is subtracted from the source's coordinates."""
+def _origin(recording: Recording, scenario_origin: _Array) -> _Array:
+    """Return the point to subtract from all coordinates: zeros, or the scenario's origin if coordinates are large."""
     points = [recording.tracks.xy[recording.tracks.valid], *(f.points[:, :2] for f in recording.features)]
     largest = max(float(np.abs(xy).max(initial=0.0)) for xy in points)
-    return np.zeros(3) if largest < _ABSOLUTE_M else np.asarray(local, np.float64)
+    return np.zeros(3) if largest < _ABSOLUTE_M else np.asarray(scenario_origin, np.float64)
 
 
-def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
-    """Return tracks over 91 steps around the current one, missing steps not valid, and the number of steps left out."""
+def _align_tracks(recording: Recording) -> tuple[Tracks, Counter[str]]:
+    """Return tracks at 91 steps around the current one, missing steps as invalid, and the number of steps left out."""
     tracks = recording.tracks
     steps, exists = _steps(recording)
     index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
@@ -110,7 +110,7 @@ def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
 
 
 def _steps(recording: Recording) -> tuple[_Array, _Array]:
-    """Return the steps of the recording around the current one, and whether it has them."""
+    """Return 91 steps around the recording's current one, and whether the recording has each."""
     steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
     return steps, (steps >= 0) & (steps < len(recording.timestamps_s))
 
@@ -118,8 +118,8 @@ def _steps(recording: Recording) -> tuple[_Array, _Array]:
 def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     """Return the rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
-    That is: of the tracks that are valid now up to 8 to predict by id, then the others by their distance from ego; then
-    those that are not, by their number of valid steps. Tracks that are not valid at any of the 91 steps are left out.
+    That is: of the tracks that are valid now up to 8 to predict by id, then the others by distance from ego; then those
+    that are not valid now, most valid steps first. Tracks that are not valid at any of the 91 steps are left out.
     """
     now = tracks.valid[:, CURRENT_STEP]
     to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
@@ -135,7 +135,7 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
 
 
 def _pad(values: _Array, rows: int, fill: int = -1) -> _Array:
-    """Pad an array to a number of rows."""
+    """Pad an array to a number of rows, with ``fill``."""
     out = np.full((rows, *values.shape[1:]), fill, values.dtype)
     out[: len(values)] = values
     return out
@@ -174,7 +174,7 @@ def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> di
 
 
 def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Array]:
-    """Return features of agents that do not change over time; -1 in rows without an agent."""
+    """Return the time-invariant features of agents; -1 in rows without an agent."""
     ids = tracks.track_id[order]
     if ids.max(initial=0) >= _FLOAT_ID_END:
         ids = np.arange(len(order))
@@ -195,16 +195,16 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
     return {f"state/{name}": _pad(column, AGENTS) for name, column in columns.items()}
 
 
-def _numbers(recording: Recording) -> dict[int, int]:
-    """Return the written id of each map feature and lane of a light by its id: the same if all fit, else its number."""
+def _file_ids(recording: Recording) -> dict[int, int]:
+    """Map ids of map features and lights' lanes to ids for the file: the same if all fit, else running numbers."""
     ids = [feature.feature_id for feature in recording.features]
-    numbers = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
-    fit = all(0 <= number < _INT_ID_END for number in numbers)
-    return {number: number if fit else row for row, number in enumerate(numbers)}
+    file_ids = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
+    fit = all(0 <= number < _INT_ID_END for number in file_ids)
+    return {number: number if fit else row for row, number in enumerate(file_ids)}
 
 
 def _lights(
-    recording: Recording, numbers: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
+    recording: Recording, file_ids: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
 ) -> dict[str, _Array]:
     """Return lights in 16 slots, time-major; count what does not fit under ``lost["light_states"]``.
 
@@ -223,7 +223,7 @@ def _lights(
     lost["light_states"] += int((states >= 0).sum() - is_observed.sum())
     lane = np.full(states.shape[1], -1, np.int64)
     point = np.full((states.shape[1], 3), -1.0)
-    lane[: len(lights)] = [numbers[light.lane_id] for light in lights]
+    lane[: len(lights)] = [file_ids[light.lane_id] for light in lights]
     point[: len(lights)] = np.array([light.stop_point for light in lights]).reshape(-1, 3) - origin
     table = {
         "state": state,
@@ -235,12 +235,12 @@ def _lights(
     return _by_span("traffic_light_state", table, axis=0)
 
 
-def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
-    """Return points along every feature, at most 1 m apart; further apart if these are more than 30,000."""
+def _map(features: tuple[MapFeature, ...], file_ids: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
+    """Return points along every feature, at most 1 m apart; further apart if there would be more than 30,000."""
     features = tuple(sorted(features, key=lambda feature: _ORDER.index(feature.kind)))
     spacing = _SPACING_M
     lines = [_sample(feature, spacing) for feature in features]
-    # Ends: the features' own points are fewer (two for each of at most 8192 stored segments).
+    # The loop ends, because the features' own points are fewer (two for each of at most 8192 stored segments).
     while sum(map(len, lines)) > POINTS:
         spacing *= _WIDEN
         lines = [_sample(feature, spacing) for feature in features]
@@ -249,7 +249,7 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
     columns = {
         "xyz": np.concatenate([*lines, np.zeros((0, 3))]) - origin,
         "dir": np.concatenate([*map(_directions, lines), np.zeros((0, 3))]),
-        "id": np.repeat([numbers[f.feature_id] for f in features], counts).astype(np.int64)[:, None],
+        "id": np.repeat([file_ids[f.feature_id] for f in features], counts).astype(np.int64)[:, None],
         "type": np.repeat([int(f.kind) for f in features], counts).astype(np.int64)[:, None],
         "speed_limit": np.repeat(limits, counts).astype(np.float64),
     }
@@ -259,7 +259,7 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
 
 
 def _sample(feature: MapFeature, spacing_m: float) -> _Array:
-    """Return points along a feature at most ``spacing_m`` apart, its own included; polygons are closed."""
+    """Return a feature's own points and others between them, at most ``spacing_m`` apart; polygons are closed."""
     points = feature.points
     if feature.kind in POLYGON_KINDS:
         points = np.concatenate((points, points[:1]))
@@ -275,8 +275,8 @@ def _directions(line: _Array) -> _Array:
     return step / np.where(length > 0, length, 1.0)
 
 
-def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, paths: Paths) -> dict[str, _Array]:
-    """Return routes from ego's first logged position; the route to the goal first and on the route.
+def _paths(scenario: Scenario, file_ids: Mapping[int, int], shift: _Array, paths: Paths) -> dict[str, _Array]:
+    """Return routes from ego's first logged position; the first is the route to the goal and always ``on_route``.
 
     The log route (stored row 1) is privileged and not exported, unless no lane leads to the goal: then it is row 0.
     """
@@ -294,7 +294,7 @@ def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, paths:
         ids = np.where(lanes >= 0, scenario.lane_id[lanes], -1).tolist()
         size = len(points)
         xyz[number, :size] = points + shift
-        lane[number, :size] = [numbers.get(lane_id, -1) for lane_id in ids]
+        lane[number, :size] = [file_ids.get(lane_id, -1) for lane_id in ids]
         arc[number, :size] = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         valid[number, :size] = 1
         _, distance = project(points[:, :2], log)

@@ -18,7 +18,7 @@ from drivax.files import PartialFolder, check_output, explain_full_disk, sync_an
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_set_space
 
-#: Description of an export in another format.
+#: File that describes an export in another format.
 NOTE = "export.json"
 #: Called with (scenarios done, scenarios).
 Progress = Callable[[int, int], None]
@@ -81,8 +81,8 @@ def export(
     options, out = options or Export(), Path(out)
     options.check()
     scenarios = ScenarioSet.open(set_path)
-    names = () if options.ids is None else (options.ids,)
-    rows = select_scenarios(scenarios, options.filters, names, options.limit)
+    id_files = () if options.ids is None else (options.ids,)
+    rows = select_scenarios(scenarios, options.filters, id_files, options.limit)
     if options.format == "set":
         return write_part(scenarios, rows, out, options.overwrite, progress)
     _refuse_existing(out, options)
@@ -165,9 +165,9 @@ def _write_examples(work: _Work) -> _Written:
         path = work.folder / shard_name(work.name, number, shards)
         with path.open("wb") as file:
             for row in work.rows[number * size : (number + 1) * size]:
-                features, missing = tf_example(work.scenarios[row], PATHS[work.options.paths])
+                features, left_out = tf_example(work.scenarios[row], PATHS[work.options.paths])
                 write_record(file, example(features))
-                lost.update(missing)
+                lost.update(left_out)
                 files.append(path.name)
                 work.report(len(files))
             sync_and_close(file)

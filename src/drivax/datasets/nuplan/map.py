@@ -39,8 +39,8 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
     "gen_lane_connectors_scaled_width_polygons": ("lane_connector_fid", "left_boundary_fid", "right_boundary_fid"),
     **dict.fromkeys(_DRIVABLE, ()),
 }  # fmt: skip
-#: Layers that are not read.
-_OTHERS = frozenset((
+#: Known layers that are not read.
+_UNUSED_LAYERS = frozenset((
     "lane_groups_polygons", "lane_group_connectors", "walkways", "traffic_lights", "dubins_nodes",
 ))  # fmt: skip
 _BASE_LAYERS = ("baseline_paths", "lanes_polygons", "lane_connectors")
@@ -49,7 +49,7 @@ NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), s
 _ARCHIVE, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
-#: Decoded around ego's drive: 100 m that are kept, and space for routes that lead further.
+#: Margin around ego's drive within which the map is decoded: 100 m that are kept, and space for longer routes.
 MARGIN_M = 250.0
 #: A feature near the drive that reaches further than this from it is damaged.
 _FARTHEST_M = 20_000.0
@@ -116,7 +116,7 @@ def _listing(log: Path) -> Path:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane or lane connector without its geometry. Ids are packed feature ids; boundaries are fids."""
+    """A lane or connector without geometry: links are packed feature ids, boundaries fids, ``baseline`` is a row."""
 
     baseline: int
     roadblock: tuple[str, int] | None
@@ -134,7 +134,7 @@ class City:
 
     Attributes:
         path: The GeoPackage.
-        epsg: The projected system of the logs.
+        epsg: EPSG code of the projected coordinate system of the logs.
         layers: The layers by name.
         lanes: Lanes and connectors by packed id.
         roadblocks: Packed ids of the lanes of each roadblock, by (``lane`` or ``connector``, fid).
@@ -159,7 +159,7 @@ def city_map(path: Path) -> City:
 
 @functools.lru_cache(maxsize=2)
 def _city(path: Path, mtime_ns: int, size: int) -> City:
-    """Index a map; time and size of the file only serve the cache."""
+    """Index a map; the time and size of the file are keys of the cache only."""
     with open_database(path) as database:
         layers = {name: layer for name in LAYERS if (layer := read_layer(database, name, LAYERS[name]))}
         if missing := [name for name in _BASE_LAYERS if name not in layers]:
@@ -174,11 +174,11 @@ def _city(path: Path, mtime_ns: int, size: int) -> City:
     boundaries = layers.get("boundaries")
     fids = () if boundaries is None else boundaries.fid.tolist()
     rows: dict[int | None, int] = {fid: row for row, fid in enumerate(fids)}
-    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _OTHERS))
+    return City(path, epsg, layers, lanes, blocks, rows, len(names - LAYERS.keys() - _UNUSED_LAYERS))
 
 
 def _read_epsg(database: Database) -> int:
-    """Read the EPSG number of the system of the logs from the table ``meta``."""
+    """Read the EPSG code of the logs' coordinate system from the table ``meta``."""
     database.require("meta", "key", "value")
     rows = database.rows("SELECT value FROM meta WHERE key = 'projectedCoordSystem'")
     match = re.fullmatch(r"(?:epsg:)?(\d{4,6})", str(rows[0][0]).strip().lower()) if rows else None
@@ -197,7 +197,7 @@ def as_integer(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
-    """Return a limit in m/s, also from a text; None for a missing or implausible one."""
+    """Return a speed limit in m/s from a number or text; None for a missing or implausible one."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
         value = float(value)
     return float(value) if isinstance(value, int | float) and 0.0 < value <= _FASTEST_MPS else None
@@ -210,7 +210,7 @@ def _lane_id(layer: str, value: Any) -> int | None:
 
 
 def _table(layer: Layer | None, *columns: str) -> Iterator[tuple[Any, ...]]:
-    """Yield the fid and some columns of every row."""
+    """Yield the fid and some columns of every row; nothing without a layer."""
     if layer is None:
         return iter(())
     return zip(layer.fid.tolist(), *(layer.columns[name] for name in columns), strict=True)
@@ -220,41 +220,41 @@ def _lanes(layers: Mapping[str, Layer]) -> dict[int, Lane]:
     """Return lanes and connectors that have a baseline, with their links, which may dangle."""
     baselines: dict[int, int] = {}
     for row, (_, lane, connector) in enumerate(_table(layers["baseline_paths"], *LAYERS["baseline_paths"])):
-        owner = _lane_id("lanes_polygons", lane) or _lane_id("lane_connectors", connector)
-        if owner is not None:
-            baselines.setdefault(owner, row)
+        lane_id = _lane_id("lanes_polygons", lane) or _lane_id("lane_connectors", connector)
+        if lane_id is not None:
+            baselines.setdefault(lane_id, row)
     lanes = _plain_lanes(layers["lanes_polygons"], baselines)
-    for number, connector in _connectors(layers, baselines):
-        lanes[number] = connector
+    for lane_id, connector in _connectors(layers, baselines):
+        lanes[lane_id] = connector
         for lane in lanes.keys() & connector.predecessors:
-            lanes[lane].successors.append(number)
+            lanes[lane].successors.append(lane_id)
         for lane in lanes.keys() & connector.successors:
-            lanes[lane].predecessors.append(number)
+            lanes[lane].predecessors.append(lane_id)
     return lanes
 
 
 def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
-    """Return lanes; their left and right neighbours have the index before and after in the same group."""
+    """Return lanes without connectors; left and right neighbours have the index before and after in the group."""
     lanes: dict[int, Lane] = {}
     lane_at: dict[tuple[int, int], int] = {}
     slots: dict[int, tuple[int, int]] = {}
     for fid, lane, group, index, left, right, limit in _table(layer, *LAYERS["lanes_polygons"]):
-        number = _lane_id("lanes_polygons", fid if lane is None else lane)
-        if number is None or number not in baselines or number in lanes:
+        lane_id = _lane_id("lanes_polygons", fid if lane is None else lane)
+        if lane_id is None or lane_id not in baselines or lane_id in lanes:
             continue
         block, slot = as_integer(group), as_integer(index)
-        lanes[number] = Lane(
-            baseline=baselines[number],
+        lanes[lane_id] = Lane(
+            baseline=baselines[lane_id],
             roadblock=None if block is None else ("lane", block),
             limit_mps=_limit(limit),
             boundaries=(as_integer(left), as_integer(right)),
         )
         if block is not None and slot is not None:
-            lane_at.setdefault((block, slot), number)
-            slots[number] = block, slot
-    for number, (block, slot) in slots.items():
+            lane_at.setdefault((block, slot), lane_id)
+            slots[lane_id] = block, slot
+    for lane_id, (block, slot) in slots.items():
         neighbours = {"left": lane_at.get((block, slot - 1)), "right": lane_at.get((block, slot + 1))}
-        lanes[number] = replace(lanes[number], **neighbours)
+        lanes[lane_id] = replace(lanes[lane_id], **neighbours)
     return lanes
 
 
@@ -268,25 +268,25 @@ def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> It
     for fid, exit_fid, entry_fid, group, limit in _table(
         layers["lane_connectors"], *LAYERS["lane_connectors"]
     ):
-        number, block = _lane_id("lane_connectors", fid), as_integer(group)
-        if number is None or number not in baselines:
+        lane_id, block = _lane_id("lane_connectors", fid), as_integer(group)
+        if lane_id is None or lane_id not in baselines:
             continue
         predecessor, successor = (_lane_id("lanes_polygons", lane) for lane in (exit_fid, entry_fid))
         lane = Lane(
-            baseline=baselines[number],
+            baseline=baselines[lane_id],
             roadblock=None if block is None else ("connector", block),
             limit_mps=_limit(limit),
             boundaries=sides.get(as_integer(fid), (None, None)),
             successors=[] if successor is None else [successor],
             predecessors=[] if predecessor is None else [predecessor],
         )
-        yield number, lane
+        yield lane_id, lane
 
 
 def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
     """Return lanes and connectors of a route's roadblocks, and the number of roadblocks that the map lacks.
 
-    Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
+    A roadblock is a group of lanes or of connectors; an id of both means the lanes, as in the devkit.
     """
     blocks = city.roadblocks
     groups = [blocks.get(("lane", number)) or blocks.get(("connector", number)) for number in ids]
@@ -297,26 +297,26 @@ def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
 def features_around(
     city: City, xy: Float64[np.ndarray, "point 2"]
 ) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """Return map features within ``MARGIN_M`` of the bounding box of a drive, in the system of the logs, z = 0.
+    """Return map features within ``MARGIN_M`` of the bounding box of a drive, and counts of lost ones by name.
 
-    Damaged geometries and baselines without a direction are counted.
+    Coordinates are in the system of the logs, z = 0. Damaged geometries and baselines without a direction are lost.
     """
     shapely = import_extra("shapely")
     try:
         with open_database(city.path) as database:
-            around = _Around(city, database, (*xy.min(axis=0), *xy.max(axis=0)))
-            features = [*_lane_features(around), *_line_features(around), *_polygon_features(around)]
-            areas = list(_areas(around))
+            decoder = _MapDecoder(city, database, (*xy.min(axis=0), *xy.max(axis=0)))
+            features = [*_lane_features(decoder), *_line_features(decoder), *_polygon_features(decoder)]
+            areas = list(_areas(decoder))
     except shapely.errors.ShapelyError as error:
         raise DataError(f"shapely cannot use a geometry ({error})", file=city.path, cure=CURE) from error
     if not any(feature.kind == RoadKind.LANE_SURFACE for feature in features):
         problem = f"no lane of the map {city.path} lies within {MARGIN_M:.0f} m of the drive"
         raise DataError(problem, cure=CURE)
     features += road_edges(areas, feature_id("road_edges", 0))
-    return tuple(features), parsing.nonzero(map_geometries=len(around.damaged), lanes=around.lost_lanes)
+    return tuple(features), parsing.nonzero(map_geometries=len(decoder.damaged), lanes=decoder.lost_lanes)
 
 
-class _Around:
+class _MapDecoder:
     """Decodes the map around ``drive``, a box (west, south, east, north) in the system of the logs.
 
     ``damaged`` holds layer and row of unusable geometries; ``lost_lanes`` counts baselines without a direction.
@@ -332,7 +332,7 @@ class _Around:
         self._middle = np.array([(west + east) / 2, (south + north) / 2])
         self._reach = _FARTHEST_M + max(east - west, north - south)
 
-    def near(self, name: str) -> list[int]:
+    def box_rows(self, name: str) -> list[int]:
         """Return the rows of a layer whose bounds touch the box."""
         layer = self.city.layers.get(name)
         if layer is None:
@@ -341,16 +341,16 @@ class _Around:
         return layer.touching(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
 
     def types(self, name: str) -> dict[int, int | None]:
-        """Return types of the features around the drive by row, for a layer whose only column is the type."""
+        """Return the type of each feature around the drive by row, from the only column of the layer."""
         (column,) = LAYERS[name]
-        return {row: as_integer(self.city.layers[name].columns[column][row]) for row in self.near(name)}
+        return {row: as_integer(self.city.layers[name].columns[column][row]) for row in self.box_rows(name)}
 
     @functools.cached_property
     def baselines(self) -> tuple[list[int], Array]:
         """Packed ids of the lanes around the drive, and their baselines."""
-        owners = {lane.baseline: number for number, lane in self.city.lanes.items()}
-        rows = [row for row in self.near("baseline_paths") if row in owners]
-        return [owners[row] for row in rows], self.shapes("baseline_paths", rows)
+        lane_ids = {lane.baseline: lane_id for lane_id, lane in self.city.lanes.items()}
+        rows = [row for row in self.box_rows("baseline_paths") if row in lane_ids]
+        return [lane_ids[row] for row in rows], self.shapes("baseline_paths", rows)
 
     def shapes(self, name: str, rows: Sequence[int]) -> Array:
         """Return projected geometries of rows; None for one that is damaged, empty or too far away."""
@@ -406,7 +406,7 @@ def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
 
 
 def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Return the outline of a polygon (of the largest part), its first point not repeated."""
+    """Return the outline of a polygon's largest part, its first point not repeated; None for any other shape."""
     shapely = import_extra("shapely")
     parts = _polygons(shape)
     if not parts:
@@ -416,7 +416,7 @@ def _ring(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
 
 
 def _distinct(xy: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "distinct 3"] | None:
-    """Return points that differ from the one before, z = 0; None for fewer than two."""
+    """Return the points that differ from the previous one, z = 0; None for fewer than two."""
     xy = xy[np.append(True, (np.diff(xy, axis=0) != 0.0).any(axis=1))]
     return np.pad(xy, ((0, 0), (0, 1))) if len(xy) >= 2 else None
 
@@ -426,18 +426,18 @@ def _polygons(shape: Any) -> list[Any]:
     return [part for part in parts if part.geom_type == "Polygon"]
 
 
-def _lane_features(around: _Around) -> Iterator[MapFeature]:
+def _lane_features(decoder: _MapDecoder) -> Iterator[MapFeature]:
     """Yield lanes and connectors with their links, limits and widths."""
-    city = around.city
-    numbers, shapes = around.baselines
-    widths = _widths(around, [city.lanes[number] for number in numbers], shapes)
-    for number, shape, width in zip(numbers, shapes, widths, strict=True):
-        points, lane = _line(shape), city.lanes[number]
+    city = decoder.city
+    lane_ids, shapes = decoder.baselines
+    widths = _widths(decoder, [city.lanes[lane_id] for lane_id in lane_ids], shapes)
+    for lane_id, shape, width in zip(lane_ids, shapes, widths, strict=True):
+        points, lane = _line(shape), city.lanes[lane_id]
         if points is None:
-            around.lost_lanes += shape is not None
+            decoder.lost_lanes += shape is not None
             continue
         yield MapFeature(
-            feature_id=number,
+            feature_id=lane_id,
             kind=RoadKind.LANE_SURFACE,
             points=points,
             limit_mps=lane.limit_mps,
@@ -446,60 +446,60 @@ def _lane_features(around: _Around) -> Iterator[MapFeature]:
             predecessors=tuple(lane.predecessors),
             left_neighbours=() if lane.left is None else (lane.left,),
             right_neighbours=() if lane.right is None else (lane.right,),
-            interpolating=number >> 32 == NUMBERS["lane_connectors"],
+            interpolating=lane_id >> 32 == NUMBERS["lane_connectors"],
         )
 
 
-def _widths(around: _Around, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
+def _widths(decoder: _MapDecoder, lanes: Sequence[Lane], shapes: Array) -> list[float | None]:
     """Return the width of each lane: the median sum of the distances to both boundaries at five points along it.
 
-    None for a lane without both boundaries, in parts, or with an implausible width.
+    None for a lane that lacks a boundary, has a baseline in parts, or an implausible width.
     """
     shapely = import_extra("shapely")
-    row_of = around.city.boundary_rows
+    row_of = decoder.city.boundary_rows
     pairs = [[row_of.get(fid, -1) for fid in lane.boundaries] for lane in lanes]
     rows = np.array(pairs, np.int64).reshape(-1, 2)
-    side_rows = np.unique(rows[rows >= 0])
-    # A missing boundary is None, the last of the lines: distances to it, and so the width, are NaN.
+    boundary_rows = np.unique(rows[rows >= 0])
+    # Row -1 is a missing boundary and selects the last line, None: distances to it, and so the width, are NaN.
     missing = np.array(None, dtype=object)
-    lines = np.append(around.shapes("boundaries", side_rows.tolist()), missing)
-    sides = lines[np.where(rows >= 0, np.searchsorted(side_rows, rows), -1)]
+    lines = np.append(decoder.shapes("boundaries", boundary_rows.tolist()), missing)
+    boundaries = lines[np.where(rows >= 0, np.searchsorted(boundary_rows, rows), -1)]
     baselines = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING, shapes, missing)
     points = shapely.line_interpolate_point(baselines[:, None], _WIDTH_FRACTIONS, normalized=True)
-    gaps = shapely.distance(points[:, None], sides[:, :, None])
+    distances = shapely.distance(points[:, None], boundaries[:, :, None])
     low, high = _WIDTHS_M
-    widths = np.median(gaps.sum(axis=1), axis=1)
+    widths = np.median(distances.sum(axis=1), axis=1)
     return [float(width) if low <= width <= high else None for width in widths]
 
 
-def _line_features(around: _Around) -> Iterator[MapFeature]:
+def _line_features(decoder: _MapDecoder) -> Iterator[MapFeature]:
     """Yield painted boundaries of lanes."""
-    types = {row: kind for row, kind in around.types("boundaries").items() if kind not in _NO_PAINT}
-    for row, number, points in around.outlines("boundaries", list(types), _line):
-        yield MapFeature(number, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
+    types = {row: kind for row, kind in decoder.types("boundaries").items() if kind not in _NO_PAINT}
+    for row, packed_id, points in decoder.outlines("boundaries", list(types), _line):
+        yield MapFeature(packed_id, _LINES.get(types[row], RoadKind.LINE_UNKNOWN), points)
 
 
-def _polygon_features(around: _Around) -> Iterator[MapFeature]:
+def _polygon_features(decoder: _MapDecoder) -> Iterator[MapFeature]:
     """Yield crosswalks, and stop signs with the lanes (else connectors) whose baselines cross their stop polygons."""
     shapely = import_extra("shapely")
-    for _, number, points in around.outlines("crosswalks", around.near("crosswalks"), _ring):
-        yield MapFeature(number, RoadKind.CROSSWALK, points)
-    owners, baselines = around.baselines
+    for _, packed_id, points in decoder.outlines("crosswalks", decoder.box_rows("crosswalks"), _ring):
+        yield MapFeature(packed_id, RoadKind.CROSSWALK, points)
+    lane_ids, baselines = decoder.baselines
     tree = shapely.STRtree(baselines)
-    stops = [row for row, kind in around.types("stop_polygons").items() if kind == _STOP_SIGN]
-    for _, number, points in around.outlines("stop_polygons", stops, _ring):
+    stops = [row for row, kind in decoder.types("stop_polygons").items() if kind == _STOP_SIGN]
+    for _, packed_id, points in decoder.outlines("stop_polygons", stops, _ring):
         polygon = shapely.Polygon(points[:, :2])
-        crossing = [owners[i] for i in sorted(tree.query(polygon, predicate="intersects").tolist())]
-        lanes = [lane for lane in crossing if lane >> 32 == NUMBERS["lanes_polygons"]] or crossing
+        crossing_lanes = [lane_ids[i] for i in sorted(tree.query(polygon, predicate="intersects").tolist())]
+        lanes = [lane for lane in crossing_lanes if lane >> 32 == NUMBERS["lanes_polygons"]] or crossing_lanes
         middle = np.append(shapely.get_coordinates(polygon.centroid)[0], 0.0)[None]
-        yield MapFeature(number, RoadKind.STOP_SIGN, middle, lanes=tuple(lanes))
+        yield MapFeature(packed_id, RoadKind.STOP_SIGN, middle, lanes=tuple(lanes))
 
 
-def _areas(around: _Around) -> Iterator[Area]:
+def _areas(decoder: _MapDecoder) -> Iterator[Area]:
     """Yield drivable polygons."""
     shapely = import_extra("shapely")
-    for name in _DRIVABLE:
-        for part in (part for shape in around.shapes(name, around.near(name)) for part in _polygons(shape)):
-            if not part.is_empty:
-                holes = [shapely.get_coordinates(hole) for hole in part.interiors]
-                yield shapely.get_coordinates(part.exterior), holes
+    shapes = (shape for name in _DRIVABLE for shape in decoder.shapes(name, decoder.box_rows(name)))
+    for part in (part for shape in shapes for part in _polygons(shape)):
+        if not part.is_empty:
+            holes = [shapely.get_coordinates(hole) for hole in part.interiors]
+            yield shapely.get_coordinates(part.exterior), holes

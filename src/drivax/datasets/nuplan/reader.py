@@ -49,8 +49,8 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "scenario_tag": ("lidar_pc_token", "type"),
     "traffic_light_status": ("lidar_pc_token", "lane_connector_id", "status"),
 }  # fmt: skip
-#: Tables that are not needed, and columns of ``TABLES`` that are not; one set, because their names hardly coincide.
-_OTHERS = frozenset((
+#: Known tables and columns of ``TABLES`` that are not read, in one set because few names occur as both.
+_UNUSED = frozenset((
     "lidar", "camera", "image", "token", "vehicle_name", "date", "timestamp", "location", "log_token", "lidar_token",
     "next_token", "prev_token", "filename", "z", "vz", "acceleration_x", "acceleration_y", "acceleration_z",
     "angular_rate_x", "angular_rate_y", "epsg", "confidence", "width", "length", "height", "description", "name",
@@ -87,11 +87,11 @@ class NuPlan:
     name: str = _NAME
     patterns: tuple[str, ...] = ("*_veh-*.db",)
     companions: tuple[str, ...] = ("map.gpkg", "nuplan-maps-*.json")
-    #: Steps of the scenarios that recordings become; a recording goes on beyond its scene for the last of them.
+    #: Steps of a scenario; recordings extend beyond their scene, so that its last steps have a whole future.
     steps: int = STEPS
 
     def recognise(self, path: Path) -> bool:
-        """Whether the file is SQLite and has the tables of a nuPlan log."""
+        """Return whether the file is SQLite and has the tables of a nuPlan log."""
         try:
             with open_database(path) as database:
                 return all(database.columns(table) for table in _SIGNATURE)
@@ -117,7 +117,7 @@ class NuPlan:
         return Description("nuPlan", "SQLite log", None, len(parts), tuple(notes), missing)
 
     def count(self, path: Path) -> int:
-        """Return the number of windows of 91 steps at the usual stride; 0 where the log is unreadable."""
+        """Return the number of windows of 91 steps at the usual stride; 0 if the log is unreadable."""
         try:
             with open_database(path) as database:
                 return sum(
@@ -156,10 +156,10 @@ class TimeLine:
 class Piece:
     """The steps of one recording: a scene or a part of it, with up to 10 steps before and a scenario's future after it.
 
-    So the current steps of its windows are steps of the scene, and windows cross the borders of scenes.
+    Therefore the current steps of its windows lie in the scene, while windows may cross the borders of scenes.
 
     Attributes:
-        name: Token of the scene in hexadecimal digits, and a number where a name occurs again.
+        name: Token of the scene in hexadecimal digits (else ``no-scene``), with a number where it occurs again.
         scene: Token of the scene.
         sweeps: Rows of the time line, one per step of 0.1 s.
         scene_sweeps: Rows of the scene or its part alone, first and one past the last (of 20 Hz perhaps one too many).
@@ -177,7 +177,7 @@ _Agents = Mapping[Any, tuple[int, AgentKind]]
 
 @dataclass(frozen=True)
 class Log:
-    """An open log: its name (else the file's), the name of its map, its time line, its number of unknown fields."""
+    """An open log: its name (else the file's), the name of its map, its time line, the number of unknown fields."""
 
     database: Database
     name: str
@@ -200,8 +200,8 @@ def _open_log(database: Database, path: Path) -> Log:
 
 def _unknown_fields(database: Database) -> int:
     """Count unknown tables, and unknown columns of the tables that are read."""
-    columns = sum(len(database.columns(table) - _OTHERS.union(names)) for table, names in TABLES.items())
-    return len(database.tables() - TABLES.keys() - _OTHERS) + columns
+    columns = sum(len(database.columns(table) - _UNUSED.union(names)) for table, names in TABLES.items())
+    return len(database.tables() - TABLES.keys() - _UNUSED) + columns
 
 
 def time_line(database: Database) -> TimeLine:
@@ -219,8 +219,8 @@ def pieces(line: TimeLine, steps: int = STEPS) -> list[Piece]:
     """Cut a time line at gaps and scenes, and long scenes, into pieces of 10 Hz for scenarios of ``steps`` steps.
 
     Of sweeps at 20 Hz every second one is taken, counted from the last gap. A piece that is too short for a window is
-    dropped: its steps are in the future of the piece before, or in the past of the one after. Of a stretch between two
-    gaps that is too short itself, the first piece is kept.
+    dropped: its steps are in the future of the previous piece, or in the past of the next one. If the time between two
+    gaps is too short for a window, its first piece is kept.
     """
     recordings: list[Piece] = []
     counts: dict[str, int] = {}
@@ -286,21 +286,21 @@ def agents(database: Database) -> _Agents:
 
 
 def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, dict[str, int]]:
-    """Return the tracks of a piece, ego in row 0, and the number of boxes without a track, or of one that has another.
+    """Return the tracks of a piece, ego in row 0, and counts of boxes without a track and of repeated boxes.
 
     Of several boxes of a track in a sweep the last one counts.
     """
     steps = len(piece.sweeps)
-    boxes, owners, lost = _boxes(log, piece, agents_by_token)
-    tokens = sorted({owner for _, owner in owners}, key=lambda token: agents_by_token[token][0])
+    boxes, box_keys, lost = _boxes(log, piece, agents_by_token)
+    tokens = sorted({token for _, token in box_keys}, key=lambda token: agents_by_token[token][0])
     if (len(tokens) + 1) * steps > _MOST_CELLS:
         raise DataError(f"{len(tokens)} tracks in {steps} steps", cure=_CURE)
     rows = {token: row for row, token in enumerate(tokens, start=1)}
     shape = (len(tokens) + 1, steps)
     table, valid = np.zeros((*shape, 9)), np.zeros(shape, dtype=bool)
     table[0], valid[0] = _ego(log, piece), True
-    if owners:
-        row, step = np.array([(rows[owner], step) for step, owner in owners]).T
+    if box_keys:
+        row, step = np.array([(rows[token], step) for step, token in box_keys]).T
         table[row, step], valid[row, step] = boxes, True
     entries = [(EGO_TRACK_ID, AgentKind.VEHICLE), *(agents_by_token[token] for token in tokens)]
     states = Tracks(
@@ -313,7 +313,7 @@ def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, di
         kind=np.array([kind for _, kind in entries], np.int8),
         track_id=np.array([number for number, _ in entries], np.int64),
     )
-    return states, {"boxes_without_track": lost, "repeated_boxes": len(owners) - len(set(owners))}
+    return states, {"boxes_without_track": lost, "repeated_boxes": len(box_keys) - len(set(box_keys))}
 
 
 def _ego(log: Log, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -352,18 +352,18 @@ def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " p
 
 def _read_observations(log: Log, piece: Piece, table: str, columns: str) -> list[tuple[Any, ...]]:
     """Read step and columns of all rows of a table that belong to sweeps of a piece, in order of steps."""
-    steps = {log.line.tokens[sweep]: step for step, sweep in enumerate(piece.sweeps)}
+    step_of = {log.line.tokens[sweep]: step for step, sweep in enumerate(piece.sweeps)}
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
-    rows = log.database.rows_in(query, list(steps))
-    # A damaged index leads to rows of other sweeps.
-    observations = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
+    rows = log.database.rows_in(query, list(step_of))
+    # A damaged index may return rows of other sweeps.
+    observations = [(step_of[row[0]], *row[1:]) for row in rows if row[0] in step_of]
     return sorted(observations, key=lambda row: row[0])
 
 
 def _boxes(
     log: Log, piece: Piece, agents_by_token: _Agents
 ) -> tuple[Float64[np.ndarray, "box 9"], list[tuple[int, Any]], int]:
-    """Read boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track); count boxes without track."""
+    """Read boxes (x, y, z, heading, length, width, height, vx, vy), their (step, track); count those without track."""
     columns = "track_token, x, y, z, yaw, length, width, height, vx, vy"
     rows = _read_observations(log, piece, "lidar_box", columns)
     with_track = [row for row in rows if row[1] in agents_by_token]
@@ -386,7 +386,7 @@ def _scenario_types(log: Log, piece: Piece) -> list[str]:
 
 
 def _roadblocks(log: Log, piece: Piece) -> list[int]:
-    """Read ids of the roadblocks of the scene's route, separated by spaces (in the documentation by commas)."""
+    """Read ids of the roadblocks on the scene's route, separated by spaces (in nuPlan's documentation by commas)."""
     rows = log.database.rows("SELECT roadblock_ids FROM scene WHERE token = ?", (piece.scene,))
     text = rows[0][0] if rows else None
     words = text.replace(",", " ").split() if isinstance(text, str) else ()
@@ -404,7 +404,7 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
     lights, lost_lights = _lights(log, piece, city, features)
     lanes = {feature.feature_id for feature in features}
     route, lost_roadblocks = corridor(city, _roadblocks(log, piece))
-    types, time_us = _scenario_types(log, piece), log.line.time_us
+    scenario_types, time_us = _scenario_types(log, piece), log.line.time_us
     tags = {"source_format": _NAME} | parsing.place_tags(log.map_name)
     return Recording(
         scenario_id=piece.name,
@@ -417,7 +417,7 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
         features=features,
         lights=lights,
         route_corridor=tuple(lane for lane in route if lane in lanes),
-        tags=tags | ({"scenario_types": "|".join(types)} if types else {}),
+        tags=tags | ({"scenario_types": "|".join(scenario_types)} if scenario_types else {}),
         lost=parsing.nonzero(
             lost,
             **lost_boxes,
@@ -431,7 +431,7 @@ def _recording(log: Log, piece: Piece, agents_by_token: _Agents, city: City) -> 
 def _lights(
     log: Log, piece: Piece, city: City, features: tuple[MapFeature, ...]
 ) -> tuple[tuple[Light, ...], int]:
-    """Read lights of the connectors around the drive, with stop points where these begin; count unknown connectors."""
+    """Read lights of connectors around the drive, with stop points at their starts; count unknown connectors."""
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
     lights = parsing.Lights(len(piece.sweeps))
     unknown = set()

@@ -31,13 +31,13 @@ _LONGEST_CELL = 1 << 24
 #: Longest statement of the schema, bytes; those of nuPlan and GeoPackages have up to 3,000. It bounds the default of a
 #: column, which rows without the column repeat.
 _LONGEST_STATEMENT = 20_000
-#: Memory of the rows of a result, bytes: half a million boxes have 250 MB. Damage and defaults can multiply the rows of
-#: small files, which may take the first number plus 16 times their size.
+#: Memory of the rows of a result, bytes: half a million boxes take 250 MB. Damage and defaults can multiply the rows of
+#: small files, which may therefore take only the first number plus 16 times their size.
 _LEAST_RESULT, _MOST_RESULT, _RESULT_PER_BYTE = 32 << 20, 512 << 20, 16
 #: Rows that are fetched before their memory is counted.
 _ROWS_AT_ONCE = 8
 #: Limit of virtual machine instructions of a query: a million, plus 20 per byte of the file (a full scan takes about
-#: 0.1). It ends queries on damaged trees with cycles.
+#: 0.1 per byte). It ends queries on damaged trees with cycles.
 _STEPS_PER_BYTE = 20
 _STEPS_AT_ONCE = 100_000
 #: Most parameters of a query; old builds of SQLite take 999.
@@ -58,13 +58,13 @@ class Database:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self._connection = connection
-        self._remaining = self._room = 0
+        self._instructions_left = self._budget = 0
         connection.set_progress_handler(self._tick, _STEPS_AT_ONCE)
 
     def _tick(self) -> int:
         """Count instructions of the query; SQLite ends it if the result is not 0."""
-        self._remaining -= _STEPS_AT_ONCE
-        return int(self._remaining < 0)
+        self._instructions_left -= _STEPS_AT_ONCE
+        return int(self._instructions_left < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Return all rows of a query.
@@ -72,31 +72,31 @@ class Database:
         Raises:
             DataError: SQLite cannot read them, or they take too much memory or too long.
         """
-        self._room = self._most_result()
+        self._budget = self._result_limit()
         return self._fetch(query, values)
 
     def rows_in(self, query: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
         """Return all rows of a query that ends in ``IN``, for any number of values."""
-        self._room = self._most_result()
+        self._budget = self._result_limit()
         rows = []
         for start in range(0, len(values), _VALUES_AT_ONCE):
             batch = values[start : start + _VALUES_AT_ONCE]
             rows += self._fetch(f"{query} ({', '.join('?' * len(batch))})", batch)
         return rows
 
-    def _most_result(self) -> int:
+    def _result_limit(self) -> int:
         return min(_LEAST_RESULT + _RESULT_PER_BYTE * self.path.stat().st_size, _MOST_RESULT)
 
     def _fetch(self, query: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
-        """Return the rows of a query, whose memory is taken from the room that is left."""
-        self._remaining = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
+        """Return the rows of a query; deduct their memory from the budget."""
+        self._instructions_left = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
         rows: list[tuple[Any, ...]] = []
         try:
             cursor = self._connection.execute(query, values)
             while batch := cursor.fetchmany(_ROWS_AT_ONCE):
-                self._room -= sum(map(getsizeof, batch)) + sum(map(getsizeof, chain.from_iterable(batch)))
-                if self._room < 0:
-                    raise MemoryError(f"rows of more than {format_bytes(self._most_result())}")
+                self._budget -= sum(map(getsizeof, batch)) + sum(map(getsizeof, chain.from_iterable(batch)))
+                if self._budget < 0:
+                    raise MemoryError(f"rows of more than {format_bytes(self._result_limit())}")
                 rows += batch
         except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as error:
             problem = f"SQLite cannot read it ({str(error) or 'out of memory'})"
@@ -109,13 +109,13 @@ class Database:
         return frozenset(str(name) for (name,) in names)
 
     def columns(self, table: str) -> frozenset[str]:
-        """Return the names of a table's columns; none for a missing, a virtual or a computed one, or for a view."""
+        """Return the names of a table's columns; none if it is missing, virtual or a view, or has computed columns."""
         # Virtual tables have the type 'table', too, but run the code of their module.
         query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
         if not self.rows(query, (table,)):
             return frozenset()
         columns = self.rows("SELECT name, hidden FROM pragma_table_xinfo(?)", (table,))
-        is_computed = any(hidden for _, hidden in columns)  # a few bytes of the file could become any number
+        is_computed = any(hidden for _, hidden in columns)  # computed values could need any amount of memory
         return frozenset() if is_computed else frozenset(str(name) for name, _ in columns)
 
     def require(self, table: str, *columns: str) -> None:
@@ -155,7 +155,7 @@ class Layer:
     Attributes:
         name: Table.
         geometry: Geometry column.
-        epsg: Coordinate reference system of the geometries.
+        epsg: EPSG code of the coordinate system of the geometries.
         fid: Feature ids (row ids).
         bounds: West, south, east, north in that system; NaN where a geometry is unreadable.
         columns: Values of the requested columns; None for columns that the layer lacks.
@@ -199,7 +199,7 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
         bounds=np.array([_envelope(row[1]) for row in rows], np.float64).reshape(-1, 4),
         columns={column: values.get(column, (None,) * len(rows)) for column in columns},
     )
-    # Headers without an envelope: the bounds are those of the geometry itself.
+    # Where the header has no envelope, compute the bounds from the geometry itself.
     rows_without = np.flatnonzero(~np.isfinite(layer.bounds).all(axis=1))
     if len(rows_without):
         shapes = geometries(database, layer, rows_without)
@@ -212,9 +212,9 @@ def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> La
 
 def _envelope(head: Any) -> tuple[float, float, float, float]:
     """Return the bounds in the header of a geometry BLOB; NaN without them."""
-    complete = isinstance(head, bytes) and len(head) >= _HEAD_BYTES and head[:2] == b"GP"
+    is_complete = isinstance(head, bytes) and len(head) >= _HEAD_BYTES and head[:2] == b"GP"
     # Byte 3 holds flags: bit 0 the byte order, bits 1 to 3 the code of the envelope, bits 4 and 5 empty and extended.
-    if not complete or not 1 <= head[3] >> 1 & 7 <= 4:
+    if not is_complete or not 1 <= head[3] >> 1 & 7 <= 4:
         return np.nan, np.nan, np.nan, np.nan
     west, east, south, north = struct.unpack_from("<4d" if head[3] & 1 else ">4d", head, 8)
     return west, south, east, north
@@ -242,7 +242,7 @@ def _decode(blob: bytes | None) -> Any:
 
 
 def _wkb(blob: Any) -> bytes | None:
-    """Return the WKB in a geometry BLOB; None for anything else, empty ones and extensions."""
+    """Return the WKB in a geometry BLOB; None for an empty geometry, an extension, and anything else."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     code = blob[3] >> 1 & 7

@@ -23,25 +23,25 @@ from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
 Array = np.ndarray[Any, Any]
 
 _AGAIN = "unpack the map expansion again"
-#: Layers that are read, row by row, and others of the map expansion.
+#: Layers that are read row by row, and other keys of the map expansion.
 _LAYERS = (
     "line", "polygon", "drivable_area", "lane", "lane_connector", "lane_divider", "road_divider", "ped_crossing",
     "stop_line",
 )  # fmt: skip
-_OTHERS = (
+_OTHER_KEYS = (
     "version", "node", "arcline_path_3", "connectivity", "road_segment", "road_block", "walkway", "carpark_area",
     "traffic_light", "canvas_edge",
 )  # fmt: skip
-#: Names of fields of the rows of these layers that are read, or need not be.
+#: Known fields of the rows of these layers; some are not read.
 _FIELDS = (
     "token", "node_tokens", "exterior_node_tokens", "holes", "polygon_token", "polygon_tokens", "line_token",
     "lane_divider_segments", "stop_line_type", "lane_type", "from_edge_line_token", "to_edge_line_token",
     "left_lane_divider_segments", "right_lane_divider_segments", "road_segment_token", "ped_crossing_tokens",
     "traffic_light_tokens", "road_block_token",
 )  # fmt: skip
-#: Points of centre lines.
+#: Largest spacing of points of centre lines, metres.
 SPACING_M = 0.5
-#: No lane is longer.
+#: Longest plausible arc line, metres.
 _LONGEST_M = 5_000.0
 _TURNS = {"L": 1.0, "S": 0.0, "R": -1.0}
 #: Adjacent lanes: spacing of their centres, angle between them, largest offset along them between compared points.
@@ -75,7 +75,7 @@ class Box:
 class City:
     """The map of one city in metres from its south-west corner, z = 0.
 
-    ``lost`` counts by kind the elements of the whole city that could not be used, or name others that do not exist.
+    ``lost`` counts by name, for the whole city, unusable elements and references to missing ones.
     """
 
     features: tuple[MapFeature, ...]
@@ -87,7 +87,7 @@ class City:
         number = len(self.features)
         result: list[MapFeature] = []
         for feature in self.features:
-            # A stop sign is one point.
+            # A stop sign is one point: make it a segment, which the box can cut.
             points = np.repeat(feature.points, 2, axis=0) if len(feature.points) == 1 else feature.points
             pieces = list(box.pieces(points))
             if feature.kind not in (*EDGE_KINDS, *LINE_KINDS):
@@ -102,7 +102,7 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """Read the map in a file of the map expansion (v1.2 or later); the last four files are kept, as first read."""
+    """Read the map in a file of the map expansion (v1.2 or later); the last four files are cached, not read again."""
     content = load_json(path)
     try:
         return _Layers(content).city()
@@ -124,7 +124,7 @@ class _Layers:
         self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
         self._lost: dict[str, int] = {}
         fields = {name for layer in _LAYERS for row in self._layer(layer) for name in row}
-        unknown = content.keys() - {*_LAYERS, *_OTHERS} | fields.difference(_FIELDS)
+        unknown = content.keys() - {*_LAYERS, *_OTHER_KEYS} | fields.difference(_FIELDS)
         self._count("unknown_fields", len(unknown))
 
     def city(self) -> City:
@@ -173,7 +173,7 @@ class _Layers:
         index = {row["token"]: i for i, (row, _) in enumerate(with_path)}
         lanes: list[MapFeature] = []
         for i, (row, name) in enumerate(with_path):
-            connects, line = name == "lane_connector", lines[row["token"]]
+            is_connector, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
             successors, predecessors = (
                 [index.get(token) for token in link.get(direction, ())]
@@ -185,10 +185,10 @@ class _Layers:
                     i,
                     RoadKind.LANE_SURFACE,
                     np.column_stack((line, np.zeros(len(line)))),
-                    width_m=None if connects else self._width(row, line),
+                    width_m=None if is_connector else self._width(row, line),
                     successors=tuple(lane for lane in successors if lane is not None),
                     predecessors=tuple(lane for lane in predecessors if lane is not None),
-                    interpolating=connects,
+                    interpolating=is_connector,
                 )
             )
         return with_neighbours(lanes)
@@ -229,23 +229,23 @@ class _Layers:
         """Return stop lines of stop signs: one point each, with the lanes that end in them."""
         shapely = import_extra("shapely")
         stops: list[MapFeature] = []
-        rows = [row for row in self._layer("stop_line") if row.get("stop_line_type") == "STOP_SIGN"]
-        areas = [exterior for row in rows for exterior, _ in self._areas([row["polygon_token"]])]
+        signs = [row for row in self._layer("stop_line") if row.get("stop_line_type") == "STOP_SIGN"]
+        areas = [exterior for row in signs for exterior, _ in self._areas([row["polygon_token"]])]
         ends = shapely.points(np.array([lane.points[-1, :2] for lane in lanes]).reshape(-1, 2))
         for exterior in (exterior for exterior in areas if len(exterior) > 2):
             polygon = shapely.make_valid(shapely.Polygon(exterior[:, :2]))
-            near = np.flatnonzero(shapely.dwithin(ends, polygon, _STOP_M)).tolist()
-            stop_lanes = tuple(i for i in near if not lanes[i].interpolating)
+            rows = np.flatnonzero(shapely.dwithin(ends, polygon, _STOP_M)).tolist()
+            stop_lanes = tuple(i for i in rows if not lanes[i].interpolating)
             centre = np.array([[polygon.centroid.x, polygon.centroid.y, 0.0]])
             stops.append(MapFeature(first_id + len(stops), RoadKind.STOP_SIGN, centre, lanes=stop_lanes))
         return stops
 
 
 def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
-    """Sample a lane's arc lines (Dubins' curves; nuScenes map expansion) every 0.5 m or less.
+    """Sample a lane's arc lines (Dubins curves in the nuScenes map expansion) every 0.5 m or less.
 
-    Each starts at ``start_pose`` (x, y, heading) and has three segments of lengths ``segment_length``, which turn left
-    (L), go straight (S) or turn right (R) by ``shape``, with ``radius``.
+    Each starts at ``start_pose`` (x, y, heading) and has three segments with lengths ``segment_length``. ``shape`` says
+    whether each turns left (L), goes straight (S) or turns right (R); curves have the radius ``radius``.
     """
     parts = [np.zeros((0, 2))]
     for arc in path:
@@ -257,16 +257,16 @@ def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
         if sum(lengths) > _LONGEST_M:
             raise ValueError(f"an arc line of {sum(lengths):.0f} m")
         for turn, length in zip(arc["shape"], lengths, strict=True):
-            bend = _TURNS[turn] / radius
+            curvature = _TURNS[turn] / radius
             s = np.linspace(0.0, length, int(np.ceil(length / SPACING_M)) + 1)
-            along = heading + bend * s
-            if bend == 0.0:
+            yaw = heading + curvature * s
+            if curvature == 0.0:
                 xs, ys = x + s * np.cos(heading), y + s * np.sin(heading)
             else:
-                xs = x + (np.sin(along) - np.sin(heading)) / bend
-                ys = y - (np.cos(along) - np.cos(heading)) / bend
+                xs = x + (np.sin(yaw) - np.sin(heading)) / curvature
+                ys = y - (np.cos(yaw) - np.cos(heading)) / curvature
             parts.append(np.stack((xs, ys), axis=-1))
-            x, y, heading = xs[-1], ys[-1], float(along[-1])
+            x, y, heading = xs[-1], ys[-1], float(yaw[-1])
     line = np.concatenate(parts)
     return line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-6)] if len(line) else line
 
@@ -284,31 +284,31 @@ def marking(name: str) -> RoadKind | None:
 def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
     """Add neighbours to lanes: up to one parallel lane on each side, 2.2 to 5.5 m from the middle of the lane.
 
-    It need not be the nearest. Lane connectors, and lanes of two points, have none.
+    A neighbour need not be the nearest such lane. Lane connectors, and lanes of two points, have none.
     """
     from scipy.spatial import KDTree
 
     rows = [i for i, lane in enumerate(lanes) if not lane.interpolating and len(lane.points) > 2]
     if not rows:
         return list(lanes)
-    owner = np.concatenate([np.full(len(lanes[i].points), i) for i in rows])
+    lane_of = np.concatenate([np.full(len(lanes[i].points), i) for i in rows])
     points = np.concatenate([lanes[i].points[:, :2] for i in rows])
     heading = np.concatenate([headings(lanes[i].points) for i in rows])
     tree = KDTree(points)
     result = list(lanes)
     for i in rows:
         middle = len(lanes[i].points) // 2
-        xy, course = lanes[i].points[middle, :2], headings(lanes[i].points)[middle]
+        xy, yaw = lanes[i].points[middle, :2], headings(lanes[i].points)[middle]
         # Half a metre more than the distance sideways covers the offset along the lane.
-        near = np.array(tree.query_ball_point(xy, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
-        near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
-        offset = points[near] - xy
-        ahead_m = offset @ np.array([np.cos(course), np.sin(course)])
-        left_m = offset @ np.array([-np.sin(course), np.cos(course)])
+        nearby = np.array(tree.query_ball_point(xy, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
+        nearby = nearby[(lane_of[nearby] != i) & (np.abs(wrap(heading[nearby] - yaw)) < _PARALLEL_RAD)]
+        offset = points[nearby] - xy
+        ahead_m = offset @ np.array([np.cos(yaw), np.sin(yaw)])
+        left_m = offset @ np.array([-np.sin(yaw), np.cos(yaw)])
         is_adjacent = (np.abs(left_m) >= _NEIGHBOUR_M[0]) & (np.abs(left_m) <= _NEIGHBOUR_M[1])
         is_adjacent &= np.abs(ahead_m) < _ABREAST_M
         sides = {
-            side: tuple(int(lane) for lane in owner[near[is_adjacent & (sign * left_m > 0)]][:1])
+            side: tuple(int(lane) for lane in lane_of[nearby[is_adjacent & (sign * left_m > 0)]][:1])
             for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))
         }
         result[i] = replace(result[i], **sides)

@@ -28,8 +28,8 @@ Array = np.ndarray[Any, Any]
 _TABLES = (
     "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data", "scene",
 )  # fmt: skip
-_OTHERS = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
-#: Names of fields of these tables that are read, or need not be.
+_UNUSED_TABLES = ("attribute", "calibrated_sensor", "map", "sensor", "visibility", "lidarseg", "panoptic")
+#: Known fields of ``_TABLES``; some are not read.
 _FIELDS = frozenset((
     "token", "name", "description", "index", "translation", "rotation", "timestamp", "category_token",
     "nbr_annotations", "first_annotation_token", "last_annotation_token", "logfile", "vehicle", "date_captured",
@@ -40,19 +40,19 @@ _FIELDS = frozenset((
 ))  # fmt: skip
 #: Keyframes are 0.5 s apart; the gap of a missing one is not interpolated.
 LONGEST_GAP_S = 0.75
-#: Steps of a usual scene (40 keyframes); a scene that lasts longer than the second number is damaged, s.
+#: Steps of a usual scene (40 keyframes), and longest plausible duration of a scene, s.
 _SCENE_STEPS, _LONGEST_S = 196, 120.0
-#: Map around the ego's log.
+#: Margin around the ego's log within which the map is used.
 MARGIN_M = 150.0
 #: The ego is a Renault Zoe: length, width, height, and how far its centre lies ahead of the rear axle (half the length
 #: less the rear overhang), from the maker's data sheet; poses are of the rear axle (nuscenes-devkit, issue 108).
 EGO_SIZE_M, CENTRE_AHEAD_M = (4.084, 1.730, 1.562), 1.385
-#: Tables are read in chunks; no row is longer than ``_LONGEST``, characters. All of nuScenes has 2.6 million rows in a
-#: table, of 700 characters, and tokens of 32.
-_CHUNK, _LONGEST, _MOST_ROWS, _LONGEST_TEXT = 1 << 20, 1 << 20, 8_000_000, 256
+#: Characters that are read at a time, and limits of a table: characters of a row, rows, characters of a text. All of
+#: nuScenes has 2.6 million rows in a table, of 700 characters, and tokens of 32.
+_CHUNK, _LONGEST_ROW, _MOST_ROWS, _LONGEST_TEXT = 1 << 20, 1 << 20, 8_000_000, 256
 _SEPARATOR = re.compile(r"[ \t\r\n,]*")
 _AGAIN = "unpack the metadata archive again"
-#: Categories by the beginning of their names; the first that fits counts.
+#: Kind by the beginning of a category's name; the first match counts.
 _KINDS = (
     ("vehicle.bicycle", AgentKind.CYCLIST),
     ("vehicle.motorcycle", AgentKind.CYCLIST),
@@ -61,8 +61,8 @@ _KINDS = (
     ("movable_object.", AgentKind.STATIC),
     ("static_object.", AgentKind.STATIC),
 )
-#: Poses are those of the lidar's frames (20 Hz); frames of other sensors lie in between.
-_CLOCK = "LIDAR_TOP"
+#: Sensor whose frames (20 Hz) give the ego's poses; frames of other sensors lie in between.
+_POSE_SENSOR = "LIDAR_TOP"
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ class NuScenes:
     name: str = "nuscenes"
     patterns: tuple[str, ...] = ("v1.0-*/scene.json",)
     companions: tuple[str, ...] = (
-        *(f"v1.0-*/{table}.json" for table in (*_TABLES, *_OTHERS) if table != "scene"),
+        *(f"v1.0-*/{table}.json" for table in (*_TABLES, *_UNUSED_TABLES) if table != "scene"),
         "maps/*.json", "expansion/*.json", "maps/*/*.json",
     )  # fmt: skip
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is ``scene.json`` with the table of samples next to it."""
+        """Return whether the file is ``scene.json`` with the table of samples next to it."""
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
@@ -303,22 +303,22 @@ def _unknown_fields(folder: Path) -> int:
     """Count unknown tables, and unknown fields in the first rows of those that are read."""
     fields = {name for table in _TABLES for name in next(rows(folder / f"{table}.json"), {})}
     tables = {path.stem for path in folder.glob("*.json")}
-    return len(fields - _FIELDS) + len(tables.difference(_TABLES, _OTHERS))
+    return len(fields - _FIELDS) + len(tables.difference(_TABLES, _UNUSED_TABLES))
 
 
 def _sort_by_time(table: Float64[Array, "row column"]) -> Float64[Array, "kept column"]:
-    """Return rows in the order of their first column, the first of several at one time."""
+    """Sort rows by time, the first column; keep the first of several at one time."""
     _, first = np.unique(table[:, 0], return_index=True)
     return table[first]
 
 
-def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64[Array, "pose 5"]:
+def _poses(folder: Path, sample_index: Mapping[str, int], sample_scene: Array) -> Float64[Array, "pose 5"]:
     """Read ego poses of the lidar's frames: scene row, time, x, y, heading."""
     scene_of_pose: dict[str, int] = {}
     for row in _table(folder, "sample_data"):
-        sample = samples.get(row.text("sample_token"), -1)
-        if sample >= 0 and _CLOCK in str(row.values.get("filename", "")):
-            scene_of_pose[row.text("ego_pose_token")] = int(scene_of[sample])
+        sample = sample_index.get(row.text("sample_token"), -1)
+        if sample >= 0 and _POSE_SENSOR in str(row.values.get("filename", "")):
+            scene_of_pose[row.text("ego_pose_token")] = int(sample_scene[sample])
     table = array("d")
     for row in _table(folder, "ego_pose"):
         scene = scene_of_pose.get(row.text("token"))
@@ -330,13 +330,13 @@ def _poses(folder: Path, samples: Mapping[str, int], scene_of: Array) -> Float64
 
 
 def _annotations(
-    folder: Path, samples: Mapping[str, int], instances: Mapping[str, int]
+    folder: Path, sample_index: Mapping[str, int], instance_index: Mapping[str, int]
 ) -> Float64[Array, "annotation 8"]:
     """Read annotations: sample row, instance row, x, y, heading, length, width, height."""
     table = array("d")
     for row in _table(folder, "sample_annotation"):
-        sample = samples.get(row.text("sample_token"), -1)
-        instance = instances.get(row.text("instance_token"), -1)
+        sample = sample_index.get(row.text("sample_token"), -1)
+        instance = instance_index.get(row.text("instance_token"), -1)
         if sample < 0 or instance < 0:
             continue
         x, y, _ = row.vector("translation", 3)
@@ -353,7 +353,7 @@ def scene_rows(folder: Path) -> list[dict[str, str]]:
 
 
 def has_annotations(folder: Path) -> bool:
-    """Whether a version has annotations, unlike the test split; True if the table cannot be read."""
+    """Return whether a version has annotations, unlike the test split; True if the table cannot be read."""
     try:
         return next(rows(folder / "sample_annotation.json"), None) is not None
     except DataError:
@@ -371,7 +371,7 @@ def yaw(w: float, x: float, y: float, z: float) -> float:
 
 
 class _Row:
-    """A row of a table; its methods check values of a type by name."""
+    """A row of a table; its methods return a value by name, and refuse one of another type."""
 
     def __init__(self, values: Mapping[str, Any], file: Path) -> None:
         self.values, self._file = values, file
@@ -407,7 +407,7 @@ def _table(folder: Path, name: str) -> Iterator[_Row]:
 
 
 def _too_long() -> ValueError:
-    return ValueError(f"a row of more than {_LONGEST:,} characters")
+    return ValueError(f"a row of more than {_LONGEST_ROW:,} characters")
 
 
 def rows(path: Path) -> Iterator[dict[str, Any]]:
@@ -433,11 +433,11 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
                     chunk = file.read(_CHUNK)
                     if not chunk:
                         raise
-                    if len(text) - position > _LONGEST:
+                    if len(text) - position > _LONGEST_ROW:
                         raise _too_long() from None
                     text, position = text[position:] + chunk, 0
                     continue
-                if end - position > _LONGEST:
+                if end - position > _LONGEST_ROW:
                     raise _too_long()
                 if not isinstance(row, dict):
                     raise DataError("is not an object", file=path, record=number, cure="download it again")

@@ -29,9 +29,9 @@ from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKi
 
 Array = np.ndarray[Any, Any]
 
-#: Lane points within this distance decide on which side of an edge one drives, metres.
+#: Lane points within this distance decide which side of an edge is drivable, metres.
 NEIGHBOUR_M = 8.0
-#: Points along a ring that are tested against the other rings; rings may touch at some.
+#: Points along a ring that are tested against the other rings; at some of them rings may touch.
 _PROBES = 5
 #: Most comparisons of points with points of rings or edges; maps that need more are refused.
 _MOST_COMPARISONS = 100_000_000
@@ -61,7 +61,7 @@ _KINDS = {
     "GUARDRAIL": RoadKind.EDGE_BOUNDARY,
     **{name: RoadKind[name] for name in ("LANE_FREEWAY", "STOP_SIGN", "CROSSWALK", "SPEED_BUMP", "DRIVEWAY")},
 }
-#: Fields of features that are read, or need not be.
+#: Known fields of features; some are not read.
 _FIELDS = frozenset((
     "type", "polyline", "polygon", "position", "lane", "interpolating", "width", "speed_limit_mph", "speed_limit_kmh",
     "entry_lanes", "exit_lanes", "left_neighbor", "right_neighbor", "left_boundaries", "right_boundaries",
@@ -77,8 +77,8 @@ _FARTHEST_M, _LONGEST_M = 1e5, 2e6
 def orient_outlines(lines: Sequence[Array]) -> list[Array]:
     """Orient the outline of drivable space: exteriors anticlockwise, holes clockwise.
 
-    Rings repeat their first point and do not cross, so one inside an even number of others is an exterior, else a hole.
-    A line that is no ring (a clipped outline) is reversed: GEOS makes outlines that run clockwise around areas.
+    Rings repeat their first point and do not cross, so a ring inside an even number of others is an exterior, else a
+    hole. A line that is no ring (a clipped outline) is reversed, because GEOS makes clockwise outlines of areas.
     """
     are_rings = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
     rings = [points[:, :2] for points, is_ring in zip(lines, are_rings, strict=True) if is_ring]
@@ -87,26 +87,26 @@ def orient_outlines(lines: Sequence[Array]) -> list[Array]:
     depth = iter([_depth(points, [other for other in rings if other is not points]) for points in rings])
     result = []
     for points, is_ring in zip(lines, are_rings, strict=True):
-        is_oriented = is_ring and (_area(points) > 0) == (next(depth) % 2 == 0)
+        is_oriented = is_ring and (_twice_area(points) > 0) == (next(depth) % 2 == 0)
         result.append(points if is_oriented else points[::-1].copy())
     return result
 
 
-def _area(ring: Array) -> float:
-    """Return twice the signed area, anticlockwise positive (shoelace formula around the first point)."""
+def _twice_area(ring: Array) -> float:
+    """Return twice the signed area of a ring, anticlockwise positive (shoelace formula around the first point)."""
     x, y = (ring[:, :2] - ring[0, :2]).T
     return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]))
 
 
 def _depth(ring: Array, others: Sequence[Array]) -> int:
     """Count the other rings that contain most of a few points along a ring."""
-    first = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
-    middle = (ring[first] + ring[first + 1]) / 2
-    return sum(int(2 * in_ring(middle, other).sum() > _PROBES) for other in others)
+    segments = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
+    probes = (ring[segments] + ring[segments + 1]) / 2
+    return sum(int(2 * in_ring(probes, other).sum() > _PROBES) for other in others)
 
 
 def in_ring(points: Array, ring: Array) -> Array:
-    """Whether each point lies inside a closed ring (even-odd rule)."""
+    """Return whether each point lies inside a closed ring (even-odd rule)."""
     a, b = ring[:-1], ring[1:]
     above = points[:, None, 1] >= a[None, :, 1]
     crosses = above != (points[:, None, 1] >= b[None, :, 1])
@@ -117,7 +117,7 @@ def in_ring(points: Array, ring: Array) -> Array:
 
 
 def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
-    """Orient road edges so that most of the lane points next to them are on their left; keep those without majority."""
+    """Orient road edges so that most lane points next to them are on their left; keep edges without a majority."""
     centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
     if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
         raise DataError("road edges and lanes of too many points", cure=SKIP)
@@ -126,12 +126,12 @@ def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
 
 def _votes_left(edge: Array, centres: Array) -> int:
     """Return the number of lane points next to an edge on its left minus those on its right."""
-    if len(edge) < 2:  # has no sides
+    if len(edge) < 2:  # a point has no sides
         return 0
     low, high = edge.min(axis=0) - NEIGHBOUR_M, edge.max(axis=0) + NEIGHBOUR_M
-    near = centres[np.all((centres >= low) & (centres <= high), axis=1)]
+    nearby = centres[np.all((centres >= low) & (centres <= high), axis=1)]
     block = max(_BLOCK // len(edge), 1)
-    return sum(_votes(edge, near[first : first + block]) for first in range(0, len(near), block))
+    return sum(_votes(edge, nearby[first : first + block]) for first in range(0, len(nearby), block))
 
 
 def _votes(edge: Array, points: Array) -> int:
@@ -152,7 +152,7 @@ def _votes(edge: Array, points: Array) -> int:
 class RoadMap:
     """Features, ids by name, whether the file lacks heights (``flat``), and counts of losses.
 
-    Links lead to features of the file, but those to skipped ones dangle.
+    Links lead to features of the file; links to skipped features dangle.
     """
 
     features: tuple[MapFeature, ...]
@@ -163,7 +163,7 @@ class RoadMap:
 
 @dataclass(frozen=True)
 class _Reading:
-    """State of reading one file; ``spatial`` are the features with three columns."""
+    """State of reading one file; ``spatial`` holds the ids of features with three columns."""
 
     dataset: str
     around: Array
@@ -175,7 +175,7 @@ class _Reading:
 def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     """Read ``map_features``; ``around`` is a position (x, y) of ego, metres.
 
-    The original data set decides which speed limits and which orientation of edges are used.
+    ``dataset``, the original one, decides which speed limits and which orientation of edges are used.
     """
     bodies = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in bodies.values() for value in body.values())
@@ -286,7 +286,7 @@ def _width(body: Mapping[Any, Any]) -> float | None:
 
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
-    """Return ids of linked features, which files name by number, text or a dictionary with ``feature_id``."""
+    """Return ids of linked features; files give them as numbers, texts or dictionaries with ``feature_id``."""
     names = [item.get("feature_id") if isinstance(item, dict) else item for item in as_list(value)]
     links = tuple(link for name in names if (link := reading.names.get(name)) is not None)
     if len(links) < len(names):
@@ -295,7 +295,7 @@ def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
 
 
 def has_headings(lanes: Sequence[Array]) -> bool:
-    """Whether the third column of lanes is their heading (nuScenes' arc lines are sampled as x, y, yaw)."""
+    """Return whether the third column of lanes is their heading (nuScenes' arc lines are sampled as x, y, yaw)."""
     differences = []
     for points in lanes:
         step = np.diff(points[:, :2], axis=0)
@@ -307,7 +307,7 @@ def has_headings(lanes: Sequence[Array]) -> bool:
 
 
 def _with_edges(features: list[MapFeature], outline: Array, dataset: str) -> list[MapFeature]:
-    """Turn outlines of drivable space into road edges, and every edge's drivable side to its left."""
+    """Turn outlines of drivable space into road edges; orient edges with the drivable side on their left."""
     rows = np.flatnonzero(outline).tolist()
     for row, points in zip(rows, orient_outlines([features[row].points for row in rows]), strict=True):
         features[row] = replace(features[row], kind=RoadKind.EDGE_BOUNDARY, points=points)

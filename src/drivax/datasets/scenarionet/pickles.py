@@ -29,7 +29,7 @@ _NUMBER = (int, float)
 MOST_BYTES = 64 << 20
 MOST_OPERATIONS = 4_000_000
 MOST_AXES = 4
-#: Types of keys; integers from this bound on and tuples of more parts are refused: many could have the same hash.
+#: Types of keys, and limits of integer keys and of parts of tuple keys: beyond them many could have the same hash.
 _PLAIN = (str, int, float, bytes, type(None))
 _LARGEST_KEY, _MOST_PARTS = 1 << 60, 4
 _DAMAGED = "copy or generate the file again"
@@ -47,7 +47,7 @@ def load(data: bytes) -> Any:
     NumPy scalars Python numbers, ordered and default dictionaries plain ones.
 
     Raises:
-        DataError: It is damaged, too large, or names anything else.
+        DataError: The pickle is damaged, too large, or names anything but data.
     """
     if len(data) > MOST_BYTES:
         raise DataError(f"a pickle of {len(data) >> 20} MB", cure=f"drivax reads up to {MOST_BYTES >> 20} MB")
@@ -93,19 +93,19 @@ class _Machine:
         """Carry out one operation."""
         if name in _LITERALS:
             self.stack.append(argument)
-        elif name in _MAKES:
-            count, make = _MAKES[name]
+        elif name in _MAKE_OPERATIONS:
+            count, make = _MAKE_OPERATIONS[name]
             items = self._take(count)
             self.stack.append(make(items))
-        elif name in _ADDS:
-            count, kind, add = _ADDS[name]
+        elif name in _ADD_OPERATIONS:
+            count, kind, add = _ADD_OPERATIONS[name]
             items = self._take(count)
             if type(self.stack[-1]) is not kind:
                 raise ValueError(f"a {kind.__name__} was expected")
             add(self.stack[-1], items)
         elif name in _OPERATIONS:
             _OPERATIONS[name](self, argument)
-        elif name not in _SKIPPED:
+        elif name not in _SKIPPED_OPERATIONS:
             problem = f"uses the pickle operation {name}, which data does not need"
             raise DataError(problem, cure=_DISTRUST)
 
@@ -136,7 +136,7 @@ class _Machine:
         if isinstance(top, _Unbuilt):
             top.indices.append(index)
 
-    def _name(self, argument: str | None) -> None:
+    def _global(self, argument: str | None) -> None:
         """GLOBAL and STACK_GLOBAL: push a name, which must be that of a constructor of data."""
         module, name = self._take(2) if argument is None else argument.partition(" ")[::2]
         if not isinstance(module, str) or not isinstance(name, str):
@@ -183,15 +183,15 @@ _LITERALS = frozenset((
     "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES",
     "BINBYTES8", "BYTEARRAY8",
 ))  # fmt: skip
-#: Operations that make a value of the last items: of a number of them, or (None) of those above the mark.
-_MAKES: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
+#: Operations that make a value from the last N items, or (None) from those above the mark.
+_MAKE_OPERATIONS: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
     "NONE": (0, lambda items: None), "NEWTRUE": (0, lambda items: True), "NEWFALSE": (0, lambda items: False),
     "EMPTY_LIST": (0, list), "EMPTY_TUPLE": (0, tuple), "EMPTY_DICT": (0, dict), "EMPTY_SET": (0, set),
     "TUPLE1": (1, tuple), "TUPLE2": (2, tuple), "TUPLE3": (3, tuple), "TUPLE": (None, tuple), "LIST": (None, list),
     "DICT": (None, lambda items: _fill({}, items)), "FROZENSET": (None, lambda items: frozenset(map(_hashable, items))),
 }  # fmt: skip
 #: Operations that add items to a container of a type.
-_ADDS: dict[str, tuple[int | None, type[Any], Callable[[Any, list[Any]], Any]]] = {
+_ADD_OPERATIONS: dict[str, tuple[int | None, type[Any], Callable[[Any, list[Any]], Any]]] = {
     "APPEND": (1, list, list.extend), "APPENDS": (None, list, list.extend),
     "SETITEM": (2, dict, _fill), "SETITEMS": (None, dict, _fill),
     "ADDITEMS": (None, set, lambda members, items: members.update(map(_hashable, items))),
@@ -201,9 +201,9 @@ _OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
     "DUP": lambda machine, _: machine.stack.append(machine.stack[-1]),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), _Machine._put),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda self, index: self.stack.append(self._memo[index])),
-    "GLOBAL": _Machine._name, "STACK_GLOBAL": _Machine._name, "REDUCE": _Machine._call, "BUILD": _Machine._build,
+    "GLOBAL": _Machine._global, "STACK_GLOBAL": _Machine._global, "REDUCE": _Machine._call, "BUILD": _Machine._build,
 }  # fmt: skip
-_SKIPPED = frozenset(("PROTO", "FRAME", "STOP"))
+_SKIPPED_OPERATIONS = frozenset(("PROTO", "FRAME", "STOP"))
 
 
 def _hashable(key: Any) -> Any:
@@ -241,8 +241,8 @@ def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
-    """Return an array type, with the arguments of ``numpy.dtype``; its byte order follows with its state."""
+def _array_type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
+    """Return an unfinished array type, from arguments of ``numpy.dtype``; the state adds the byte order."""
     if not isinstance(code, str) or not _TYPE_CODE.fullmatch(code):
         raise ValueError(f"arrays of type {code[:20]!r}" if isinstance(code, str) else "arrays of no type")
     dtype = np.dtype(code)
@@ -258,7 +258,7 @@ def _type(code: Any, align: Any = False, copy: Any = False) -> _Unbuilt:
 
 
 def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
-    """Return an array whose shape, type and content follow with its state."""
+    """Return an unfinished array; the state adds shape, type and content."""
 
     def finish(state: Any) -> Any:
         """Build the array from its state: version, shape, type, order and content."""
@@ -307,7 +307,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "numpy._core.multiarray._reconstruct": _empty_array,
     "numpy._core.multiarray.scalar": _scalar,
     "numpy._core.numeric._frombuffer": _array,
-    "numpy.dtype": _type,
+    "numpy.dtype": _array_type,
     "collections.defaultdict": _new_dictionary,
     "collections.OrderedDict": _new_dictionary,
     "builtins.set": lambda items=(): set(map(_hashable, _members(items))),
@@ -403,11 +403,11 @@ def _row(row: Any) -> Any:
 
 
 class Names:
-    """Distinct integers for the names of one file: the names where all are distinct integers, else their order.
+    """Distinct integers for the names in a file: the names if all are distinct integers, else their positions.
 
     Args:
         names: All names, as texts.
-        bits: Names that are 2 to the power of this or more are no integers.
+        bits: Names of ``2**bits`` or more do not count as integers.
     """
 
     def __init__(self, names: Sequence[str], bits: int) -> None:
@@ -417,6 +417,6 @@ class Names:
         self._numbers = dict(zip(names, numbers, strict=True))
 
     def get(self, value: Any) -> int | None:
-        """Return the number of a name; None for one that the file lacks."""
+        """Return the integer of a name; None for one that the file lacks."""
         name = as_text(value)
         return None if name is None else self._numbers.get(name)

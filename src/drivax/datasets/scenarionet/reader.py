@@ -79,10 +79,10 @@ _COLUMNS = {
     "radius": ((1,), 1e3),  # of round objects of MetaDrive, without length and width
     "valid": ((1,), np.inf),
 }
-#: States of tracks that are not needed: what MetaDrive's own vehicles add.
-_OTHERS = ("angular_velocity", "steering", "throttle_brake", "action")
-#: A track moves at its end if its last step is longer.
-_MOVED_M = 0.05
+#: Known states of tracks that are not read: MetaDrive's own vehicles have them.
+_UNUSED_STATES = ("angular_velocity", "steering", "throttle_brake", "action")
+#: A track moves at its end if its last step is longer than this, metres.
+_MOVING_M = 0.05
 #: A scenario file names its dictionaries within this many bytes.
 _HEAD_BYTES = 4096
 _SIGNS = (b"version", b"length")
@@ -98,7 +98,7 @@ class ScenarioNet:
     companions: tuple[str, ...] = ("dataset_summary.pkl", "dataset_mapping.pkl")
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is a pickle that begins with the keys of a scenario."""
+        """Return whether the file is a pickle that begins with the keys of a scenario."""
         head = read_head(path, _HEAD_BYTES)
         has_keys = all(key in head for key in _SIGNS) and any(key in head for key in _PARTS)
         return head[:1] in (b"\x80", b"(", b"}") and has_keys
@@ -163,14 +163,14 @@ def decode(tree: Any) -> Recording:
     dataset, identity, ego = _dataset(tree, metadata), _identity(tree, metadata), _ego(metadata, rows)
     tracks, lost = read_tracks(table, Names(list(table), bits=31), ego)
     tracks, flags = _motion(tracks, metadata, dataset, ego)
-    around = tracks.xy[ego, int(np.argmax(tracks.valid[ego]))]
-    roads = road_map(mapping(tree, "map_features"), dataset, around)
+    ego_xy = tracks.xy[ego, int(np.argmax(tracks.valid[ego]))]
+    roads = road_map(mapping(tree, "map_features"), dataset, ego_xy)
     steps = tracks.valid.shape[1]
     lost += Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
     lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
     tracks, features = _with_heights(tracks, roads)
     tags = {"source_format": _NAME} | parsing.place_tags(as_text(metadata.get("map")))
-    kind = as_text(metadata.get("scenario_type")) or None
+    scenario_type = as_text(metadata.get("scenario_type")) or None
     recording = Recording(
         scenario_id=identity,
         dataset=dataset,
@@ -183,7 +183,7 @@ def decode(tree: Any) -> Recording:
         lights=lights,
         to_predict=_track_rows(metadata.get("tracks_to_predict"), rows),
         of_interest=_track_rows(metadata.get("objects_of_interest"), rows),
-        tags=tags | ({} if kind is None else {"scenario_types": kind[:64]}),
+        tags=tags | ({} if scenario_type is None else {"scenario_types": scenario_type[:64]}),
         lost=parsing.nonzero(**lost),
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
@@ -247,8 +247,8 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
     """Read ``tracks``, and count states of unknown names.
 
     Invalid states become zeros. Velocities, heights and sizes that the file lacks are zero; a track without ``valid``
-    is valid at every step. Round objects get twice their radius as length and width; an ego that is wider than long
-    gets the two exchanged.
+    is valid at every step. Round objects get twice their radius as length and width; length and width of an ego that is
+    wider than long are swapped.
     """
     titles = [f"track {name[:40]!r}" for name in table]
     bodies = [mapping({"": body}, "", f"tracks[{name[:40]!r}]") for name, body in table.items()]
@@ -289,7 +289,7 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> tuple[Track
         ),
         track_id=np.array([names.get(name) for name in table], np.int64),
     )
-    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_OTHERS}
+    unknown = {str(name) for state in states for name in state} - {*_COLUMNS, *_UNUSED_STATES}
     return tracks, Counter(unknown_fields=len(unknown))
 
 
@@ -308,14 +308,14 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
 
 
 def lacks_velocity(tracks: Tracks) -> bool:
-    """Whether most tracks that move at their end have velocity 0 there.
+    """Return whether most tracks that move at their end have velocity 0 there.
 
     Then velocities are missing, or differences to the next position, of which the last step has none (nuScenes).
     """
     rows = np.arange(len(tracks.valid))
     end = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[:, ::-1], axis=1)
     previous = np.maximum(end - 1, 0)
-    moves = np.hypot(*(tracks.xy[rows, end] - tracks.xy[rows, previous]).T) > _MOVED_M
+    moves = np.hypot(*(tracks.xy[rows, end] - tracks.xy[rows, previous]).T) > _MOVING_M
     moves &= tracks.valid[rows, end] & tracks.valid[rows, previous] & (end > previous)
     has_zero = ~tracks.velocity[rows, end].any(axis=1)
     return bool((moves & has_zero).sum() * 2 > moves.sum())
@@ -337,14 +337,14 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
 
 
 def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeature, ...]]:
-    """Set agents on the ground of the map where tracks or map have no heights."""
+    """Place agents on the ground if the tracks or the map have no heights."""
     if roads.flat:
         return flatten(tracks, roads.features)
     return tracks if tracks.z.any() else lift(tracks, roads.features), roads.features
 
 
 def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
-    """Return seconds of all steps; 10 Hz where the file has no timestamps."""
+    """Return the time of every step, seconds; 10 Hz if the file has no timestamps."""
     stamps = metadata.get("ts")
     if stamps is None:
         return np.arange(steps) * DT_S
@@ -357,7 +357,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
-    """Return the current step; files of long recordings name none, or the first."""
+    """Return the current step: that of the file, or step 10 (the last of fewer) if a long recording names none."""
     step = as_int(metadata.get("current_time_index"))
     if step is None:
         return min(CURRENT_STEP, steps - 1)
@@ -376,7 +376,7 @@ def _track_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
 def _lights(
     table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
 ) -> tuple[Light, ...]:
-    """Return lights by lane. None in the file is a step without an observation."""
+    """Return lights by lane; a state of None in the file is a step without an observation."""
     if len(table) * steps > _MOST_LIGHT_STATES:
         raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
@@ -417,7 +417,7 @@ def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
 
 
 def _state(state: Any) -> LightState | None:
-    """Return the state by its name or WOMD's number; None for any other."""
+    """Return the state by its name or WOMD's number; None for anything else."""
     if isinstance(state, str):
         return _STATES.get(state)
     number = as_float(state)

@@ -1,4 +1,4 @@
 """Readers of the Waymo Open Motion Dataset and of ScenarioMax.
 
-The entry is ``scenario_reader.WomdScenario`` for protos, ``example_reader`` for tf.Examples and ScenarioMax.
+``scenario_reader`` reads Scenario protos, ``example_reader`` tf.Examples of both.
 """

@@ -5,8 +5,8 @@ no speed limits, no lanes of stop signs; the map as one list of points that the 
 most 16 lights per step.
 
 ScenarioMax, which V-Max reads, has the same layout with differences: ego is row 0, ids are renumbered from 0, padding
-looks like tracks, times, speeds and courses are missing, map points have limits in mph, lights keep their slot and are
-UNKNOWN where nothing was known, ten paths of ego are included, and the original data set is not named.
+looks like tracks, times, ``speed`` and ``vel_yaw`` are missing, map points have limits in mph, lights keep their slot
+and are UNKNOWN where nothing was known, ten paths of ego are included, and the original data set is not named.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate
 from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, Flag, LightState, RoadKind
 
-#: Floats hold every whole number below; from here on, ids stored as floats may have been rounded.
+#: float32 holds every integer below this; larger ids may have been rounded.
 _EXACT = 2**24
 #: Larger median spacings of map points are those of v1.2 and later (1 m instead of 0.5 m), m.
 _COARSE_M = 0.75
@@ -112,7 +112,7 @@ class ScenarioMax(womd.TfRecordReader):
 def _recording(
     table: ExampleFeatures, payload: bytes, rows: Array, dataset: str, source_format: str
 ) -> Recording:
-    """Return the recording in some rows.
+    """Return the recording of the tracks in some rows.
 
     Invalid entries (-1 in the file) become zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
     hold different lanes over time. ``path_samples`` count as lost: the route among them was marked with the log's
@@ -267,7 +267,7 @@ def _open_ring(points: Array) -> Array:
 
 
 def _is_coarse(road_map: Sequence[MapFeature]) -> bool:
-    """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m; False without lines."""
+    """Return whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m; False without lines."""
     return (parsing.spacing_m(road_map) or 0.0) > _COARSE_M
 
 

@@ -251,7 +251,7 @@ class ExampleFeatures:
         return kind, () if kind is None else getattr(value, kind).value
 
     def has(self, name: str) -> bool:
-        """Whether the feature exists and is not empty."""
+        """Return whether the feature exists and is not empty."""
         return len(self._list(name)[1]) > 0
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> _Array:

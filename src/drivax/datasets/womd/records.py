@@ -45,8 +45,8 @@ def format_of(payload: bytes) -> str | None:
 def scenariomax_signs(features: ExampleFeatures) -> int:
     """Count how many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
-    The prediction difficulty is missing; of the tracks that are valid at the current step the ids are the rows, the ego
-    is row 0; all times of that step are negative.
+    The signs: the prediction difficulty is missing; the ids of tracks that are valid at the current step are their
+    rows, and the ego is row 0; all times of the current step are negative.
     """
     ids_are_rows = has_no_times = False
     with suppress(DataError):
@@ -81,7 +81,7 @@ class TfRecordReader:
         raise NotImplementedError
 
     def recognise(self, path: Path) -> bool:
-        """Whether the first readable record is of this format; never raises."""
+        """Return whether the first readable record is of this format; never raises."""
         try:
             return looks_framed(path) and format_of(_first(path)) == self.name
         except UsageError:
@@ -113,7 +113,7 @@ class TfRecordReader:
                 yield attempt(self._decode, payload, file=path, record=number)
 
     def _decode(self, payload: bytes) -> Recording:
-        """Return the recording in a payload; the error for a payload of another format names the format."""
+        """Return the recording in a payload; for a payload of another known format the error names that format."""
         try:
             return self.decode(payload)
         except DataError as error:

@@ -22,9 +22,9 @@ from drivax.reading import explain_damage
 
 _Array = np.ndarray[Any, Any]
 
-#: Wire type of everything that has a length, and the fields of ``Feature`` by kind of list.
+#: Wire type of fields with a length, and the fields of ``Feature`` by kind of list.
 _LENGTH, _BYTES, _FLOATS, _INTEGERS = 2, 1, 2, 3
-#: Numbers of the bytes of a variable-length integer: seven bits each, so at most ten for 64 bits.
+#: Indices of the bytes of a varint: seven bits each, so at most ten for 64 bits.
 _GROUPS = np.arange(10, dtype=np.uint64)
 _HEADER_BYTES, _FOOTER_BYTES = 12, 4
 _MASK = 0xA282EAD8
@@ -62,11 +62,11 @@ def _field(number: int, content: bytes) -> bytes:
 
 
 def varints(values: _Array) -> bytes:
-    """Serialise integers as variable-length ones: seven bits a byte, the least first, ten bytes for negative ones."""
+    """Serialise integers as varints: seven bits per byte, least significant first; negative ones take ten bytes."""
     bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
     groups = bits >> (np.uint64(7) * _GROUPS)
     continues = groups >= 128
-    # The first byte, and every one after a byte that continues.
+    # Write the first byte, and every byte after one that continues.
     is_written = np.concatenate((np.ones_like(continues[:, :1]), continues[:, :-1]), axis=1)
     content = (groups & np.uint64(127)) | (continues.astype(np.uint64) << np.uint64(7))
     return content.astype(np.uint8)[is_written].tobytes()
@@ -175,7 +175,7 @@ def count_records(path: str | Path) -> int:
 
 
 def looks_framed(path: Path) -> bool:
-    """Whether the file begins with a length and its checksum. Needs no package, never raises."""
+    """Return whether the file begins with a length and its checksum. Needs no package, never raises."""
     header = read_head(path, _HEADER_BYTES)
     is_whole = len(header) == _HEADER_BYTES
     return is_whole and mask_crc(_crc32c_slowly(header[:8])) == struct.unpack_from("<I", header, 8)[0]
