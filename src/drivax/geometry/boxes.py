@@ -60,20 +60,20 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
     xp = box.__array_namespace__()
     cos, sin = box[..., COS], box[..., SIN]
 
-    def local(point: Any) -> tuple[Any, Any]:
+    def to_local(point: Any) -> tuple[Any, Any]:
         x, y = point[..., 0] - box[..., X], point[..., 1] - box[..., Y]
         return x * cos + y * sin, y * cos - x * sin
 
-    enters, leaves = 0.0, 1.0
+    t_enter, t_leave = 0.0, 1.0
     halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
-    for begin, stop, half in zip(local(start), local(end), halves, strict=True):
+    for begin, stop, half in zip(to_local(start), to_local(end), halves, strict=True):
         step = stop - begin
-        # A tiny step keeps a segment that is parallel to these two sides between them throughout, or never.
+        # A segment parallel to these two sides gets a tiny step: it lies between them throughout, or never.
         step = xp.where(abs(step) < 1e-9, xp.full_like(step, 1e-9), step)
         first, second = (-half - begin) / step, (half - begin) / step
         low, high = xp.minimum(first, second), xp.maximum(first, second)
-        enters, leaves = xp.maximum(low, enters), xp.minimum(high, leaves)
-    return enters, leaves
+        t_enter, t_leave = xp.maximum(low, t_enter), xp.minimum(high, t_leave)
+    return t_enter, t_leave
 
 
 def gap(a: Any, b: Any) -> Any:
@@ -106,23 +106,23 @@ def overlap_within(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: 
     normal of the relative velocity. Equal to ``time_to_overlap(...) < horizon_s`` for positive horizons, without
     divisions, but a corner that only touches the other box in passing counts as overlap.
     """
-    half = horizon_s / 2
-    vx, vy = ((velocity_b[..., axis] - velocity_a[..., axis]) * half for axis in (0, 1))
-    dx, dy = b[..., X] - a[..., X] + vx, b[..., Y] - a[..., Y] + vy
+    half_s = horizon_s / 2
+    sweep_x, sweep_y = ((velocity_b[..., axis] - velocity_a[..., axis]) * half_s for axis in (0, 1))
+    dx, dy = b[..., X] - a[..., X] + sweep_x, b[..., Y] - a[..., Y] + sweep_y
     extent = sum(
-        abs(box[..., COS] * vy - box[..., SIN] * vx) * (box[..., LENGTH] / 2)
-        + abs(box[..., SIN] * vy + box[..., COS] * vx) * (box[..., WIDTH] / 2)
+        abs(box[..., COS] * sweep_y - box[..., SIN] * sweep_x) * (box[..., LENGTH] / 2)
+        + abs(box[..., SIN] * sweep_y + box[..., COS] * sweep_x) * (box[..., WIDTH] / 2)
         for box in (a, b)
     )
-    # Without relative motion the normal is zero and excludes nothing: both sides are 0.
-    result = abs(dy * vx - dx * vy) <= extent
+    # Without relative motion the normal is zero: both sides are 0, so it excludes nothing.
+    result = abs(dy * sweep_x - dx * sweep_y) <= extent
     for axis_x, axis_y, reach in _axis_terms(a, b):
-        result &= abs(dx * axis_x + dy * axis_y) < reach + abs(vx * axis_x + vy * axis_y)
+        result &= abs(dx * axis_x + dy * axis_y) < reach + abs(sweep_x * axis_x + sweep_y * axis_y)
     return result
 
 
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:
-    """Return the first time at which two boxes overlap at constant velocities and fixed headings, in closed form.
+    """Return the first time (s) at which two boxes overlap at constant velocities and fixed headings, in closed form.
 
     On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
     interval; they overlap in the plane during the intersection of the four (swept separating axis theorem). Velocities

@@ -73,9 +73,9 @@ class Polylines:
         """Find the segment at arc length ``s`` of polyline ``row``, which has two points or more.
 
         Returns:
-            The index of its first point, and the fraction of the segment at ``s``. Beyond an end it is the first
-            segment with a length, or the last segment: evaluation continues straight on, but stays at a last point
-            that is repeated.
+            The index of its first point, and the fraction of the segment at ``s``. Beyond an end, the segment is the
+            first with a length, or the last: evaluation continues straight on, but stays at a last point that is
+            repeated.
         """
         # Minimum and maximum are several times as fast as clip on few elements.
         key = np.minimum(np.maximum(s, 0.0), self.length[row]) + self._base[row]
@@ -147,7 +147,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Mask of points to keep, so that the dropped ones lie within the tolerance of the simplified polylines.
+    """Mask of the points to keep: the other points lie within the tolerance of the simplified polylines.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
@@ -171,11 +171,11 @@ def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Boo
         )
         first = _changes(interval)  # the first interior point of each interval
         farthest = np.repeat(np.maximum.reduceat(distance, first), np.diff(first, append=len(interior)))
-        active = farthest > tolerance_m
+        must_split = farthest > tolerance_m
         # Several points may be equally far: split at the earliest.
-        peak = np.flatnonzero(active & (distance == farthest))
+        peak = np.flatnonzero(must_split & (distance == farthest))
         keep[interior[peak[_changes(interval[peak])]]] = True
-        interior = interior[active]
+        interior = interior[must_split]
         interior = interior[~keep[interior]]
     return keep
 
@@ -186,7 +186,7 @@ def _changes(values: Int[Array, " n"]) -> Int[Array, " change"]:
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
-    """Number of equal pieces of segments so that none is longer than ``longest_m``; at least one."""
+    """Number of equal pieces to cut each segment into, so that no piece is longer than ``longest_m``; at least 1."""
     # The tolerance keeps rounding from adding a piece.
     return np.maximum(np.ceil(length / longest_m - 1e-9), 1).astype(np.int64)
 
@@ -194,7 +194,7 @@ def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array,
 def resample(
     points: Float[Array, "point dim"], spacing_m: float, most: int | None = None
 ) -> tuple[Float[Array, "sample dim"], Int[Array, " sample"]]:
-    """Resample a polyline of at least two points every ``spacing_m`` of arc length; the rest at the end is dropped.
+    """Resample a polyline of two points or more every ``spacing_m`` of arc length; the remainder at the end is dropped.
 
     Returns:
         The first ``most`` samples, and for each the index of the point where its segment begins.

@@ -21,13 +21,13 @@ def rotate(xy: Any, cos: Any, sin: Any) -> Any:
 def root(squared: Any) -> Any:
     """Square root whose gradient at zero is zero; 0 for negative arguments and NaN.
 
-    Reverse differentiation of ``sqrt(0)`` is infinite, and infinity times the zero that a mask sends back is not a
-    number; so both the argument and the result are masked.
+    The gradient of ``sqrt`` at 0 is infinite, and infinity times the zero that a mask propagates back is NaN; so both
+    the argument and the result are masked.
     """
     xp = squared.__array_namespace__()
-    positive = squared > 0
-    safe = xp.sqrt(xp.where(positive, squared, xp.ones_like(squared)))
-    return xp.where(positive, safe, xp.zeros_like(squared))
+    is_positive = squared > 0
+    safe_root = xp.sqrt(xp.where(is_positive, squared, xp.ones_like(squared)))
+    return xp.where(is_positive, safe_root, xp.zeros_like(squared))
 
 
 def norm(vector: Any) -> Any:

@@ -52,15 +52,15 @@ def recording_from_arrays(
             the roads have heights); ``id``, integers. Invalid entries may hold anything.
         roads: ``lanes``, a sequence of mappings with ``points`` [point, 2 or 3] in driving direction and optionally
             ``successors``, ``left``, ``right`` (indices in this sequence; neighbours have the same direction),
-            ``limit_mps``, ``width_m``, ``kind`` ("surface", "freeway", "bike"); without any successor lanes are joined
-            where they touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional:
+            ``limit_mps``, ``width_m``, ``kind`` ("surface", "freeway", "bike"); if no lane has successors, lanes are
+            joined where they touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional:
             ``crosswalks``, polygons; ``stop_signs``, mappings with ``point`` and ``lanes`` (indices).
         lights: Mappings with ``lane`` (index), ``states``, one per step ("red", "yellow", "green", "unknown", None
             if unobserved, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``, x, y or
             x, y, z (otherwise the beginning of the lane; without z at the height of the lane).
         route: Indices of the lanes of the intended route in order, if known.
-        ego: Row of the agent that is driven.
-        dt_s: Seconds between steps; resample other steps than 0.1 first (:func:`resample`).
+        ego: Row of the ego vehicle among the agents.
+        dt_s: Seconds between steps; resample agents with steps other than 0.1 s first (:func:`resample`).
         dataset: Short name of the source.
 
     Raises:
@@ -100,7 +100,7 @@ def scenario_from_arrays(
     lights: Sequence[Mapping[str, Any]] = (), route: Sequence[int] = (), ego: int = 0,
     dt_s: float = DT_S, dataset: str = "own",
 ) -> Scenario:  # fmt: skip
-    """Return a scenario from plain arrays of at most 91 steps; step 10, or the last of fewer, is the current one.
+    """Return a scenario from plain arrays of at most 91 steps; the current step is 10, or the last of fewer.
 
     Arguments and errors are those of :func:`recording_from_arrays` and :func:`~drivax.scenario.build.assemble`; cut
     longer recordings with :func:`drivax.scenario.recording.windows`.
@@ -109,7 +109,7 @@ def scenario_from_arrays(
 
 
 def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
-    """Resample agents, as for :func:`recording_from_arrays` but ``dt_s`` apart, to 10 Hz by linear interpolation.
+    """Resample agents of :func:`recording_from_arrays`, with steps ``dt_s`` apart, to 10 Hz by linear interpolation.
 
     Headings turn along the shorter arc. A new step is valid if it falls on a valid step or between two neighbouring
     valid steps. The result has no velocities: they follow from the new positions.
@@ -121,24 +121,24 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     count, steps = valid.shape
     new_steps = int(np.floor((steps - 1) * dt_s / DT_S + 1e-6)) + 1
     at = np.minimum(np.arange(new_steps) * (DT_S / dt_s), steps - 1)
-    # Undo rounding: a new step that falls on an old one must not need its neighbour, too.
+    # Undo rounding: a new step that falls on an old step must not need the neighbour of that step.
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
-    is_observed = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
+    is_valid = valid[:, np.floor(at).astype(np.int64)] & valid[:, np.ceil(at).astype(np.int64)]
 
-    def resample_field(name: str, columns: tuple[int, ...]) -> Array:
+    def resample_field(name: str, shape: tuple[int, ...]) -> Array:
         """Interpolate a field of the agents at the new steps."""
-        values = _array(agents, name, float, (count, steps, *columns))
+        values = _array(agents, name, float, (count, steps, *shape))
         return interpolate(values, valid, at, angle=name == "heading")
 
-    widths: dict[str, tuple[int, ...]] = {"xy": (2,), "heading": ()}
-    widths |= {"z": ()} if "z" in agents else {}
-    widths |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
+    shapes: dict[str, tuple[int, ...]] = {"xy": (2,), "heading": ()}
+    shapes |= {"z": ()} if "z" in agents else {}
+    shapes |= {"size": (3,)} if np.ndim(agents.get("size", ())) == 3 else {}
     result = {name: agents[name] for name in ("kind", "id", "size") if name in agents}
-    return result | {"valid": is_observed} | {name: resample_field(name, n) for name, n in widths.items()}
+    return result | {"valid": is_valid} | {key: resample_field(key, shape) for key, shape in shapes.items()}
 
 
 def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
-    """Refuse unknown keys."""
+    """Refuse anything but a mapping with some of the keys; ``what`` names it in errors."""
     if not isinstance(mapping, Mapping):
         raise UsageError(f"{what} is not a mapping", cure=f"give a dictionary with {', '.join(keys)}")
     for key in mapping:
@@ -147,7 +147,7 @@ def _check_keys(mapping: Any, keys: Sequence[str], what: str) -> None:
 
 
 def _items(values: Any, what: str) -> list[Any]:
-    """Return the items of a list."""
+    """Return the items of an iterable as a list; refuse text."""
     try:
         if not isinstance(values, str):
             return list(values)
@@ -164,7 +164,7 @@ def _number(value: Any, what: str) -> float | None:
 
 
 def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
-    """Return an array of the agents, of a shape in which None is any size."""
+    """Return an array of the agents; in its expected ``shape``, None stands for any size."""
     if name not in agents:
         raise UsageError(f'agents["{name}"] is missing', cure="see recording_from_arrays")
     try:
@@ -173,7 +173,7 @@ def _array(agents: Mapping[str, Any], name: str, kind: type, shape: tuple[int | 
         raise UsageError(
             f'agents["{name}"] is not an array of numbers', cure="give one row per agent"
         ) from error
-    sizes = [own if size is None else size for size, own in zip(shape, values.shape, strict=False)]
+    sizes = [actual if size is None else size for size, actual in zip(shape, values.shape, strict=False)]
     if values.ndim != len(shape) or values.shape != tuple(sizes):
         expected = tuple("any" if size is None else size for size in shape)
         problem = f'agents["{name}"] has shape {values.shape}, not {expected}'
@@ -203,10 +203,10 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_z: bool) -> Tracks:
     elif needs_z:
         raise UsageError('the roads have heights, agents["z"] is missing', cure="give z of the box centres")
     else:
-        default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])
-        default[ego] = DEFAULT_EGO_SIZE[2]
+        default_height_m = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])
+        default_height_m[ego] = DEFAULT_EGO_SIZE[2]
         # The roads are at z = 0, so the centre of a box is at half its height.
-        z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default[:, None]) / 2, valid)
+        z = _zero_invalid(np.where(size[..., 2] > 0, size[..., 2], default_height_m[:, None]) / 2, valid)
     heading = _zero_invalid(_array(agents, "heading", float, (count, steps)), valid)
     track_id = _array(agents, "id", float, (count,)) if "id" in agents else np.arange(count)
     if (track_id != np.floor(track_id)).any():
@@ -223,7 +223,7 @@ def _kinds(agents: Mapping[str, Any], count: int) -> Int8[np.ndarray, " agent"]:
 
 
 def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
-    """Box sizes of every step; zeros stand for default sizes."""
+    """Box sizes ``[agent, time, 3]``; zeros stand for default sizes."""
     if "size" not in agents:
         return np.zeros((count, steps, 3))
     if np.ndim(agents["size"]) == 3:
@@ -232,7 +232,7 @@ def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
 
 
 def _member(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -> Any:
-    """Return a member of an enumeration, from a member, number or word."""
+    """Return the member of an enumeration that a member, a number or a name stands for."""
     try:
         return names[value] if isinstance(value, str) or value is None else kinds(value)
     except (KeyError, ValueError, TypeError) as error:
@@ -245,9 +245,9 @@ def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     lanes, number = len(roads.get("lanes", ())), itertools.count()
     for row, lane in enumerate(roads.get("lanes", ())):
         yield _lane(next(number), lane, f'roads["lanes"][{row}]', lanes)
-    for name, kind, least in (("edges", RoadKind.EDGE_BOUNDARY, 2), ("crosswalks", RoadKind.CROSSWALK, 3)):
+    for name, kind, minimum in (("edges", RoadKind.EDGE_BOUNDARY, 2), ("crosswalks", RoadKind.CROSSWALK, 3)):
         for row, line in enumerate(roads.get(name, ())):
-            yield MapFeature(next(number), kind, _points(line, f'roads["{name}"][{row}]', least))
+            yield MapFeature(next(number), kind, _points(line, f'roads["{name}"][{row}]', minimum))
     for row, sign in enumerate(roads.get("stop_signs", ())):
         what = f'roads["stop_signs"][{row}]'
         _check_keys(sign, ("point", "lanes"), what)
@@ -258,15 +258,15 @@ def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
         yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controls)
 
 
-def _points(line: Any, what: str, least: int) -> Array:
-    """Points with heights, 0 without them."""
+def _points(line: Any, what: str, minimum: int) -> Array:
+    """Points ``[point, 3]``; heights are 0 if the line has none."""
     try:
         points = np.array(line, dtype=np.float64)
     except (TypeError, ValueError) as error:
         cure = "give (x, y) or (x, y, z) per point"
         raise UsageError(f"{what} is not an array of points", cure=cure) from error
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) < least:
-        cure = f"give at least {least} rows of x, y or x, y, z"
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) < minimum:
+        cure = f"give at least {minimum} rows of x, y or x, y, z"
         raise UsageError(f"{what} has shape {points.shape}", cure=cure)
     if not np.isfinite(points).all():
         raise UsageError(f"{what} has a point that is not finite", cure="leave it out")
@@ -293,7 +293,7 @@ def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
 
 
 def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
-    """Check one or several indices of lanes, and return a tuple."""
+    """Check the index or indices of lanes, and return them as a tuple."""
     rows = [indices] if isinstance(indices, int | np.integer) else _items(indices, what)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:

@@ -24,19 +24,19 @@ def record(cls: type[Record]) -> type[Record]:
     that checks shapes would refuse.
     """
     data_class = dataclass(frozen=True)(cls)
-    leaves = tuple(f.name for f in fields(cast(Any, data_class)) if not f.metadata.get("static"))
-    statics = tuple(f.name for f in fields(cast(Any, data_class)) if f.metadata.get("static"))
+    leaf_names = tuple(f.name for f in fields(cast(Any, data_class)) if not f.metadata.get("static"))
+    static_names = tuple(f.name for f in fields(cast(Any, data_class)) if f.metadata.get("static"))
 
     def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return tuple(getattr(value, n) for n in leaves), tuple(getattr(value, n) for n in statics)
+        return tuple(getattr(value, n) for n in leaf_names), tuple(getattr(value, n) for n in static_names)
 
     def flatten_with_keys(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        keyed = tuple((jax.tree_util.GetAttrKey(n), getattr(value, n)) for n in leaves)
-        return keyed, tuple(getattr(value, n) for n in statics)
+        keyed_leaves = tuple((jax.tree_util.GetAttrKey(n), getattr(value, n)) for n in leaf_names)
+        return keyed_leaves, tuple(getattr(value, n) for n in static_names)
 
     def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
         value = object.__new__(data_class)
-        for name, child in (*zip(leaves, children, strict=True), *zip(statics, aux, strict=True)):
+        for name, child in (*zip(leaf_names, children, strict=True), *zip(static_names, aux, strict=True)):
             object.__setattr__(value, name, child)
         return value
 

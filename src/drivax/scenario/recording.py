@@ -25,17 +25,17 @@ DATASET_BYTES = 16
 EXTENT_M, SPEED_MPS = 100_000.0, 100.0
 #: Default number of steps between the starts of two windows.
 STRIDE = 40
-_UNITS = "repair it, or convert it to metres in the reader"
+_UNIT_CURE = "repair it, or convert it to metres in the reader"
 _ROAD_KINDS = frozenset(RoadKind)
 #: Fields of tracks with a value per step, and the shape of that value.
-_WIDTHS = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
+_VALUE_SHAPES = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
 #: Problem and cure, None if a check passes.
 Finding = tuple[str, str] | None
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks of all road users in the map frame of the source; invalid entries hold zeros."""
+    """Tracks of all road users (box centres) in the map frame of the source: m, rad, m/s; 0 where not valid."""
 
     xy: Float64[np.ndarray, "track time 2"]
     z: Float64[np.ndarray, "track time"]
@@ -70,7 +70,7 @@ class MapFeature:
 
 @dataclass(frozen=True)
 class Light:
-    """A traffic light for one lane."""
+    """A traffic light for one lane: stop point (x, y, z) in metres, and a ``LightState`` for each step."""
 
     lane_id: int
     stop_point: Float64[np.ndarray, " 3"]
@@ -130,9 +130,9 @@ class Recording:
 def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> Iterator[Recording]:
     """Cut a recording into windows of ``length`` steps that share its segment; step 10 (or the last) becomes current.
 
-    Window ``k`` starts at step ``k * stride``; a rest that fills no window is dropped (110 steps make one window, 199
-    make three). Windows without a valid ego at the current step are dropped, and counted in ``lost`` of the others as
-    ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
+    Window ``k`` starts at step ``k * stride``; a remainder that fills no window is dropped (110 steps make one window,
+    199 make three). Windows without a valid ego at the current step are dropped; ``lost`` of all other windows counts
+    them as ``windows_without_ego``. A recording of at most ``length`` steps is its own window.
 
     No window spans a gap of two or more missing frames: the pieces between gaps are cut on their own, and ``lost``
     counts the ``time_gaps``. If no piece fills a window, the longest one with a valid ego is the window. A piece with a
@@ -148,39 +148,39 @@ def windows(recording: Recording, stride: int = STRIDE, length: int = STEPS) -> 
             raise UsageError(f"a {name} of {number} steps", cure="choose 1 or more")
     pieces = [_resample(piece) for piece in _split_at_gaps(recording)]
     if len(pieces) == 1 and len(pieces[0][1]) <= length:
-        piece, frameless = pieces[0]
-        now = min(CURRENT_STEP, len(frameless) - 1)
-        piece = piece if piece.current_step == now else replace(piece, current_step=now)
-        yield _add_counts(piece, interpolated_steps=int(frameless.sum()))
+        piece, is_interpolated = pieces[0]
+        current_step = min(CURRENT_STEP, len(is_interpolated) - 1)
+        piece = piece if piece.current_step == current_step else replace(piece, current_step=current_step)
+        yield _add_counts(piece, interpolated_steps=int(is_interpolated.sum()))
         return
-    cut = [
-        _window(piece, frameless, start, length, recording)
-        for piece, frameless in pieces
-        for start in range(0, len(frameless) - length + 1, stride)
+    candidates = [
+        _window(piece, is_interpolated, start, length, recording)
+        for piece, is_interpolated in pieces
+        for start in range(0, len(is_interpolated) - length + 1, stride)
     ] or [_window(*max(pieces, key=_window_rank), 0, length, recording)]
-    usable = [window for window in cut if window.tracks.valid[window.ego, window.current_step]]
-    if not usable:
-        problem = f"the ego is not valid at the current step of any of {len(cut)} windows"
+    usable_windows = [window for window in candidates if window.tracks.valid[window.ego, window.current_step]]
+    if not usable_windows:
+        problem = f"the ego is not valid at the current step of any of {len(candidates)} windows"
         raise DataError(problem, record=recording.scenario_id, cure="skip the recording")
-    lost = {"windows_without_ego": len(cut) - len(usable), "time_gaps": len(pieces) - 1}
-    yield from (_add_counts(window, **lost) for window in usable)
+    lost = {"windows_without_ego": len(candidates) - len(usable_windows), "time_gaps": len(pieces) - 1}
+    yield from (_add_counts(window, **lost) for window in usable_windows)
 
 
 def _window_rank(piece: tuple[Recording, Array]) -> tuple[bool, int]:
     """Sort key of pieces that fill no window: first a valid ego at the current step, then length."""
-    recording, frameless = piece
-    now = min(CURRENT_STEP, len(frameless) - 1)
-    return bool(recording.tracks.valid[recording.ego, now]), len(frameless)
+    recording, is_interpolated = piece
+    current_step = min(CURRENT_STEP, len(is_interpolated) - 1)
+    return bool(recording.tracks.valid[recording.ego, current_step]), len(is_interpolated)
 
 
 def _add_counts(recording: Recording, **lost: int) -> Recording:
-    """The recording with more counts in ``lost``; itself if they are all 0."""
+    """Return the recording with nonzero counts added to ``lost``, or itself if all are 0."""
     lost = {name: count for name, count in lost.items() if count}
     return replace(recording, lost={**recording.lost, **lost}) if lost else recording
 
 
 def _split_at_gaps(recording: Recording) -> Iterator[Recording]:
-    """The pieces of a recording between gaps; timestamps that do not increase are left to ``check``."""
+    """Yield the pieces of a recording between gaps; :func:`check` refuses timestamps that do not increase."""
     times = recording.timestamps_s
     ends = np.flatnonzero(np.diff(times) > GAP_STEPS * step_seconds(times)[0]) + 1
     if not len(ends) or not (np.diff(times) > 0).all():
@@ -191,28 +191,28 @@ def _split_at_gaps(recording: Recording) -> Iterator[Recording]:
 
 
 def _resample(recording: Recording) -> tuple[Recording, Bool[np.ndarray, " time"]]:
-    """Interpolate a recording at even times if a step is too short or too long; mask the steps without a frame."""
+    """Interpolate a recording at even times if its steps are uneven; also return the mask of steps without a frame."""
     times = recording.timestamps_s
     if is_even(times) or not (np.diff(times) > 0).all():
         return recording, np.zeros(len(times), dtype=bool)
-    step, _ = step_seconds(times)
-    count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step) + 1
-    even = times[0] + step * np.arange(count)
-    at = np.interp(even, times, np.arange(len(times)))
-    # Steps near enough to a frame take it as it is.
+    step_s, _ = step_seconds(times)
+    count = int((times[-1] - times[0] + STEP_TOLERANCE_S) / step_s) + 1
+    even_times = times[0] + step_s * np.arange(count)
+    at = np.interp(even_times, times, np.arange(len(times)))
+    # A step near enough to a frame takes the frame unchanged.
     frame = np.rint(at).astype(np.int64)
-    exact = np.abs(times[frame] - even) <= STEP_TOLERANCE_S
-    return _interpolate_at(recording, np.where(exact, frame, at), even), ~exact
+    is_exact = np.abs(times[frame] - even_times) <= STEP_TOLERANCE_S
+    return _interpolate_at(recording, np.where(is_exact, frame, at), even_times), ~is_exact
 
 
 def _interpolate_at(
-    recording: Recording, at: Float64[np.ndarray, " step"], even: Float64[Array, " step"]
+    recording: Recording, at: Float64[np.ndarray, " step"], times: Float64[Array, " step"]
 ) -> Recording:
-    """The recording at fractional steps, which come at even times; lights keep their state until the next frame."""
+    """Interpolate a recording at fractional steps and new times; lights keep their state until the next frame."""
     before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
     tracks, seen = recording.tracks, recording.seen
     series = {"valid": tracks.valid[:, before] & tracks.valid[:, after]}
-    for name in _WIDTHS.keys() - series.keys():
+    for name in _VALUE_SHAPES.keys() - series.keys():
         series[name] = interpolate(getattr(tracks, name), tracks.valid, at, angle=name == "heading")
 
     def step_of(old: int) -> int:
@@ -221,7 +221,7 @@ def _interpolate_at(
 
     return replace(
         recording,
-        timestamps_s=even,
+        timestamps_s=times,
         current_step=step_of(recording.current_step),
         tracks=replace(tracks, **series),
         seen=None if seen is None else seen[:, before] & seen[:, after],
@@ -238,10 +238,10 @@ def interpolate(
 ) -> Float[Array, "track step *value"]:  # fmt: skip
     """Interpolate values of tracks at fractional steps, angles along the shorter arc; 0 unless both sides are valid."""
     before, after = np.floor(at).astype(np.int64), np.ceil(at).astype(np.int64)
-    widen = (..., *[None] * (values.ndim - 2))
-    step = values[:, after] - values[:, before]
-    result = values[:, before] + (at - before)[widen] * (wrap(step) if angle else step)
-    return np.where((valid[:, before] & valid[:, after])[widen], result, 0.0)
+    expand = (..., *[None] * (values.ndim - 2))
+    difference = values[:, after] - values[:, before]
+    result = values[:, before] + (at - before)[expand] * (wrap(difference) if angle else difference)
+    return np.where((valid[:, before] & valid[:, after])[expand], result, 0.0)
 
 
 def differentiate(
@@ -259,47 +259,47 @@ def differentiate(
     first, last = np.maximum(step - has_previous, 0), np.minimum(step + has_next, len(step) - 1)
     rows = np.arange(len(xy))[:, None]
     seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
-    moved = xy[rows, last] - xy[rows, first]
+    displacement = xy[rows, last] - xy[rows, first]
     is_known = (has_previous | has_next)[..., None]
-    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=is_known)
+    return np.divide(displacement, seconds_apart, out=np.zeros_like(displacement), where=is_known)
 
 
 def _window(
-    piece: Recording, frameless: Bool[Array, " time"], start: int, length: int, whole: Recording
+    piece: Recording, is_interpolated: Bool[Array, " time"], start: int, length: int, whole: Recording
 ) -> Recording:
-    """The steps from ``start`` of a piece on, named by the steps since the beginning of the whole recording."""
-    part = slice(start, min(start + length, len(frameless)))
-    begin = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
+    """Return the window of a piece from step ``start`` on; ``@STEP`` in its id is its start in the whole recording."""
+    steps = slice(start, min(start + length, len(is_interpolated)))
+    piece_start = (piece.timestamps_s[0] - whole.timestamps_s[0]) / step_seconds(whole.timestamps_s)[0]
     window = replace(
-        _cut(piece, part),
-        scenario_id=f"{whole.scenario_id}@{round(begin) + start}",
-        current_step=min(CURRENT_STEP, part.stop - part.start - 1),
+        _cut(piece, steps),
+        scenario_id=f"{whole.scenario_id}@{round(piece_start) + start}",
+        current_step=min(CURRENT_STEP, steps.stop - steps.start - 1),
     )
-    return _add_counts(window, interpolated_steps=int(frameless[part].sum()))
+    return _add_counts(window, interpolated_steps=int(is_interpolated[steps].sum()))
 
 
-def _cut(recording: Recording, part: slice) -> Recording:
-    """The steps ``part`` of a recording and the events in them; the caller sets the current step."""
-    last = part.stop - part.start - 1
-    series = {name: getattr(recording.tracks, name)[:, part] for name in _WIDTHS}
+def _cut(recording: Recording, steps: slice) -> Recording:
+    """Return some steps of a recording, and the events in them; the caller sets the current step."""
+    last = steps.stop - steps.start - 1
+    series = {name: getattr(recording.tracks, name)[:, steps] for name in _VALUE_SHAPES}
     events = (
-        replace(event, start=max(event.start - part.start, 0), end=min(event.end - part.start, last))
+        replace(event, start=max(event.start - steps.start, 0), end=min(event.end - steps.start, last))
         for event in recording.events
     )
     return replace(
         recording,
-        timestamps_s=recording.timestamps_s[part],
+        timestamps_s=recording.timestamps_s[steps],
         tracks=replace(recording.tracks, **series),
-        seen=None if recording.seen is None else recording.seen[:, part],
-        lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
+        seen=None if recording.seen is None else recording.seen[:, steps],
+        lights=tuple(replace(light, states=light.states[steps]) for light in recording.lights),
         events=tuple(event for event in events if event.end >= event.start),
     )
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """Return the recording with another vehicle as the ego, without route and ``seen``; its id ends with the track's.
+    """Return the recording with another vehicle as the ego, without route and ``seen``; its id ends in ``#TRACK_ID``.
 
-    With its own ego it is the recording itself.
+    For the row of the present ego, return the recording unchanged.
 
     Raises:
         UsageError: The track is not a vehicle that is valid at the current step.
@@ -317,7 +317,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Refuse an invalid recording."""
+    """Raise a DataError if a recording is invalid."""
     finding = _check_names(recording) or _check_time(recording, capacity.steps) or _check_shapes(recording)
     finding = finding or _check_tracks(recording) or _check_extent(recording)
     finding = finding or _check_map(recording) or _check_lights(recording)
@@ -376,7 +376,7 @@ def _check_time(recording: Recording, most_steps: int) -> Finding:
 def _check_shapes(recording: Recording) -> Finding:
     tracks, steps = recording.tracks, len(recording.timestamps_s)
     count = len(tracks.track_id)
-    shapes = {f"tracks.{name}": (count, steps, *width) for name, width in _WIDTHS.items()}
+    shapes = {f"tracks.{name}": (count, steps, *value_shape) for name, value_shape in _VALUE_SHAPES.items()}
     shapes |= {"tracks.kind": (count,)} | ({} if recording.seen is None else {"seen": (count, steps)})
     for name, shape in shapes.items():
         actual = np.shape(attrgetter(name)(recording))
@@ -412,28 +412,28 @@ def _check_tracks(recording: Recording) -> Finding:
 
 def _ego_position(recording: Recording) -> Float[Array, "3"]:
     """Position of the ego at the current step."""
-    now = recording.ego, recording.current_step
-    return np.append(recording.tracks.xy[now], recording.tracks.z[now])
+    index = recording.ego, recording.current_step
+    return np.append(recording.tracks.xy[index], recording.tracks.z[index])
 
 
 def _check_extent(recording: Recording) -> Finding:
     """Refuse implausible values of ego and lights, which exhaust memory or float32; other tracks lose such steps."""
     ego, row = _ego_position(recording), recording.ego
-    lost = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
-    if len(lost):
-        steps = f"between steps {lost[0]} and {lost[-1]}" if len(lost) > 1 else f"at step {lost[0]}"
-        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s {steps}", _UNITS
+    steps = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
+    if len(steps):
+        when = f"between steps {steps[0]} and {steps[-1]}" if len(steps) > 1 else f"at step {steps[0]}"
+        return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s {when}", _UNIT_CURE
     stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
     if stops and np.nanmax(np.abs(np.array(stops) - ego), initial=0.0) > EXTENT_M:
-        return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+        return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNIT_CURE
     return None
 
 
 def plausible(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarray, "track time"]:
-    """Valid steps of tracks without those beyond ``EXTENT_M`` and ``SPEED_MPS``, and without jumps.
+    """Mask of the valid steps of tracks within ``EXTENT_M`` and ``SPEED_MPS`` and without jumps.
 
-    A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps the
-    longest is kept, and before and after it those that connect.
+    A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps, the
+    longest and those before and after that connect to it are kept.
     """
     tracks, ego = recording.tracks, _ego_position(recording)
     xy, z, velocity = tracks.xy[rows], tracks.z[rows], tracks.velocity[rows]
@@ -450,9 +450,9 @@ def plausible(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarra
     return result
 
 
-def _longest_chain(xy: Float[Array, "time 2"], at: Int[Array, " step"]) -> Int[Array, " kept"]:
+def _longest_chain(xy: Float[Array, "time 2"], steps: Int[Array, " step"]) -> Int[Array, " kept"]:
     """Return the steps of a track that form its longest piece without jumps, and those that connect to it."""
-    pieces = np.split(at, np.flatnonzero(~_connects(xy[at], at)) + 1)
+    pieces = np.split(steps, np.flatnonzero(~_connects(xy[steps], steps)) + 1)
     longest = int(np.argmax([len(piece) for piece in pieces]))
     chain = pieces[longest]
     for piece in pieces[longest + 1 :]:
@@ -465,9 +465,9 @@ def _longest_chain(xy: Float[Array, "time 2"], at: Int[Array, " step"]) -> Int[A
 
 
 def _connects(xy: Float[Array, "k 2"], step: Int[Array, " k"]) -> Bool[np.ndarray, " pair"]:
-    """Whether a track could drive between successive observations."""
-    moved = xy[1:] - xy[:-1]
-    return np.hypot(moved[:, 0], moved[:, 1]) <= SPEED_MPS * DT_S * (step[1:] - step[:-1])
+    """Return whether a track could connect successive observations at ``SPEED_MPS``."""
+    displacement = xy[1:] - xy[:-1]
+    return np.hypot(displacement[:, 0], displacement[:, 1]) <= SPEED_MPS * DT_S * (step[1:] - step[:-1])
 
 
 def _check_map(recording: Recording) -> Finding:
@@ -491,7 +491,7 @@ def _check_map(recording: Recording) -> Finding:
     if not np.isfinite(points[far[0]]).all():
         return f"feature {feature.feature_id} has a point that is not finite", "repair it or drop it"
     where = f"more than {EXTENT_M / 1000:.0f} km away from the ego"
-    return f"feature {feature.feature_id} has a point {where}", _UNITS
+    return f"feature {feature.feature_id} has a point {where}", _UNIT_CURE
 
 
 def _check_lights(recording: Recording) -> Finding:

@@ -76,7 +76,7 @@ POLYGON_KINDS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY)
 
 
 def among(kind: Int[np.ndarray, "*n"], group: tuple[int, ...]) -> Bool[np.ndarray, "*n"]:
-    """Mask of kinds (-1 or more) in a group: ``np.isin`` by a table, which is several times faster."""
+    """Mask of kinds (-1 or more) in a group, by table lookup: several times as fast as ``np.isin``."""
     table = _members(group)
     return table[np.minimum(kind, len(table) - 1)]
 
@@ -90,7 +90,7 @@ def _members(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
 
 
 def nonzero(mask: Bool[np.ndarray, "*axis"]) -> tuple[Int[np.ndarray, " entry"], ...]:
-    """Indices of the true entries by axis: ``np.nonzero``, which takes several times as long for two axes or more."""
+    """Indices of the true entries by axis: several times as fast as ``np.nonzero`` for two axes or more."""
     return np.unravel_index(mask.ravel().nonzero()[0], mask.shape)
 
 
@@ -132,7 +132,7 @@ class Flag(enum.IntFlag):
 
 @dataclass(frozen=True)
 class Capacity:
-    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``, but not routes and egos.
+    """Padded sizes of a stored scenario; items that do not fit, except routes and egos, are counted in ``overflow``.
 
     ``egos`` is the largest number of vehicles with a route and a goal, the recorded ego included.
     """
@@ -252,7 +252,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
 
 
 def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return the fields of further egos: slot, last step, and route to the goal (as of the recorded ego)."""
+    """Return the fields of further egos: slot, last step, and route to the goal (as for the recorded ego)."""
     return {
         "ego_slot": ("i2", (egos,)), "ego_last_step": ("i2", (egos,)),
         "ego_on_lanes": ("?", (egos,)),  # otherwise the route is the logged path (privileged)
@@ -265,16 +265,16 @@ def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tupl
 
 #: Names of a scenario. The manifest holds them in full.
 NAMES = ("scenario_id", "dataset", "segment")
-_DIGEST = 16
+_DIGEST_DIGITS = 16
 
 
 def stored_name(text: str, size: int) -> bytes:
-    """Return a name as its field of ``size`` bytes holds it: longer ones end in ``~`` and digits of their SHA-256."""
+    """Return a name as its field of ``size`` bytes holds it: long names end in ``~`` and digits of their SHA-256."""
     name = text.encode()
     if len(name) <= size:
         return name
-    begin = name[: size - _DIGEST - 1].decode(errors="ignore").encode()  # no half characters
-    return begin + b"~" + hashlib.sha256(name).hexdigest()[:_DIGEST].encode()
+    begin = name[: size - _DIGEST_DIGITS - 1].decode(errors="ignore").encode()  # no partial characters
+    return begin + b"~" + hashlib.sha256(name).hexdigest()[:_DIGEST_DIGITS].encode()
 
 
 @cache
@@ -282,15 +282,15 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
     fields = scenario_fields(capacity)
     offsets, end = [], 0
-    for form in fields.values():
+    for field_type in fields.values():
         offsets.append(-(-end // 64) * 64)
-        end = offsets[-1] + np.dtype(form).itemsize
+        end = offsets[-1] + np.dtype(field_type).itemsize
     names, formats, itemsize = list(fields), list(fields.values()), -(-end // 4096) * 4096
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
 
 
 def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) -> np.ndarray[Any, Any]:
-    """Stack a field of some records, or the same part of it, along a new first axis."""
+    """Stack a field of records, or the same part of that field, along a new first axis."""
     values = [record[name][part] for record in records]
     if not values[0].ndim:
         return np.array(values)
@@ -336,7 +336,7 @@ class Scenario:
     names: dict[str, str] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
-        # Copying and unpickling ask before the fields of the class are set, so ``record`` would recurse.
+        # Copying and unpickling look up attributes before fields are set, so reading ``record`` would recurse.
         if name.startswith("__") or name in _OWN_FIELDS:
             raise AttributeError(name)
         try:
@@ -360,7 +360,7 @@ class Scenario:
 
     @property
     def has_stop(self) -> Bool[np.ndarray, " sign"]:
-        """Slots of stop signs that are in use: others have no lane and lie at the origin."""
+        """Mask of the slots of stop signs that are in use: unused slots have no lane and lie at the origin."""
         return (self.stop_xy != 0).any(axis=1) | (self.stop_lane >= 0).any(axis=1)
 
 

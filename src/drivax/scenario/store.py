@@ -7,7 +7,7 @@ A set is a folder::
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     seal.json            SHA-256 of the manifest (``drivax.seal``)
     splits/              optional: lists for training, validation and test (``scenario.select.splits``)
-    scores.npz           optional: criticality scores by which they were selected (``curation.subset``)
+    scores.npz           optional: criticality scores by which scenarios were selected (``curation.subset``)
 
 ``numpy.load(path, mmap_mode="r")`` reads a shard; a record lies at a fixed offset, so a scenario is one range read. A
 set appears under its name only when it is complete. This module needs no JAX.
@@ -65,11 +65,11 @@ MANIFEST = "manifest.json"
 AGAIN = "convert or generate the set again"
 #: Bytes at the beginning of a record that hold its names.
 _PAGE = 4096
-#: Bytes of the largest manifest that is read, of some 500,000 scenarios; sparse shards may claim any size.
+#: Bytes of the largest manifest that is read (some 500,000 scenarios); sparse shards may claim any size.
 _MOST_MANIFEST = 1 << 30
 #: Scenarios that an iteration reads at a time, and that a thread reads in one task.
 _BATCH, _PART = 64, 8
-#: Threads map a shard once.
+#: Held while a shard is mapped, so that threads map it only once.
 _MAP_LOCK = threading.Lock()
 #: Types of the values of a manifest entry.
 _ENTRY = {**dict.fromkeys(NAMES, str), "flags": list, "overflow": dict, "audit": dict, "tags": dict}
@@ -77,7 +77,7 @@ _Bytes = np.ndarray[Any, Any]
 
 
 def check_set_space(path: str | Path, capacity: Capacity, scenarios: int) -> None:
-    """Raise a DataError if the disk has no space for a set of some scenarios."""
+    """Raise a DataError if the disk has no space for a set of that many scenarios."""
     check_space(Path(path), scenarios * record_dtype(capacity).itemsize)
 
 
@@ -125,13 +125,13 @@ class ScenarioWriter:
     def __enter__(self) -> Self:
         check_set_space(self.path, self.capacity, 1)
         with explain_full_disk(self.path):
-            parts = self._partial.open(restart=self.overwrite)
-        for part in parts:
-            if not self._is_finished(part):  # It and all that follow are written again.
+            summaries = self._partial.open(restart=self.overwrite)
+        for summary in summaries:
+            if not self._is_finished(summary):  # This shard and all later ones are written again.
                 break
-            self._shards.append(part["shard"])
-            self._entries += part["scenarios"]
-            self.notes.append(part.get("note"))
+            self._shards.append(summary["shard"])
+            self._entries += summary["scenarios"]
+            self.notes.append(summary.get("note"))
         self._known = {_key(entry) for entry in self._entries}
         names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
         for entry in self._partial.content.iterdir():  # Remove unfinished shards and files.
@@ -139,10 +139,10 @@ class ScenarioWriter:
                 remove(entry)
         return self
 
-    def _is_finished(self, part: Mapping[str, Any]) -> bool:
-        """Whether a closed shard is as it was written, and full; a last one of fewer records is written again."""
+    def _is_finished(self, summary: Mapping[str, Any]) -> bool:
+        """Return whether a closed shard is undamaged and full; a last shard of fewer records is written again."""
         with contextlib.suppress(DataError, *DAMAGE):
-            shard, entries = part["shard"], part["scenarios"]
+            shard, entries = summary["shard"], summary["scenarios"]
             _check_entries([*self._shards, shard], entries)
             if shard["count"] == len(entries) == self._shard_size:
                 Shard(self._partial.content, shard, self._buffer.dtype, entries).check_digest()
@@ -245,7 +245,7 @@ class ScenarioWriter:
         seal(self._partial.content, MANIFEST)
         if self._further is not None:
             self._further(self._partial.content)
-        self._refuse_existing()  # Another process may have written it in the meantime.
+        self._refuse_existing()  # Another process may have written the set in the meantime.
         self._partial.publish()
 
     def _refuse_existing(self) -> None:
@@ -293,7 +293,7 @@ class ScenarioSet(Sequence[Scenario]):
             raise DataError(problem, file=result.path / MANIFEST, cure=AGAIN)
         for shard in result._shards:
             shard.check_files()
-        allow_open_files(result.path, len(result._shards))  # each memory map is one
+        allow_open_files(result.path, len(result._shards))  # each memory map keeps a file open
         return result
 
     def __len__(self) -> int:
@@ -304,13 +304,13 @@ class ScenarioSet(Sequence[Scenario]):
             yield from self[first : first + _BATCH]
 
     def take(self, indices: Iterable[int]) -> list[Scenario]:
-        """Return scenarios; threads test the checksums of those that were not read before."""
+        """Return scenarios by index; threads test the checksums of those that were not read before."""
         numbers = list(indices)
         if not self.verify:
             return [self[number] for number in numbers]
-        parts = [numbers[first : first + _PART] for first in range(0, len(numbers), _PART)]
+        tasks = [numbers[first : first + _PART] for first in range(0, len(numbers), _PART)]
         with ThreadPoolExecutor() as pool:  # zlib releases the lock of the interpreter
-            return list(chain.from_iterable(pool.map(lambda part: [self[number] for number in part], parts)))
+            return list(chain.from_iterable(pool.map(lambda task: [self[number] for number in task], tasks)))
 
     def __getitem__(self, index: Any) -> Any:
         """Return a scenario (a view of the file), or a list for a slice."""
@@ -321,25 +321,25 @@ class ScenarioSet(Sequence[Scenario]):
         number = int(index) % len(self)
         entry = self.entries[number]
         shard = int(np.searchsorted(self._starts, number, side="right")) - 1
-        record = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
-        findings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
-        fields = record.view(self._dtype).reshape(())
+        data = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
+        mappings = {name: dict(entry[name]) for name in ("overflow", "audit", "tags")}
+        record = data.view(self._dtype).reshape(())
         names = {name: str(entry[name]) for name in NAMES}
-        return Scenario(fields, self.capacity, SourceCounts(**entry["source"]), **findings, names=names)
+        return Scenario(record, self.capacity, SourceCounts(**entry["source"]), **mappings, names=names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) over those of the shards; it does not cover the entries of the manifest (tags, audit)."""
+        """SHA-256 (hex) of the digests of all shards; it does not cover the entries of the manifest (tags, audit)."""
         digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
         return hashlib.sha256(digests.encode()).hexdigest()
 
     def records(self, indices: Any, out: _Bytes | None = None) -> _Bytes:
         """Copy records into a structured array ``[n]``, in the order of ``indices``; negative ones count from the end.
 
-        ``out`` is the result of an earlier call with as many indices, to fill again: twice as fast as new memory.
+        ``out`` is the result of an earlier call with as many indices; filling it again is twice as fast as new memory.
         """
         index = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
@@ -353,7 +353,7 @@ class ScenarioSet(Sequence[Scenario]):
             raise UsageError(problem, file=self.path, cure="leave it out")
         data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
         shards = np.searchsorted(self._starts, index, side="right") - 1
-        # A contiguous copy right after the test that brought the record into the cache; np.take is slower.
+        # Copy each record right after the test that brought it into the cache; np.take is slower.
         for row, (shard, number) in enumerate(zip(shards.tolist(), index.tolist(), strict=True)):
             data[row] = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         return out
@@ -371,7 +371,7 @@ class ScenarioSet(Sequence[Scenario]):
 
 
 def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
-    """Refuse sets for one command whose scenarios have room for different numbers of steps."""
+    """Refuse sets whose scenarios have room for different numbers of steps."""
     for other in others:
         if other.capacity.steps != first.capacity.steps:
             problem = f"has scenarios of {other.capacity.steps} steps, {first.path} of {first.capacity.steps}"
@@ -401,7 +401,7 @@ class Shard:
             if not path.is_file():
                 raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
         if self.crc_path.stat().st_size > _PAGE + 4 * self.count:  # A header is shorter than a page.
-            raise self._other_checksums()
+            raise self._checksum_file_error()
         self._check_file("crc_sha256")
         with self.path.open("rb") as file:
             shape, dtype = read_header(file, self.path)
@@ -417,9 +417,9 @@ class Shard:
             raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
         size = self.path.stat().st_size
         if size != offset + self.count * self._dtype.itemsize:
-            whole = max(0, size - offset) // self._dtype.itemsize
-            problem = f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}"
-            raise self._damage(problem, min(whole, self.count))
+            records = max(0, size - offset) // self._dtype.itemsize
+            problem = f"shard is truncated or has trailing bytes: {records} whole records of {self.count}"
+            raise self._damage_error(problem, min(records, self.count))
 
     def _check_names(self, row: int, data: _Bytes) -> None:
         """Compare the names at the beginning of a record with its entry in the manifest."""
@@ -429,14 +429,14 @@ class Shard:
             expected = str(self._scenarios[row][name])
             if data[begin : begin + size].tobytes().rstrip(b"\0") != stored_name(expected, size):
                 problem = f"{name} is not {expected!r}, that of the manifest: half copied, or another shard"
-                raise self._damage(problem, row)
+                raise self._damage_error(problem, row)
 
     def record(self, row: int, verify: bool) -> _Bytes:
         """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
         data = self._map() if self._data is None else self._data
         if verify and not self._intact[row]:
             if zlib.crc32(data[row].data) != int(self._crcs[row]):
-                raise self._damage("checksum mismatch, the record is damaged", row)
+                raise self._damage_error("checksum mismatch, the record is damaged", row)
             self._check_names(row, data[row])
             self._intact[row] = True
         return data[row]
@@ -447,7 +447,7 @@ class Shard:
         self._check_file("sha256")
 
     def _check_file(self, key: str) -> None:
-        """Compare a file's SHA-256 with the manifest's; sets of earlier versions have none of checksum files."""
+        """Compare a file's SHA-256 with the manifest's; sets of earlier versions have none for checksum files."""
         path = self.crc_path if key == "crc_sha256" else self.path
         if self._entry.get(key) not in (None, file_digest(path)):
             problem = "SHA-256 differs from the manifest's: damaged, or of another set"
@@ -463,7 +463,7 @@ class Shard:
             shape, dtype = read_header(file, self.crc_path)
             crcs = file.read()
         if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
-            raise self._other_checksums()
+            raise self._checksum_file_error()
         self._crcs = np.frombuffer(crcs, np.uint32)
         # A plain view: indexing a memmap costs Python time. Set last, since several threads may read.
         self._data = np.asarray(
@@ -471,10 +471,10 @@ class Shard:
         )
         return self._data
 
-    def _other_checksums(self) -> DataError:
+    def _checksum_file_error(self) -> DataError:
         return DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
 
-    def _damage(self, problem: str, record: int) -> DataError:
+    def _damage_error(self, problem: str, record: int) -> DataError:
         return DataError(problem, file=self.path, record=record, cure=f"copy the file again or {AGAIN}")
 
 
@@ -521,9 +521,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
         manifest = parse_json(text)
         version = manifest["schema_version"]
     if version != SCHEMA_VERSION:
-        newer = isinstance(version, int) and version > SCHEMA_VERSION
+        is_newer = isinstance(version, int) and version > SCHEMA_VERSION
         problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
-        raise DataError(problem, file=file, cure="upgrade drivax" if newer else AGAIN)
+        raise DataError(problem, file=file, cure="upgrade drivax" if is_newer else AGAIN)
     with explain_damage(file, AGAIN, "manifest is damaged"):
         _check_manifest(manifest, file)
         is_sealed = any("crc_sha256" in shard for shard in manifest["shards"])
@@ -533,8 +533,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _size_on_disk(manifest: os.stat_result, shards: Sequence[os.stat_result]) -> int:
-    """Return the bytes that shards take on the disk: those of a sparse file take no space."""
-    # Some network disks state no blocks, not even for the manifest.
+    """Return the bytes that shards take on the disk: holes of sparse files take none."""
+    # Some network disks report no blocks, not even for the manifest: use the sizes of files there.
     return sum(shard.st_blocks * 512 if manifest.st_blocks else shard.st_size for shard in shards)
 
 

@@ -4,10 +4,9 @@ A configuration record holds scalars, strings, literals, paths, tuples, mappings
 which carry a ``kind`` key in YAML (:func:`kind_of`), and objects of the user by ``package.module:name``. Missing keys
 keep the defaults of the enclosing record. In a record with presets (a class method ``preset(name)``), the key
 ``preset`` names the preset to start from. A file may extend a preset (``extends: ppo``) or a file relative to it
-(``extends: base.yaml``): its settings are merged over those of the other. No file shadows a preset: a file without a
-suffix is ``./NAME``. An unknown key or a value of the wrong type
-is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. A class variable ``renamed``
-maps former keys to present ones.
+(``extends: base.yaml``): its settings are merged over those of the other. No file shadows a preset: write ``./NAME``
+for a file without a suffix. An unknown key or a value of the wrong type is a :class:`~drivax.errors.UsageError` with
+the dotted path and the closest valid name. A class variable ``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ def load(
         source: The name of a preset, a YAML file (text is one if :func:`is_path`), or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
             count as underscores. A ``kind`` other than that in ``source`` discards the settings of its section.
-        trust: None for a source that the user wrote. Otherwise it is data, as of a run: its names lead only to drivax
-            and to these modules, and it extends no other file.
+        trust: None for a source that the user wrote. Otherwise the source is data, such as the configuration of a
+            run: it may name code of drivax and of these modules only, and extends no other file.
 
     Raises:
         UsageError: File or preset not found, invalid YAML, a cycle, unknown key, a value of the wrong type, or a name
@@ -95,7 +94,7 @@ def _configs() -> Path:
 
 
 def _find_file(source: str | Path) -> Path:
-    """Return the file of the preset of this name, or else that at a path."""
+    """Return the file of a preset if ``source`` is its name, else the file at the path ``source``."""
     if isinstance(source, str) and (source in presets() or not is_path(source)):
         return preset(source)
     path = Path(source)
@@ -116,7 +115,7 @@ def _read_settings(
     """Return the settings of a file, merged over those of the file that it ``extends``.
 
     ``extended_by`` has the files that extend this one, outermost first. Without ``follow_extends``, ``extends`` is a
-    setting as any other.
+    setting like any other.
     """
     try:
         values = parse_yaml(read_text(file, "name a YAML file"), file)
@@ -146,7 +145,7 @@ def _find_base(file: Path, name: Any) -> Path:
 
 
 def _merge(base: Any, values: Any) -> Any:
-    """Return settings merged over others by key; a section that names another kind or preset replaces the other."""
+    """Merge ``values`` over ``base`` by key; a section with another kind or preset replaces that of ``base``."""
     if not isinstance(values, dict):
         return values
     base = _section(base)
@@ -156,7 +155,7 @@ def _merge(base: Any, values: Any) -> Any:
 
 
 def _section(value: Any) -> dict[str, Any]:
-    """Return a setting as a section: a mapping as it is, a name as that of its kind, others as an empty section."""
+    """Return a setting as a section: a mapping unchanged, a name as its ``kind``, other values as an empty section."""
     content = parse_yaml(value) if isinstance(value, Flag) else value
     if isinstance(content, str):
         return {NameAlone("kind"): type(value)(content)}
@@ -197,7 +196,7 @@ def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_names(values: Any, trust: Collection[str], file: Path | None = None) -> None:
-    """Check the dotted names in plain values of a file before one of them is imported; those in flags are trusted.
+    """Check the dotted names in plain values of a file before any of them is imported; those in flags are trusted.
 
     Raises:
         UsageError: A name leads to a module that is not trusted, or to something that is no component.

@@ -26,9 +26,9 @@ from drivax.plugins import check_arguments, check_protocol, dotted_name, find_na
 from drivax.reading import DAMAGE
 
 _UNIONS = (Union, types.UnionType)
-#: Largest YAML text, its deepest value, and its values with aliases in full.
+#: Largest numbers of characters, nested levels and values (aliases expanded) of a YAML text.
 _MOST_CHARACTERS, _MOST_LEVELS, _MOST_VALUES = 1 << 20, 64, 50_000
-#: Accepted types of values by scalar type, and its name in messages.
+#: Accepted types of values for each scalar type, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
     int: (int, "an integer"),
@@ -104,7 +104,7 @@ def _to_scalar(value: Any, cls: Any) -> Any:
     """Convert to a boolean, number or null; integers may be written as floats, floats as integers."""
     result = _parse_flag(value)
     if cls is int and isinstance(result, float) and result.is_integer():
-        result = int(result)  # steps: 25e6
+        result = int(result)  # such as steps: 25e6
     accepts, name = _SCALARS[cls]
     if isinstance(result, bool) != (cls is bool) or not isinstance(result, accepts):
         raise _refusal(value, name)
@@ -122,7 +122,7 @@ def _to_path(value: Any, _: Any) -> Path:
 
 
 def _to_literal(value: Any, cls: Any) -> Any:
-    """Return the option that equals a value; for a flag its text, or else what YAML reads in it."""
+    """Return the option that equals a value; a flag is compared as text, then as the YAML value of its text."""
     options = get_args(cls)
     for candidate in (value, _parse_flag(value)):
         for literal in options:
@@ -130,8 +130,8 @@ def _to_literal(value: Any, cls: Any) -> Any:
                 return literal
     names = [str(option) for option in options]
     quotes = "without quotes" if isinstance(value, str) else "in quotes"
-    near = f"write it {quotes}" if str(value) in names else did_you_mean(str(value), names)
-    raise _Problem(f"{str(value)!r} is not one of {', '.join(map(str, options))}", cure=near)
+    cure = f"write it {quotes}" if str(value) in names else did_you_mean(str(value), names)
+    raise _Problem(f"{str(value)!r} is not one of {', '.join(map(str, options))}", cure=cure)
 
 
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
@@ -150,13 +150,13 @@ def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
 
 
 def _to_mapping(value: Any, cls: Any) -> dict[str, Any]:
-    """Convert to a mapping from text to the values of its type."""
+    """Convert to a mapping from text to values of its item type."""
     items = _parse_flag(value)
     if not isinstance(items, Mapping):
         raise _refusal(value, "a mapping")
     item_type = get_args(cls)[1]
-    own_items = {name: item for name, item in items.items() if not isinstance(name, NameAlone)}
-    return {name: _to_item(item, item_type, str(name)) for name, item in own_items.items()}
+    entries = {name: item for name, item in items.items() if not isinstance(name, NameAlone)}
+    return {name: _to_item(item, item_type, str(name)) for name, item in entries.items()}
 
 
 def _to_item(value: Any, cls: Any, place: str) -> Any:
@@ -171,7 +171,7 @@ def _to_union(value: Any, cls: Any) -> Any:
     """Convert to a user-defined object, to a record by its kind, or to the first other type that fits."""
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
-    # A flag may hold a section, {kind: ...}. Without records its type decides, so that text stays text.
+    # A flag may hold a section, {kind: ...}. Without records, leave it to the members, so that text stays text.
     value = _parse_flag(value) if isinstance(value, Flag) and records else value
     for member in members:
         if _accepts_user_objects(member) and is_dotted(_kind(value)):
@@ -433,7 +433,7 @@ class _Loader(yaml.SafeLoader):
 
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)
-        #: Current depth, number of values with aliases in full, and that number within each value.
+        #: Current depth, number of values (aliases expanded), and that number within each node by its id.
         self._depth, self._count, self._counts = 0, 0, dict[int, int]()
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -478,7 +478,7 @@ class _Dumper(yaml.SafeDumper):
 
 _NUMBER = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
 _FLOAT = rf"^(?:{_NUMBER}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-#: Tag, pattern and possible first characters of the scalars that are no strings.
+#: Tag, pattern and possible first characters of scalars that are not strings.
 _RULES = (
     ("tag:yaml.org,2002:bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
     ("tag:yaml.org,2002:int", r"^[-+]?[0-9][0-9_]*$", "-+0123456789"),

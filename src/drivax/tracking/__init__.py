@@ -1,7 +1,7 @@
 """Run folders, checkpoints, metric logs, progress and worker processes.
 
 ``run_folder`` writes ``run.json`` and ``config.yaml``, ``sinks`` writes ``metrics.jsonl``; :mod:`drivax.files` replaces
-outputs, and :mod:`drivax.seal` finds edits.
+outputs, and :mod:`drivax.seal` detects edits.
 """
 
 import lazy_loader

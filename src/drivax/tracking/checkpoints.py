@@ -35,9 +35,9 @@ ABOUT = "about.json"
 #: Former names of fields of training states, in checkpoints of version 0.1.0.
 _RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
-_OTHER = "use another checkpoint, or train again"
+_RETRAIN = "use another checkpoint, or train again"
 _CHUNK_BYTES = 1 << 24
-#: Most bytes of a checkpoint's file for each number that its arrays hold (keys hold several words), and besides.
+#: Largest file of a checkpoint: bytes for each number in its arrays (a key has several words), and for all else.
 _MOST_ITEM_BYTES, _MOST_OTHER_BYTES = 32, 1 << 24
 #: Threads of Orbax end within this time after a failure (s).
 _LATE_S = 2.0
@@ -58,7 +58,7 @@ class Checkpoints:
     def steps(self) -> list[int]:
         """Return the steps of all complete checkpoints, ascending."""
         names = (
-            path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_own_folder(path)
+            path.name.removeprefix("step-") for path in self.folder.glob("step-*") if _is_real_folder(path)
         )
         return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):09d}")
 
@@ -79,7 +79,7 @@ class Checkpoints:
         """Return the content of ``about.json`` of a checkpoint.
 
         It has ``step``, ``score`` (None without one), ``leaves`` with their current names, and ``files`` with their
-        checksums (not in checkpoints of former versions).
+        checksums (absent in checkpoints of former versions).
 
         Raises:
             DataError: The checkpoint is missing, damaged or edited.
@@ -88,8 +88,8 @@ class Checkpoints:
         if not path.is_dir():
             cure = f"available steps: {available or 'none'}"
             raise DataError(f"no checkpoint of step {step}", file=self.folder, cure=cure)
-        about = read_json(path / ABOUT, _OTHER)
-        with explain_damage(path / ABOUT, _OTHER):
+        about = read_json(path / ABOUT, _RETRAIN)
+        with explain_damage(path / ABOUT, _RETRAIN):
             crc = about.pop("crc", None)
             if (crc is not None or "files" in about) and crc != _checksum(about):
                 raise ValueError("checksum mismatch")
@@ -107,35 +107,35 @@ class Checkpoints:
         return path
 
     def write(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
-        """Store a pytree of numbers and JAX or NumPy arrays, and return the folder, which is on disk.
+        """Store a pytree of numbers and JAX or NumPy arrays, and return its folder once it is on disk.
 
         Higher scores are better; sequences are compared lexicographically. A score with a NaN counts as none.
         """
         arrays, leaves = _describe(state)
         score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
-        final = self._path(step)
+        folder = self._path(step)
         size_bytes = sum(array.nbytes for array in arrays.values())
-        with replace_folder(final, size_bytes) as partial:
+        with replace_folder(folder, size_bytes) as partial:
             if arrays:
                 _save_arrays(partial / _ARRAYS, arrays)
             about = {"step": step, "score": score, "leaves": leaves, "files": _sync(partial)}
             write_text(partial / ABOUT, json.dumps({**about, "crc": _checksum(about)}, indent=1))
         sync_folder(self.folder.parent)
-        return final
+        return folder
 
     def delete_superseded(self) -> None:
-        """Delete all but the checkpoints to keep; damaged ones have no score."""
+        """Delete all but the checkpoints to keep; a damaged checkpoint counts as one without a score."""
         steps, scores = self.steps(), dict[int, Any]()
         for step in steps:
             with contextlib.suppress(DataError):
                 scores[step] = self.about(step)["score"]
-        current = {*steps[-self.keep :], *([_best(scores)] if self.keep_best else [])}
+        kept_steps = {*steps[-self.keep :], *([_best(scores)] if self.keep_best else [])}
         for step in steps:
-            if step not in current:
+            if step not in kept_steps:
                 self._delete(step)
 
     def drop_after(self, step: int) -> None:
-        """Delete what an interrupted run left: checkpoints of later steps and hidden folders; delete links, too."""
+        """Delete what an interrupted run left: checkpoints after ``step`` and hidden folders; delete links, too."""
         for other in self.steps():
             if other > step:
                 self._delete(other)
@@ -193,8 +193,8 @@ class Checkpoints:
         remove(hidden_folder)
 
 
-def _is_own_folder(path: Path) -> bool:
-    """Return whether a path is a folder, not a link by which a stranger's run could write or delete anywhere."""
+def _is_real_folder(path: Path) -> bool:
+    """Return whether a path is a folder, not a link by which an untrusted run could write or delete anywhere."""
     return path.is_dir() and not path.is_symlink()
 
 
@@ -205,13 +205,13 @@ def _best(scores: Mapping[int, Any]) -> int | None:
 
 
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
-    """Return whether a leaf belongs to one of the parts of a state, all by name (``.critics`` not to ``.critic``)."""
+    """Return whether the name of a leaf lies in one of the parts of a state (``.critics`` not in ``.critic``)."""
     # A part ends where the leaf does, or before an attribute or index.
     return any(leaf.startswith(part) and (leaf + ".")[len(part)] in ".[" for part in parts)
 
 
 def _current_name(leaf: str) -> str:
-    """Return the name of a leaf, with the current names of renamed fields."""
+    """Return the name of a leaf with the current names of renamed fields."""
     return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
 
 
@@ -220,7 +220,7 @@ def _checksum(about: Mapping[str, Any]) -> int:
 
 
 def _sync(folder: Path) -> dict[str, int]:
-    """Flush a folder with all that it contains to disk, and return the CRC-32 of each file."""
+    """Flush the contents of a folder to disk, and return the CRC-32 of each file by its relative path."""
     checksums = {}
     for path in sorted(folder.rglob("*")):
         if path.is_dir():
@@ -262,12 +262,12 @@ def _check_files(path: Path, checksums: Mapping[str, int], most: int) -> None:
         inside(path, *name.parts)
     files = {name.as_posix(): entry for name, entry in entries.items() if not entry.is_dir()}
     for file in files.values():
-        check_regular(file, _OTHER)
+        check_regular(file, _RETRAIN)
     for name, expected in checksums.items():
-        with explain_damage(path / name, _OTHER):
-            if name not in files:  # A stranger's checkpoint may name files outside.
+        with explain_damage(path / name, _RETRAIN):
+            if name not in files:  # An untrusted checkpoint may name files outside.
                 raise FileNotFoundError
-            check_size(files[name], _OTHER, most)
+            check_size(files[name], _RETRAIN, most)
             with files[name].open("rb") as file:
                 crc = _file_crc(file)
             if crc != expected:
@@ -275,7 +275,7 @@ def _check_files(path: Path, checksums: Mapping[str, int], most: int) -> None:
 
 
 def pack(file: Path, tree: Any) -> None:
-    """Write a pytree of arrays atomically to an ``.npz`` file, which NumPy alone can read."""
+    """Write a pytree of arrays atomically to an ``.npz`` file, which can be read with NumPy alone."""
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
     with atomic_write(file, sum(array.nbytes for array in arrays.values())) as out:
         np.savez(out, **arrays)
@@ -313,7 +313,7 @@ def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[st
     arrays, leaves = {}, []
     for number, (name, leaf) in enumerate(_named_leaves(state)):
         array = np.asarray(_to_numpy(leaf), order="C")
-        # A key is stored as an array of other type and shape.
+        # A random key is stored as an array of another type and shape.
         array_type, crc = [str(array.dtype), list(array.shape)], zlib.crc32(array.tobytes())
         shape = list(np.shape(leaf))
         leaves.append(
@@ -329,7 +329,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _to_numpy(leaf: Any) -> np.ndarray[Any, Any]:
-    """Return a leaf as an array; that of a key holds its data."""
+    """Return a leaf as an array; for a random key, its data."""
     array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
     if array.dtype == object or array.dtype.kind in "US":
         raise TypeError(f"a {type(leaf).__name__} cannot be stored in a checkpoint")
@@ -365,19 +365,19 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 
 @contextlib.contextmanager
 def _silence_writers() -> Iterator[None]:
-    """Raise the first error of a write alone: Orbax and asyncio log it too, and TensorStore prints each array's."""
-    loggers, report = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
+    """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's."""
+    loggers, report_hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
     levels = [logger.level for logger in loggers]
 
-    def report_other(lost: sys.UnraisableHookArgs) -> None:
-        if str(lost.exc_value) != "Event loop is closed":
-            report(lost)
+    def report_other(unraisable: sys.UnraisableHookArgs) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            report_hook(unraisable)
 
     def restore() -> None:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
         if sys.unraisablehook is report_other:
-            sys.unraisablehook = report
+            sys.unraisablehook = report_hook
 
     for logger in loggers:
         logger.setLevel(logging.CRITICAL)
@@ -385,7 +385,7 @@ def _silence_writers() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # Threads of Orbax still run, and fail.
+        # Threads of Orbax still run and fail, so restore later.
         timer = threading.Timer(_LATE_S, restore)
         timer.daemon = True
         timer.start()
@@ -398,7 +398,7 @@ def _load_arrays(
 ) -> dict[str, np.ndarray[Any, Any]]:
     """Read the arrays of the template's leaves by name, and verify their checksums.
 
-    Memory depends only on the template, since a stranger's checkpoint may state any size.
+    Memory depends only on the template, since an untrusted checkpoint may state any size.
     """
     import orbax.checkpoint as ocp
 
@@ -415,11 +415,11 @@ def _load_arrays(
                 request = ocp.args.PyTreeRestore(nonempty, types, partial_restore=True)
                 restored_arrays = checkpointer.restore(folder, args=request)
     except Exception as error:
-        raise DataError(f"arrays cannot be read ({error})", file=path, cure=_OTHER) from error
+        raise DataError(f"arrays cannot be read ({error})", file=path, cure=_RETRAIN) from error
     arrays = {name: np.asarray(restored_arrays.get(numbers[name], array)) for name, array in arrays.items()}
     for leaf in leaves:
         if (name := leaf["name"]) in arrays and zlib.crc32(arrays[name].tobytes()) != leaf["crc"]:
-            raise DataError(f"checksum mismatch in {name}", file=path, cure=_OTHER)
+            raise DataError(f"checksum mismatch in {name}", file=path, cure=_RETRAIN)
     return arrays
 
 

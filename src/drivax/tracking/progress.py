@@ -21,7 +21,7 @@ class Progress:
         work: Name of the work ("converting").
         unit: Counted unit ("scenarios").
         total: Final count; None if unknown.
-        done: Count that earlier runs have done, which is no part of the rate.
+        done: Count that earlier runs reached, which does not enter the rate.
         stream: Text file to write to; standard error by default, so that standard output contains only results.
         interval_s: Seconds between two lines if ``stream`` is not a terminal.
         clock: Returns the time in seconds.
@@ -52,7 +52,7 @@ class Progress:
             self._print(self.summary())
 
     def update(self, done: int, note: str = "", total: int | None = None) -> None:
-        """Report the count so far, followed by a note."""
+        """Report the count so far, followed by a note; ``total`` replaces the final count."""
         self.done = done
         self.total = self.total if total is None else total
         if self._bar is not None:
@@ -83,8 +83,8 @@ class Progress:
 
     def summary(self) -> str:
         """Return count, duration and rate as one line."""
-        text, rate = duration(self._clock() - self._start), _format_number(self.rate())
-        return f"{self.work}: {self.done:,} {self.unit} in {text}, {rate}/s"
+        elapsed, rate = duration(self._clock() - self._start), _format_number(self.rate())
+        return f"{self.work}: {self.done:,} {self.unit} in {elapsed}, {rate}/s"
 
     def _print(self, text: str) -> None:
         self._stream.write(text + "\n")

@@ -48,7 +48,7 @@ _ENTRIES: dict[str, Any] = {
 _TRAINING_KINDS = ("training", "seeds")
 #: Kinds of runs whose data sets have hashes; tables of other programs may lack them.
 _HASHED_KINDS = (*_TRAINING_KINDS, "policy", "study")
-#: Far more seeds than a device trains; resuming creates a folder for each.
+#: Largest number of seeds that is read, far more than a device trains; resuming creates a folder for each.
 _MOST_SEEDS = 10_000
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
@@ -139,17 +139,17 @@ class RunFolder:
 
     @property
     def is_sealed(self) -> bool:
-        """Whether drivax sealed the folder; versions before seals, and other programs, do not say so."""
+        """Whether drivax sealed the folder, by its ``run.json``; earlier versions and other programs did not."""
         return self.info.get("sealed", False)
 
     def config(self, cls: type[Record], overrides: Sequence[str] = (), trust: Collection[str] = ()) -> Record:
         """Return the run's configuration as a record, with overrides as on a command line.
 
-        ``trust`` are the modules outside drivax whose code it may name.
+        ``trust`` are the modules outside drivax whose code the configuration may name.
 
         Raises:
             DataError: ``config.yaml`` is missing or edited.
-            UsageError: It does not match ``cls``, or names code that is not trusted.
+            UsageError: The configuration does not match ``cls``, or names code that is not trusted.
         """
         file = require_file(self.path / CONFIG_FILE, _RERUN)
         return settings.load(cls, file, overrides, trust=trust)
@@ -195,7 +195,7 @@ class RunFolder:
         return list(rows)
 
     def metric_rows(self) -> Iterator[dict[str, Any]]:
-        """Yield the rows of ``metrics.jsonl``, of which one at a time is in memory.
+        """Yield the rows of ``metrics.jsonl``; only one row at a time is in memory.
 
         Raises:
             DataError: The file is missing, or a row is damaged.
@@ -261,7 +261,7 @@ def seed_folders(path: str | Path) -> list[Path]:
     folders = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
     seeds = {f: int(match[1]) for f in folders if (match := re.fullmatch(r"seed-(-?\d+)", f.name))}
     if not seeds:
-        # As a training that was killed at its start leaves it.
+        # A training run that was killed at its start leaves such a folder.
         cure = "continue the training with --resume"
         raise DataError("no folder seed-N in a run of several seeds", file=path, cure=cure)
     return sorted(seeds, key=seeds.__getitem__)
@@ -280,8 +280,8 @@ def run_and_step(name: str) -> tuple[str, int | None]:
     Raises:
         UsageError: The step is not a number.
     """
-    run, at, step = name.rpartition("@")
-    if not at or "/" in step or Path(name).is_dir():
+    run, separator, step = name.rpartition("@")
+    if not separator or "/" in step or Path(name).is_dir():
         return name, None
     if step.isdecimal():
         return run, int(step)
@@ -377,9 +377,9 @@ def machine() -> dict[str, Any]:
 def kernels_difference(info: Mapping[str, Any]) -> str | None:
     """Return which native kernels a run and this process use, given its ``run.json``; None if they are the same."""
     machine = info.get("machine")
-    noted = machine.get("kernels", "none") if isinstance(machine, dict) else "none"
+    run_state = machine.get("kernels", "none") if isinstance(machine, dict) else "none"
     before, now = (
-        "none" if str(state).startswith("none") else str(state) for state in (noted, kernels.state())
+        "none" if str(state).startswith("none") else str(state) for state in (run_state, kernels.state())
     )
     return f"the run used native kernels {before}, this process {now}" if before != now else None
 

@@ -40,7 +40,7 @@ class JsonLines:
                     if row["step"] <= resume_step:
                         out.write(f"{json.dumps(row)}\n".encode())
         else:
-            remove(self.path)  # perhaps a link or a pipe
+            remove(self.path)  # it may be a link or a pipe
         self._file = self.path.open("wb" if resume_step is None else "ab")
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
@@ -56,7 +56,7 @@ class JsonLines:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Flush to disk."""
+        """Flush the file to disk and close it."""
         if not self._file.closed:
             sync_and_close(self._file)
 
@@ -64,7 +64,7 @@ class JsonLines:
 class TensorBoard:
     """TensorBoard events in the format of tensorboardX (extra ``track``), without those after ``resume_step``.
 
-    Its ``SummaryWriter`` writes in a thread, which prints the errors of the disk instead of raising them.
+    ``SummaryWriter`` is not used: it writes in a thread that prints disk errors instead of raising them.
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:
@@ -76,9 +76,9 @@ class TensorBoard:
         self._file = EventsWriter(str(folder / "events"))
         self._next_flush = 0.0
         # TensorBoard drops the events of earlier processes from this step on.
-        first = 0 if resume_step is None else resume_step + 1
+        first_step = 0 if resume_step is None else resume_step + 1
         start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
-        self._file.write_event(self._event(wall_time=time.time(), step=first, session_log=start))
+        self._file.write_event(self._event(wall_time=time.time(), step=first_step, session_log=start))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Add a scalar for each value."""
@@ -89,12 +89,12 @@ class TensorBoard:
             self._next_flush = time.monotonic() + _FLUSH_S
 
     def close(self) -> None:
-        """Flush to disk."""
+        """Flush the file and close it."""
         self._file.close()
 
 
 class MetricLog:
-    """Log of a run: ``metrics.jsonl`` in its folder, and TensorBoard events (None: if tensorboardX is installed).
+    """Log of a run: ``metrics.jsonl`` in its folder, and TensorBoard events (default: if tensorboardX is installed).
 
     Rows after ``resume_step`` are deleted; None starts a new log.
     """
@@ -112,7 +112,7 @@ class MetricLog:
             self.sinks.append(TensorBoard(events, resume_step))
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Log the numbers of one step."""
+        """Log the metrics of one step."""
         for sink in self.sinks:
             sink.write(step, values)
 
@@ -121,7 +121,7 @@ class MetricLog:
         self._rows.sync()
 
     def close(self) -> None:
-        """Flush to disk."""
+        """Flush and close all sinks."""
         with contextlib.ExitStack() as stack:
             for sink in self.sinks:
                 stack.callback(sink.close)
@@ -146,7 +146,7 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
             if not isinstance(row["step"], int):
                 raise ValueError("a step that is no integer")
         except DAMAGE as error:
-            if not line.endswith("\n"):  # the last one
+            if not line.endswith("\n"):  # the incomplete last row
                 return
             cure = "delete the row"
             raise DataError("not a metrics row", file=file, record=number, cure=cure) from error

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from drivax.errors import DataError, UsageError
 
-#: Errors of semaphores, which lie in /dev/shm on Linux.
+#: Errors when a semaphore cannot be created; on Linux, semaphores lie in /dev/shm.
 _NO_SHARED_MEMORY = (errno.ENOENT, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
 #: A Ctrl-C that killed a worker raises KeyboardInterrupt in its parent within this time (s).
 _INTERRUPT_S = 0.3
@@ -29,14 +29,14 @@ Result = TypeVar("Result")
 
 
 class WorkerPool(ProcessPoolExecutor):
-    """A pool whose workers are terminated, after 10 s killed, if the ``with`` block does not reach its end.
+    """A process pool that terminates its workers, and kills them after 10 s, if the ``with`` block raises.
 
     Raises:
-        DataError: At the end of the block, if a worker died in it.
+        DataError: A worker died; raised at the end of the block.
     """
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """Wait for the workers, or after an exception (a signal reaches this process alone) terminate them."""
+        """Wait for the workers, or terminate them after an exception (a signal may reach this process alone)."""
         if kind is not None:
             self._stop()
         self.shutdown()
@@ -46,19 +46,19 @@ class WorkerPool(ProcessPoolExecutor):
             raise DataError(problem, cure="use fewer --workers or --cores, or add the guard") from error
 
     def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submit a call; a worker that starts for it gets Ctrl-C only when it has set up its signals."""
+        """Submit a call; a worker that is started for it receives Ctrl-C only after it has set up its signals."""
         with _block(signal.SIGINT):
             return super().submit(*arguments, **options)
 
     def _stop(self) -> None:
-        running = list((self._processes or {}).values())
-        results: Any = self._result_queue
+        processes = list((self._processes or {}).values())
+        result_queue: Any = self._result_queue
         self.shutdown(wait=False, cancel_futures=True)
-        results._writer.close()  # else the pool's thread waits for the rest of a result that a worker began to send
-        for process in running:
+        result_queue._writer.close()  # else the pool's thread waits for the rest of a worker's unfinished result
+        for process in processes:
             process.terminate()
-        for process in running:
-            # A training only notes SIGTERM, and may then wait for a lock that a dead worker holds.
+        for process in processes:
+            # A training run only notes SIGTERM, and may then wait for a lock that a dead worker holds.
             process.join(_STOP_S)
             process.kill()
             process.join()
@@ -69,18 +69,18 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
 
     Each process is bound to one of ``cores``, if given.
     """
-    processes = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("spawn")
     core_queue: Any = None
     try:
-        # A closed terminal must not end Python's process that removes semaphores.
+        # A closed terminal must not end Python's resource tracker, the process that removes semaphores.
         with _block(signal.SIGHUP):
             resource_tracker.ensure_running()
         if cores is not None:
-            core_queue = processes.SimpleQueue()
+            core_queue = context.SimpleQueue()
             for core in cores:
                 core_queue.put(core)
-        return WorkerPool(workers, processes, initializer=_start, initargs=(core_queue,))
-    except OSError as error:  # it names no file
+        return WorkerPool(workers, context, initializer=_start, initargs=(core_queue,))
+    except OSError as error:  # has no filename, so recognise it by its errno
         if error.errno not in _NO_SHARED_MEMORY:
             raise
         problem = f"no shared memory for worker processes ({os.strerror(error.errno)})"
@@ -89,7 +89,7 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
 
 
 def available_cores() -> list[int]:
-    """Return the cores of this process; all of the machine where a system has no affinities (macOS)."""
+    """Return the CPU cores that this process may use; all cores on systems without CPU affinity (macOS)."""
     has_affinity = hasattr(os, "sched_getaffinity")
     return sorted(os.sched_getaffinity(0)) if has_affinity else list(range(os.cpu_count() or 1))
 
@@ -97,7 +97,7 @@ def available_cores() -> list[int]:
 def one_core_each(
     call: Callable[[Task], Result], tasks: Sequence[Task], cores: int | None = None
 ) -> Iterator[tuple[Task, Result]]:
-    """Call an importable function with each task in a single-core process; yield results as they finish.
+    """Call an importable function with each task in a single-core process; yield (task, result) as calls finish.
 
     Parallel tasks neither wait for each other nor affect each other's results. At most ``cores`` cores are used, by
     default all cores of this process.
@@ -125,7 +125,7 @@ def _block(number: signal.Signals) -> Iterator[None]:
 
 
 def _start(core_queue: Any) -> None:
-    """Set up a worker process: its core, if there is a queue of cores, its signals, and its end."""
+    """Set up a worker process: its core, if there is a queue of cores, its signals, and its exit with the parent."""
     if core_queue is not None and hasattr(os, "sched_setaffinity"):
         # JAX starts one thread per core, so restrict the cores first.
         os.sched_setaffinity(0, {core_queue.get()})

@@ -44,8 +44,8 @@ class EdgeRow:
 class LaneRow:
     """Rows of ``ScenarioBank.lanes``: those of :class:`EdgeRow`, half width, limit in m/s (-1 unknown), and lane index.
 
-    The limit of a connector is the highest of the lanes that it joins, if known. The index is raised by a half on lanes
-    of the corridor (the lanes of the route and their same-direction neighbours); by 2^-(k+1) for that of the k-th ego.
+    The limit of a connector is the highest of the lanes that it joins, if known. The index is raised by 2^-(k+1) on
+    lanes of the corridor of the k-th ego, from k = 0 on (the lanes of its route and their same-direction neighbours).
     """
 
     X_A, Y_A, X_B, Y_B, Z, HALF_WIDTH, LIMIT, LANE = range(8)
@@ -81,8 +81,8 @@ class RoadLayer:
 class StrandColumn:
     """Columns of ``ScenarioBank.lane_strands``; -1 for no strand, 1e6 for no point.
 
-    The strand of a lane, the strands next to it on the left and the right, the strand that its own one merges onto, and
-    the point where it does.
+    The strand of a lane, the strands next to that lane on the left and the right, the strand that its strand merges
+    onto, and the point where it does.
     """
 
     STRAND, LEFT, RIGHT, ONTO, END_X, END_Y = range(6)

@@ -37,16 +37,16 @@ LANE_MARGIN_M = 0.2
 _GOES_ON_M = 8.0
 #: Smallest cosine between the directions of a car and of the lane that it drives (30 deg), and how far a car may be
 #: beyond the ends of a segment, m.
-_FITS, _JOINT_M = 0.75**0.5, 0.5
-#: For the native kernels.
+_PARALLEL_COS, _JOINT_M = 0.75**0.5, 0.5
+#: Parameters of the native kernels.
 _LANE_RULES = {
     "cutoff_m": LANE_CUTOFF_M, "level_m": LEVEL_M, "margin_m": LANE_MARGIN_M, "goes_on_m": _GOES_ON_M,
-    "joint_m": _JOINT_M, "parallel_cos": _FITS,
+    "joint_m": _JOINT_M, "parallel_cos": _PARALLEL_COS,
 }  # fmt: skip
 _EDGE_RULES = {"cutoff_m": EDGE_CUTOFF_M, "level_m": LEVEL_M, "split": SPLIT, "not_drivable": NOT_DRIVABLE}
 #: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
-#: A car passes to another lane this far beyond the line between them; centres of parallel lanes are at least the second
+#: A car changes lanes this far beyond the line between two lanes; centres of parallel lanes are at least the second
 #: distance apart (nearer lanes fork or join); a lane is left in a merge up to the third distance before its end, m.
 BEYOND_M, SIDE_BY_SIDE_M, MERGE_M = 0.3, 2.0, 100.0
 _FAR = 1e9
@@ -57,9 +57,9 @@ _WINDOW, _WINDOW_BEHIND = 40, 6
 def left_of_edges(
     bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "P 2"], z: Scalar
 ) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:
-    """Signed distance of points to the nearest road edge, m (left, the drivable side, positive), and whether it counts.
+    """Signed distance of points to the nearest edge, m (left, the drivable side, positive), and whether it is known.
 
-    It counts if an edge of this level lies within the cut-off. At a vertex two segments are equally near; the segment
+    It is known if an edge of this level lies within the cut-off. At a vertex two segments are equally near; the segment
     whose line is further away decides. Points must lie within 5 m of ``centre``, whose cells are read.
     """
     rows, inside = edges_around(bank, index, centre)
@@ -69,7 +69,7 @@ def left_of_edges(
 def left_of_segments(
     rows: Float[Array, "5 K"], counts: Bool[Array, " K"], points: Float[Array, "P 2"]
 ) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:
-    """Return the values of :func:`left_of_edges` for the edges ``rows`` of the mask ``counts``."""
+    """Return the values of :func:`left_of_edges` for those of the edges ``rows`` that the mask ``counts`` selects."""
     squared, side = to_segments(rows, points)
     squared = jnp.where(counts, squared, _FAR)
     nearest = squared.min(axis=1)
@@ -105,15 +105,15 @@ def _around(
     # Clamped so that the 3 x 3 block lies in the grid.
     cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
     cell = jnp.clip(cell, 1, grid - 2)
-    features, inside = [], []
+    blocks, inside = [], []
     for below in (-1, 0, 1):
         first = (cell[1] + below) * grid + cell[0] - 1
         bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
         block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
-        features.append(block)
+        blocks.append(block)
         inside.append(jnp.arange(run) < bounds[3] - bounds[0])
     # Read once: without the barrier XLA repeats the reads in every operation that uses them.
-    return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
+    return jax.lax.optimization_barrier((jnp.concatenate(blocks, axis=1), jnp.concatenate(inside)))
 
 
 def to_segments(
@@ -130,7 +130,7 @@ def to_segments(
 
 
 def is_level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
-    """Whether segments are on the level of a height."""
+    """Whether segments are on the level of a height (:data:`LEVEL_M`)."""
     return jnp.abs(height - z) <= LEVEL_M
 
 
@@ -178,7 +178,7 @@ def around_lanes(
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height.
 
     Of the lanes that hold the centre and lead at most 30 degrees away from the heading, the box drives that with the
-    highest limit, lanes of the corridor of the route ``row`` before others if it is ``routed``. Without such lanes it
+    highest limit, lanes of the corridor of the route ``row`` before others if ``routed``. Without such lanes it
     drives the nearest within 30 degrees, else the nearest within 90 degrees.
     """
     if bindings.supports_grid(_lane_grid(bank), points, centre, heading, z):
@@ -199,46 +199,44 @@ def _xla_lanes(
     ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
-    own, corner = squared[0], squared[1:]
-    alongside = own - side[0] * side[0] <= _JOINT_M**2
-    parallel = alongside & (aligned_cos > _FITS)
-    fits = parallel & (own <= half * half)
+    centre_m2, corner_m2 = squared[0], squared[1:]
+    alongside = centre_m2 - side[0] * side[0] <= _JOINT_M**2
+    parallel = alongside & (aligned_cos > _PARALLEL_COS)
+    holds_centre = parallel & (centre_m2 <= half * half)
     corridor = in_corridor(bank, rows, row)
-    # By limit, on the route first; without lanes that hold the centre the nearest, parallel ones first.
+    # Lanes that hold the centre rank first, by limit, those on the route before others; then the nearest parallel lane.
     rank = jnp.where(corridor & routed, 0.0, 0.2) + 1e-3 * (100.0 - rows[LaneRow.LIMIT])
-    others = jnp.where(parallel & (own <= LANE_CUTOFF_M**2), 1.0 + own, 100.0 + own)
-    rank = jnp.where(fits, rank, jnp.where(aligned, others, _FAR))
-    # Only these lanes are read again, so that nothing else is stored for all of them.
-    numbers = jnp.stack([first_smallest(rank), first_smallest(own)])
+    fallback = jnp.where(parallel & (centre_m2 <= LANE_CUTOFF_M**2), 1.0 + centre_m2, 100.0 + centre_m2)
+    rank = jnp.where(holds_centre, rank, jnp.where(aligned, fallback, _FAR))
+    # Only these two lanes are read again, so that no more values are stored for all lanes.
+    numbers = jnp.stack([first_smallest(rank), first_smallest(centre_m2)])
     lanes = rows[:, numbers]
-    (driven, nearest), (lane_squared, lane_side) = lanes.T, to_segments(lanes, box)
-    near_driven, near = inside[numbers] & (lane_squared[0] <= LANE_CUTOFF_M**2)
-    has_lane = near_driven & _runs_along(lanes, heading)[0]
-    opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
-    friendly = jnp.where(aligned, own, _FAR).min()
+    (driven_lane, nearest_lane), (lane_m2, lane_side) = lanes.T, to_segments(lanes, box)
+    is_driven_near, is_near = inside[numbers] & (lane_m2[0] <= LANE_CUTOFF_M**2)
+    has_lane = is_driven_near & _runs_along(lanes, heading)[0]
+    opposed_m2 = jnp.where(against & (centre_m2 <= half * half), centre_m2, _FAR).min()
+    aligned_m2 = jnp.where(aligned, centre_m2, _FAR).min()
     if bank.long_ego:
         points_near, outside = jax.vmap(lambda point: _corner_lanes(bank, index, point, heading, z))(points)
     else:
         # Both flags of each corner by one reduction over one array.
-        flags = (corner <= LANE_CUTOFF_M**2) + 2 * _holds(corner, aligned, half).astype(jnp.int32)
+        flags = (corner_m2 <= LANE_CUTOFF_M**2) + 2 * _holds(corner_m2, aligned, half).astype(jnp.int32)
         flags = jax.lax.reduce(flags, jnp.int32(0), jax.lax.bitwise_or, (1,))
         points_near, outside = flags & 1 > 0, flags < 2
-    goes_on = (
-        (jnp.abs(lane_side[1:, 1]) <= LANE_CUTOFF_M)
-        | ~inside[numbers[1]]
-        | (lane_squared[0, 1] > _GOES_ON_M**2)
+    road_goes_on = (
+        (jnp.abs(lane_side[1:, 1]) <= LANE_CUTOFF_M) | ~inside[numbers[1]] | (lane_m2[0, 1] > _GOES_ON_M**2)
     )
     outside_m = jnp.where(aligned & alongside, reduce(jnp.maximum, jnp.abs(side[1:])) - half, _FAR).min()
-    outside_m = jnp.minimum(outside_m, jnp.abs(lane_side[1:, 0]).max() - driven[LaneRow.HALF_WIDTH])
+    outside_m = jnp.minimum(outside_m, jnp.abs(lane_side[1:, 0]).max() - driven_lane[LaneRow.HALF_WIDTH])
     return LaneHits(
-        near=near,
-        points_near=points_near | (_outside_box(bank, index, points, 0.0) & goes_on),
-        on_corridor=(corridor & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
-        wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
+        near=is_near,
+        points_near=points_near | (_outside_box(bank, index, points, 0.0) & road_goes_on),
+        on_corridor=(corridor & (centre_m2 <= (half + LANE_MARGIN_M) ** 2)).any(),
+        wrong_way=(opposed_m2 < _FAR / 2) & (opposed_m2 < aligned_m2),
         straddling=outside.any(),
         leaving_lane=has_lane & (outside_m > LANE_MARGIN_M),
-        limit=jnp.where(has_lane, driven[LaneRow.LIMIT], -1.0),
-        z=jnp.where(near, nearest[LaneRow.Z], z),
+        limit=jnp.where(has_lane, driven_lane[LaneRow.LIMIT], -1.0),
+        z=jnp.where(is_near, nearest_lane[LaneRow.Z], z),
     )
 
 
@@ -267,7 +265,7 @@ def in_corridor(bank: ScenarioBank, lanes: Float[Array, "8 K"], row: Any) -> Boo
     code = lanes[LaneRow.LANE]
     if bank.most_egos == 1:
         return code > jnp.floor(code)
-    # Exact, by a power of two: shifts the bit of the ego to the first after the point.
+    # Multiplying by a power of two is exact: it shifts the bit of the ego to the first place after the point.
     code = code * (1 << bank.ego_number(row))
     return code - jnp.floor(code) >= 0.5
 
@@ -302,9 +300,9 @@ def _nearest_vertex(
     along = jnp.sum(u * w, axis=0) / jnp.maximum(length, 1e-6)
     across = (u[0] * w[1] - u[1] * w[0]) / jnp.maximum(length, 1e-6)
     last = jnp.floor(length / spacing_m) * spacing_m
-    at = jnp.clip(jnp.round(along / spacing_m) * spacing_m, 0.0, last)
-    away = jnp.minimum(jnp.abs(along - at), jnp.abs(along - length))
-    return root(jnp.where(inside, across * across + away * away, _FAR).min())
+    vertex = jnp.clip(jnp.round(along / spacing_m) * spacing_m, 0.0, last)
+    offset = jnp.minimum(jnp.abs(along - vertex), jnp.abs(along - length))
+    return root(jnp.where(inside, across * across + offset * offset, _FAR).min())
 
 
 def _holds(
@@ -384,19 +382,19 @@ def offroad_by_edges(
 
     ``left`` and ``known`` are the values of :func:`left_of_edges`.
     """
-    stored = _stored_side(bank, index, points)
-    sides = jnp.where(stored == NOT_DRIVABLE, EDGE_CUTOFF_M, -EDGE_CUTOFF_M)
-    return jnp.where(known, -left, sides), known | (stored != 0)
+    side_code = _stored_side(bank, index, points)
+    sides = jnp.where(side_code == NOT_DRIVABLE, EDGE_CUTOFF_M, -EDGE_CUTOFF_M)
+    return jnp.where(known, -left, sides), known | (side_code != 0)
 
 
 def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]) -> Int[Array, " P"]:
     """Code of the side cell of each point (``scenario.build.grid.pack_sides``); 0 outside the grid."""
     grid = round(bank.grid_side.shape[1] ** 0.5)
-    fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
-    inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
-    cell, part = jnp.clip(fine // SPLIT, 0, grid - 1), fine % SPLIT
+    side_cell = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
+    inside = ((side_cell >= 0) & (side_cell < grid * SPLIT)).all(axis=1)
+    cell, sub_cell = jnp.clip(side_cell // SPLIT, 0, grid - 1), side_cell % SPLIT
     word = bank.grid_side[index, cell[:, 1] * grid + cell[:, 0]]
-    return jnp.where(inside, (word >> (2 * (part[:, 1] * SPLIT + part[:, 0]))) & 3, 0)
+    return jnp.where(inside, (word >> (2 * (sub_cell[:, 1] * SPLIT + sub_cell[:, 0]))) & 3, 0)
 
 
 def left_the_map(bank: ScenarioBank, index: Integer, xy: Vector) -> Bool[Array, ""]:
@@ -442,16 +440,17 @@ def project_on_route(
     size = min(_WINDOW, count)
     window = jax.lax.dynamic_slice(routes, (row, first, jnp.int32(0)), (1, size, RouteColumn.LIMIT))[0]
     a, b = window[:-1], window[1:]
-    place = first + jnp.arange(size - 1)
-    real = (place + 1 < points[row]) & (place <= near_m + ahead_m)
+    point = first + jnp.arange(size - 1)
+    is_valid = (point + 1 < points[row]) & (point <= near_m + ahead_m)
     ends = [end[:, column] for end in (a, b) for column in (RouteColumn.X, RouteColumn.Y)]
     squared, side = to_segments(ends, xy[None])
-    k = first_smallest(jnp.where(real, squared[0], _FAR))
+    k = first_smallest(jnp.where(is_valid, squared[0], _FAR))
     u, w = b[k, RouteColumn.XY] - a[k, RouteColumn.XY], xy - a[k, RouteColumn.XY]
-    part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
+    fraction = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
     distance = root(squared[0, k])
     lateral = jnp.where(side[0, k] >= 0, distance, -distance)
-    return RouteHit((first + k).astype(jnp.float32) + part, lateral, distance, window[k, RouteColumn.HEADING])
+    along_m = (first + k).astype(jnp.float32) + fraction
+    return RouteHit(along_m, lateral, distance, window[k, RouteColumn.HEADING])
 
 
 def route_ahead(
@@ -462,8 +461,8 @@ def route_ahead(
     last = bank.route_points[row] - 1
     low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[1] - 2)
     # Limits and lanes are not interpolated.
-    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < RouteColumn.LIMIT)
-    rows = bank.routes[row, low] * (1 - part) + bank.routes[row, low + 1] * part
+    fraction = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < RouteColumn.LIMIT)
+    rows = bank.routes[row, low] * (1 - fraction) + bank.routes[row, low + 1] * fraction
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
 
 
@@ -478,16 +477,16 @@ def light_crossing(
     line = bank.light_line[index]
     cos, sin, half = line[LightRow.COS], line[LightRow.SIN], line[LightRow.HALF]
 
-    def split(point: Vector) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
+    def to_line_frame(point: Vector) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
         dx, dy = point[0] - line[LightRow.X], point[1] - line[LightRow.Y]
         return dx * cos + dy * sin, dy * cos - dx * sin
 
-    (s0, t0), (s1, t1) = split(before), split(now)
-    share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
-    through = jnp.abs(t0 + (t1 - t0) * share) <= half
-    level = jnp.abs(line[LightRow.Z] - z) <= LEVEL_M
-    before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
-    return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
+    (s0, t0), (s1, t1) = to_line_frame(before), to_line_frame(now)
+    fraction = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
+    is_through = jnp.abs(t0 + (t1 - t0) * fraction) <= half
+    is_on_level = jnp.abs(line[LightRow.Z] - z) <= LEVEL_M
+    before_m = jnp.where(is_on_level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
+    return (s0 < 0.0) & (s1 >= 0.0) & is_through & is_on_level, before_m
 
 
 def lane_course(
@@ -532,24 +531,24 @@ def lane_passage(
     strand and another, so that a car that drives along the line does not change lanes at every step.
     """
     rows, inside = lanes_around(bank, index, xy)
-    to_line, side = to_segments(rows, xy[None])
-    counts = inside & _runs_along(rows, heading) & is_level(rows[LaneRow.Z], z)
-    lane = jnp.where(counts, rows[LaneRow.LANE], -1.0).astype(jnp.int32)
-    squared, side = jnp.where(counts, to_line[0], _FAR), side[0]
-    codes = bank.lane_strands[index]
-    strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
+    segment_m2, side = to_segments(rows, xy[None])
+    is_candidate = inside & _runs_along(rows, heading) & is_level(rows[LaneRow.Z], z)
+    lane = jnp.where(is_candidate, rows[LaneRow.LANE], -1.0).astype(jnp.int32)
+    squared, side = jnp.where(is_candidate, segment_m2[0], _FAR), side[0]
+    strands = bank.lane_strands[index]
+    strand = jnp.where(lane >= 0, strands[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
     best = first_smallest(squared)
-    own = jnp.where((strand == before) & (strand >= 0), squared, _FAR)
-    held = first_smallest(own)
-    near, kept = squared[best] <= LANE_CUTOFF_M**2, own[held] <= LANE_CUTOFF_M**2
-    stays = kept & (root(own[held]) - root(squared[best]) <= 2 * BEYOND_M)
-    now = jnp.where(stays, before, jnp.where(near, strand[best], -1))
-    old, new = codes[lane[held]], codes[lane[best]]
+    before_m2 = jnp.where((strand == before) & (strand >= 0), squared, _FAR)
+    closest = first_smallest(before_m2)
+    has_lane, has_before = squared[best] <= LANE_CUTOFF_M**2, before_m2[closest] <= LANE_CUTOFF_M**2
+    stays = has_before & (root(before_m2[closest]) - root(squared[best]) <= 2 * BEYOND_M)
+    now = jnp.where(stays, before, jnp.where(has_lane, strand[best], -1))
+    old, new = strands[lane[closest]], strands[lane[best]]
     adjacent = (new[StrandColumn.LEFT] == before) | (new[StrandColumn.RIGHT] == before)
-    adjacent = (adjacent | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
-    passed = (before >= 0) & (now >= 0) & (now != before)
-    changed = passed & adjacent & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
-    previous = codes[before]
-    ending = norm(xy - previous[StrandColumn.END]) <= MERGE_M
-    merged = passed & ending & (changed | (previous[StrandColumn.ONTO] == now))
+    adjacent = (adjacent | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & has_before
+    is_new_strand = (before >= 0) & (now >= 0) & (now != before)
+    changed = is_new_strand & adjacent & (jnp.abs(side[closest] - side[best]) >= SIDE_BY_SIDE_M)
+    previous = strands[before]
+    ends_nearby = norm(xy - previous[StrandColumn.END]) <= MERGE_M
+    merged = is_new_strand & ends_nearby & (changed | (previous[StrandColumn.ONTO] == now))
     return Passage(now.astype(jnp.int16), changed, merged)

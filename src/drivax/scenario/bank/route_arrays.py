@@ -77,15 +77,15 @@ def stack_lights(records: Sequence[_Record], count: int) -> _Arrays:
     """Return the first ``count`` stop lines and their states."""
     lights = slice(0, count)
     line = stack_field(records, "light_line", lights).astype(np.float64)
-    z, heading, exits, lane = (
+    z, heading, exit_rad, lane = (
         stack_field(records, f"light_{name}", lights) for name in ("z", "heading", "exit_heading", "lane")
     )
     middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
     half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
-    right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
+    right = wrap(exit_rad.astype(np.float64) - heading) < -np.pi / 4
     x, y = np.moveaxis(middle, -1, 0)
     arcs = [_stop_arcs(records, ego, lane, middle) for ego in range(most_egos(records))]
-    rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, *arcs]
+    rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exit_rad), np.sin(exit_rad), right, *arcs]
     return {
         "light_line": np.stack(rows, axis=1, dtype=np.float32),
         "light_state": stack_field(records, "light_state", slice(None), lights),
@@ -101,7 +101,7 @@ def _stop_arcs(
     count, route_lane = (of_ego(records, f"route_{name}", ego, 0) for name in ("points", "lane"))
     on_route = np.zeros((len(records), 2 + max(int(lane.max()), int(route_lane.max()))), bool)
     on_route[np.arange(len(records))[:, None], route_lane] = True
-    on_route[:, -1] = False  # that of -1, no lane
+    on_route[:, -1] = False  # the entry of -1, no lane
     on_route &= count[:, None] > 0
     scenario, light = stops = np.nonzero(on_route[np.arange(len(records))[:, None], lane])
     if len(light):

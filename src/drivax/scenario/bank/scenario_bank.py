@@ -1,7 +1,7 @@
 """The scenario bank: scenarios stacked on the device, an argument of all simulation.
 
-Padding that no scenario uses is trimmed. The layout is that of the reads of a step: agents are time-major (a frame is a
-contiguous read), map segments are feature-major (a grid query is three contiguous reads per feature).
+Padding that no scenario uses is trimmed. The layout suits the reads of a simulation step: agents are time-major (a
+frame is a contiguous read), map segments are feature-major (a grid query is three contiguous reads per feature).
 """
 
 from __future__ import annotations
@@ -94,11 +94,11 @@ class Sizes:
 
     @classmethod
     def whole(cls, capacity: Capacity) -> Sizes:
-        """Return the sizes of a capacity."""
-        own = {name: getattr(capacity, name) for name in ("agents", "lights", "edge_run", "lane_run")}
-        own |= {"edges": capacity.segments, "lanes": capacity.segments, "graphs": capacity.lanes}
+        """Return the sizes that hold all scenarios of a capacity."""
+        sizes = {name: getattr(capacity, name) for name in ("agents", "lights", "edge_run", "lane_run")}
+        sizes |= {"edges": capacity.segments, "lanes": capacity.segments, "graphs": capacity.lanes}
         slots = capacity.agents + capacity.parked
-        return cls(**own, slots=slots, road=capacity.road_rows, long_ego=False)
+        return cls(**sizes, slots=slots, road=capacity.road_rows, long_ego=False)
 
     @classmethod
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
@@ -277,10 +277,10 @@ class ScenarioBank:
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
         """Select scenarios by index."""
-        of_egos = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
+        ego_rows = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
 
         def select(path: tuple[Any, ...], leaf: Array) -> Array:
-            return leaf[of_egos if path[0].name in PER_EGO else rows]
+            return leaf[ego_rows if path[0].name in PER_EGO else rows]
 
         return jax.tree_util.tree_map_with_path(select, self)
 
@@ -307,13 +307,13 @@ class ScenarioBank:
                 names = [f"{c.name!r} ({c.steps} steps)" for c in (scenario.capacity, logs[0].capacity)]
                 cure = "convert all sets with one --capacity and --future-s"
                 raise DataError(f"has capacity {names[0]}, others {names[1]}", record=scenario.id, cure=cure)
-        least = Sizes.used(logs)
-        sizes = trim if isinstance(trim, Sizes) else least if trim else Sizes.whole(logs[0].capacity)
-        sizes = replace(sizes, long_ego=sizes.long_ego or least.long_ego)
-        has, needs = asdict(sizes), asdict(least)
-        if small := [f"{name} {has[name]} < {needs[name]}" for name in has if has[name] < needs[name]]:
+        used = Sizes.used(logs)
+        sizes = trim if isinstance(trim, Sizes) else used if trim else Sizes.whole(logs[0].capacity)
+        sizes = replace(sizes, long_ego=sizes.long_ego or used.long_ego)
+        room, need = asdict(sizes), asdict(used)
+        if too_small := [f"{name} {room[name]} < {need[name]}" for name in room if room[name] < need[name]]:
             cure = "use Sizes.used of all scenarios"
-            raise UsageError(f"sizes are too small: {', '.join(small)}", cure=cure)
+            raise UsageError(f"sizes are too small: {', '.join(too_small)}", cure=cure)
         if sizes.agents > (most := logs[0].capacity.agents):
             problem = f"sizes are too large: agents {sizes.agents} > {most} of the capacity"
             raise UsageError(problem, cure="use Sizes.used of scenarios of this capacity")
@@ -340,7 +340,7 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
         "lanes": (8, sizes.lanes + sizes.lane_run),
         "map_box": (4,),
     }
-    large = [_aligned((len(records), *shape), np.dtype(np.float32)) for shape in shapes.values()]
+    large_arrays = [_aligned((len(records), *shape), np.dtype(np.float32)) for shape in shapes.values()]
     # The first record gives the names, shapes and types of the other arrays.
     arrays = {
         name: _aligned((len(records), *values.shape[1:]), values.dtype)
@@ -350,7 +350,7 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     def fill(rows: slice) -> None:
         """Write a batch of scenarios into all arrays."""
         batch = records[rows]
-        targets = zip(*(array[rows] for array in large), strict=True)
+        targets = zip(*(array[rows] for array in large_arrays), strict=True)
         for log, values, target in zip(batch, _lane_values(batch), targets, strict=True):
             agents, edges, lanes, box = target
             _fill_agents(agents, log)
@@ -363,7 +363,7 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     for name in PER_EGO:
         arrays[name] = arrays[name].reshape(-1, *arrays[name].shape[2:])
     names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
-    return arrays | dict(zip(shapes, large, strict=True)) | {"identity": identities(names)}
+    return arrays | dict(zip(shapes, large_arrays, strict=True)) | {"identity": identities(names)}
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray[Any, Any]:
@@ -378,8 +378,8 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
     """Return a unique number per scenario from its data set and id, independent of set, order and batch.
 
     It is a four-byte BLAKE2b digest of data set, id and a count of earlier scenarios of that name, so that copies
-    differ. The count skips digests of earlier scenarios (of 65,000 scenarios, two have the same with 40 %): these few
-    numbers depend on the set.
+    differ. The count skips digests of earlier scenarios (40 % of sets of 65,000 scenarios have such a collision): only
+    these few numbers depend on the set.
     """
     counts: Counter[tuple[str, str]] = Counter()
     numbers: dict[int, None] = {}
@@ -507,7 +507,7 @@ def _lane_values(records: Sequence[_Record]) -> Float[np.ndarray, "n 3 lane1"]:
         route = (of_ego(records, f"route_{name}", ego, 0) for name in ("lane", "points"))
         index = index + 0.5 ** (ego + 1) * corridor_lanes(records, *route)[:, lanes]
     values = np.stack([half, _lane_limits(records, lanes), index], axis=1, dtype=np.float32)
-    values[..., -1] = DEFAULT_LANE_WIDTH_M / 2, -1.0, -1.0  # a full table has no empty last row
+    values[..., -1] = DEFAULT_LANE_WIDTH_M / 2, -1.0, -1.0  # -1 reads the last lane of a full table
     return values
 
 

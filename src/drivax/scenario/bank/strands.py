@@ -25,13 +25,13 @@ NOWHERE_M = 1e6
 #: Stretch of a lane at its ends that decides its course, and distance from the ends for headings, m.
 _BEND_M, _END_M = 20.0, 1.0
 #: Turn to or from a lane whose stretch is not stored, larger than any known turn, rad.
-_UNKNOWN = 100.0
-#: Lanes that meet merge if their headings differ by less 20 m before; others cross or turn in.
+_UNKNOWN_TURN = 100.0
+#: Lanes that meet merge if their headings 20 m before differ by less; other lanes cross or turn in.
 _MERGING_RAD = np.deg2rad(30.0)
 #: An adjacent lane continues beyond the end of a lane if it reaches further than the first distance. Lanes may end at
 #: the crop of the map beyond the second distance from the box of the ego's log, m.
 _CONTINUES_M, _KNOWN_M = 10.0, 95.0
-#: Largest excess of the length of a lane over its drawing (height, rounding), m.
+#: Largest excess of the length of a lane over that of its segments (height, rounding), m.
 _SLACK_M = 1.0
 
 
@@ -57,12 +57,12 @@ def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 
     courses, lane_of_link = _Courses.of(records, lanes), np.repeat(lane[:, None], 4, axis=1)
     next_lane = _straightest_link(successor, courses.turn(lane_of_link, successor))
     previous_lane = _straightest_link(predecessor, courses.turn(predecessor, lane_of_link))
-    # Two lanes belong to one strand if each is the straightest link of the other. Index -1 reads the last lane; what it
-    # yields is masked.
-    follows = np.where((next_lane >= 0) & (previous_lane[next_lane] == lane), next_lane, -1)
-    strand, last = _strands(follows)
+    # Two lanes belong to one strand if each is the straightest link of the other. Index -1 reads the last lane; its
+    # values are masked.
+    continuation = np.where((next_lane >= 0) & (previous_lane[next_lane] == lane), next_lane, -1)
+    strand, last = _strands(continuation)
     # A lane whose successor continues another lane (its rival) merges onto that strand if both come from one direction.
-    rival = np.where((next_lane >= 0) & (follows < 0), previous_lane[next_lane], -1)
+    rival = np.where((next_lane >= 0) & (continuation < 0), previous_lane[next_lane], -1)
     merges = (rival >= 0) & (np.abs(wrap(courses.before - courses.before[rival])) <= _MERGING_RAD)
     onto = np.where(merges, strand[next_lane], -1)
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
@@ -76,8 +76,8 @@ def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 
         continues = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | is_further)
         onto = np.where(is_dead_end & continues, strand[adjacent], onto)
         rows[:, column] = lanes.index(np.where(adjacent >= 0, strand[adjacent], -1))
-    # What holds for the last lane holds for the whole strand; a ring has no last lane.
-    onto = np.where(follows[last] < 0, onto[last], -1)
+    # A strand merges where its last lane does; a ring has no last lane.
+    onto = np.where(continuation[last] < 0, onto[last], -1)
     rows[:, StrandColumn.STRAND], rows[:, StrandColumn.ONTO] = lanes.index(strand), lanes.index(onto)
     rows[:, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
     return rows
@@ -204,18 +204,18 @@ class _Segments:
 
 def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
     """Link of each lane with the smallest turn, the first if several are equal to 0.01 rad or unknown; -1 for none."""
-    turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN, np.round(turn, 2)), np.inf)
+    turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN_TURN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
 
 
-def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Array, " lane"]]:
-    """Strand of each lane and its last lane (any lane of a ring), by pointer doubling."""
-    lane = np.arange(len(follows))
-    last = np.where(follows >= 0, follows, lane)
+def _strands(continuation: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Array, " lane"]]:
+    """Strand of each lane, and the last lane of that strand (any lane of a ring), by pointer doubling."""
+    lane = np.arange(len(continuation))
+    last = np.where(continuation >= 0, continuation, lane)
     highest = np.maximum(lane, last)
-    for _ in range(len(follows).bit_length()):
+    for _ in range(len(continuation).bit_length()):
         highest, last = np.maximum(highest, highest[last]), last[last]
-    return np.where(follows[last] >= 0, highest, last), last
+    return np.where(continuation[last] >= 0, highest, last), last
 
 
 def _is_map_known(

@@ -1,7 +1,7 @@
 """Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid.
 
-``assemble`` runs them. ``lane_paths.LaneSearch`` is the route search; ``routes``, with the published
-search, selects and samples paths.
+``assemble`` runs them. ``lane_paths.LaneSearch`` searches for routes; ``routes``, which also has the published search,
+selects and samples paths.
 """
 
 import lazy_loader

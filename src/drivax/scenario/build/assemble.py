@@ -161,11 +161,11 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     log = ego_log(tracks, now)
     path = thin_path(log.positions[:, :2])
     roads = road_lines(recording.features, origin, recording.split_gap_m)
-    _refuse_endless(roads)
+    _check_map_length(roads)
     segments = cut(roads)
-    whole = lane_graph(recording.features, origin)
-    lane_segments = LaneSegments.of(segments, whole)
-    intent, unknown = _intent(recording, whole)
+    full_graph = lane_graph(recording.features, origin)
+    lane_segments = LaneSegments.of(segments, full_graph)
+    intent, missing_lanes = _intent(recording, full_graph)
     preferred = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, preferred, capacity.agents, capacity.parked)
     sizes = {"most_routes": capacity.routes, "most_points": capacity.route_points}
@@ -173,33 +173,33 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     routes, egos = find(log, intent), _further_egos(tracks, placement.moving, log, capacity.egos - 1, find)
     on_route = _lanes_of([*routes.routes, *(ego.routes.routes[0] for ego in egos)])
     in_crop = inside_box(segments.middle, path, MARGIN_M)
-    in_crop |= np.isin(segments.feature, whole.feature[on_route])
+    in_crop |= np.isin(segments.feature, full_graph.feature[on_route])
     grid = arrange(segments.take(in_crop), path, MARGIN_M, capacity)
-    keep, lost_lanes = _select_lanes(whole, segments.feature[in_crop], on_route, path, capacity.lanes)
-    graph = select(whole, keep)
+    keep, lost_lanes = _select_lanes(full_graph, segments.feature[in_crop], on_route, path, capacity.lanes)
+    graph = select(full_graph, keep)
     polylines, lost_features = _select_polylines(roads, grid, path, capacity.features)
     edges, lanes = (segments.take(segments.block == block) for block in (EDGE_BLOCK, LANE_BLOCK))
     closed = roads.closed[edges.polyline]
     ringed = ringed_cells(grid.grid, edges, closed, path, MARGIN_M)
-    on_graph = LaneSegments.of(segments, graph)
+    stored_lanes = LaneSegments.of(segments, graph)
     parts = Parts(
         tracks=tracks,
         placement=placement,
         extension=extend(tracks, placement.moving, lane_segments, capacity.extension),
         graph=graph,
-        routes=_renumber(routes, keep, whole.count),
-        egos=[replace(ego, routes=_renumber(ego.routes, keep, whole.count)) for ego in egos],
+        routes=_renumber(routes, keep, full_graph.count),
+        egos=[replace(ego, routes=_renumber(ego.routes, keep, full_graph.count)) for ego in egos],
         grid=grid,
         sides=cell_sides(grid.grid, edges, lanes.middle, closed, ringed),
         ringed=bool(ringed.any()),
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
-        lights=place_lights(recording.lights, on_graph, origin, path, MARGIN_M, capacity.lights),
+        lights=place_lights(recording.lights, stored_lanes, origin, path, MARGIN_M, capacity.lights),
         stops=place_stops(recording.features, graph, origin, path, MARGIN_M, capacity.stops),
     )
     lost = Counter({name: int(count) for name, count in recording.lost.items()})
-    lost += Counter({**whole.lost, **unknown})
+    lost += Counter({**full_graph.lost, **missing_lanes})
     overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
     flags = _flags(recording, parts)
     flags |= Flag.OVERFLOW if overflow else Flag.NONE
@@ -217,7 +217,7 @@ def _further_egos(
     tracks: LocalTracks, moving: Int[Array, " slot"], log: EgoLog, most: int,
     find: Callable[[EgoLog, Intent], RouteSet],
 ) -> list[FurtherEgo]:  # fmt: skip
-    """Return up to ``most`` egos next to the recorded one, with routes from ``find``, without an intended route."""
+    """Return up to ``most`` egos in addition to the recorded one, with routes from ``find`` without intended lanes."""
     return [
         FurtherEgo(slot, last, find(ego_log(tracks, log.current, int(moving[slot]), last), Intent()))
         for slot, last in _select_egos(tracks, moving, log, most)
@@ -286,7 +286,7 @@ def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, i
     return Intent(*dense), {"route_lanes_missing": counts[0], "route_corridor_missing": counts[1]}
 
 
-def _refuse_endless(roads: RoadLines) -> None:
+def _check_map_length(roads: RoadLines) -> None:
     """Raise a DataError if the lines of the map are implausibly long together."""
     length = float(roads.lines.length.sum())
     if length > MAP_M:
@@ -410,7 +410,7 @@ def blank(capacity: Capacity) -> Record:
 
 
 def _put(record: Record, **values: Array) -> None:
-    """Write arrays into the beginning of the leading axis of fields."""
+    """Write arrays into fields, from index 0 of their first axis on."""
     for name, value in values.items():
         record[name][: len(value)] = value
 

@@ -13,7 +13,7 @@ from drivax.errors import DataError
 from drivax.scenario.build.segments import Segments, inside_box, path_distance
 from drivax.scenario.schema import Capacity
 
-#: Nearer to an edge than this the edge itself decides (``scenario.bank.queries.EDGE_CUTOFF_M``), m.
+#: Within this distance an edge itself decides the side of a point (``scenario.bank.queries.EDGE_CUTOFF_M``), m.
 CUTOFF_M = 3.0
 #: Side cells along a grid cell. Half the diagonal of a side cell is below the cut-off, so no edge lies between its
 #: centre and those of its points that are beyond the cut-off.
@@ -197,8 +197,8 @@ def cell_sides(
     if in_reach.any():
         side, distance = _nearest_sides(side_grid, edges.take(in_reach))
     lane_cells = side_grid.cell(lanes[side_grid.contains(lanes)])
-    on_road = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
-    side[on_road] = 0
+    contradicted = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
+    side[contradicted] = 0
     if ringed.any():
         square = _sides_within_rings(grid, edges, closed, ringed).reshape(grid.side, grid.side)
         ring_side = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
@@ -233,11 +233,11 @@ def _nearest_sides(side_grid: Grid, edges: Segments) -> tuple[Int[Array, " cell"
     begins, ends = _open_ends(a, b)
     past_end = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
     # At a vertex the segment whose line is further away decides.
-    (most, least), unknown = np.zeros((2, len(nearest))), np.zeros(len(nearest), dtype=bool)
-    np.maximum.at(most, near_cell, left)
-    np.minimum.at(least, near_cell, left)
+    (most_left, least_left), unknown = np.zeros((2, len(nearest))), np.zeros(len(nearest), dtype=bool)
+    np.maximum.at(most_left, near_cell, left)
+    np.minimum.at(least_left, near_cell, left)
     unknown[near_cell[past_end]] = True
-    sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest)
+    sign, distance = np.where(most_left >= -least_left, 1, -1), np.sqrt(nearest)
     sides = np.where(unknown | (distance > _REACH_M), 0, sign)
     shape, square = (rows, columns), (side_grid.side, side_grid.side)
     sides = _crop(sides, shape, low, np.zeros(square, int))
@@ -263,21 +263,21 @@ def _nearest_pairs(
         squared = _squared_distances(x, y, a[block], b[block]).reshape(cell.shape)
         nearer = (squared < nearest.take(cell)).ravel().nonzero()[0]
         np.minimum.at(nearest, cell.take(nearer), squared.take(nearer))
-        near = (squared <= _almost(nearest.take(cell))).ravel().nonzero()[0]
+        near = (squared <= _tie_limit(nearest.take(cell))).ravel().nonzero()[0]
         pairs.append((near // len(window) + first, cell.take(near), squared.take(near)))
     segment, cell, squared = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     # All segments that are nearest up to rounding: at a vertex there are two.
-    keep = squared <= _almost(nearest[cell])
+    keep = squared <= _tie_limit(nearest[cell])
     return segment[keep], cell[keep], nearest
 
 
-def _almost(squared: Array) -> Array:
+def _tie_limit(squared: Array) -> Array:
     """Squared distances up to which segments are equally near."""
     return squared * (1 + 1e-6) + 1e-6
 
 
 def _crop(values: Array, shape: tuple[int, int], low: Int[Array, "2"], square: Array) -> Array:
-    """Put the cells of a rectangle, whose first column and row are ``low``, into a square, flat."""
+    """Copy the cells of a rectangle, whose first column and row are ``low``, into a square; return it flat."""
     (x, y), (first_x, first_y) = np.maximum(low, 0), np.maximum(-low, 0)
     target = square[y:, x:]
     source = values.reshape(shape)[first_y : first_y + len(target), first_x : first_x + target.shape[1]]
@@ -330,8 +330,8 @@ def _sides_within_rings(
     if low < 0 < high:
         return side  # Rings contradict each other.
     drivable = winding > 0 if high > 0 else winding == 0
-    corner = np.concatenate((rings.a[:, :2], rings.b[:, :2]))
-    in_box = (grid.centres >= corner.min(axis=0)) & (grid.centres <= corner.max(axis=0))
+    vertices = np.concatenate((rings.a[:, :2], rings.b[:, :2]))
+    in_box = (grid.centres >= vertices.min(axis=0)) & (grid.centres <= vertices.max(axis=0))
     has_side = ringed & in_box.all(axis=1) & ~_near_edge(grid, edges).ravel()
     side[has_side] = np.where(drivable[has_side], 1, -1)
     return side

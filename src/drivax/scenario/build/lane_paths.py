@@ -130,19 +130,19 @@ class LaneSearch:
     def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[LanePath]:
         """Cheapest paths to the lanes under the goal (Dijkstra's search)."""
         goals = self._goals(xyz, heading)
-        complete, done, serial = list[LanePath](), set[int](), count()
+        complete, visited, serial = list[LanePath](), set[int](), count()
         # Starts are sorted by penalty, so the list is a heap.
         heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]
         while heap and len(complete) < len(goals):
             lane_path = heapq.heappop(heap)[2]
             lane = lane_path.lanes[-1]
-            if lane in done:
+            if lane in visited:
                 continue
-            done.add(lane)
+            visited.add(lane)
             if lane in goals:
                 complete.append(replace(lane_path, goal_m=lane_path.ahead + goals[lane]))
             for child in self.expand(lane_path):
-                if child.lanes[-1] not in done:
+                if child.lanes[-1] not in visited:
                     heapq.heappush(heap, (child.penalty + child.ahead + child.entry_m, next(serial), child))
         return complete
 

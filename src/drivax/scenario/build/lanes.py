@@ -205,8 +205,8 @@ def _link_table(
     bend = np.abs(wrap(in_heading[b] - out_heading[a]))
     # Rounded: links that are equally straight stay in order.
     order = np.lexsort((np.arange(len(a)), np.round(bend, 3), a))
-    place = np.arange(len(a)) - np.searchsorted(a[order], a[order])
-    table[a[order], place] = b[order]
+    column = np.arange(len(a)) - np.searchsorted(a[order], a[order])
+    table[a[order], column] = b[order]
     return table
 
 
@@ -244,26 +244,26 @@ def _adjacent(
 def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Whether lane ``b`` runs along ``a`` in its direction, its distance and arc-length shift: ``[pair, probe]``."""
     fraction = np.array(_PROBES)
-    at = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
-    probe = samples[a][:, at]
-    direction = samples[a][:, at + 1] - samples[a][:, at - 1]
+    index = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
+    probe = samples[a][:, index]
+    direction = samples[a][:, index + 1] - samples[a][:, index - 1]
     begin, end = samples[b][:, None, :-1], samples[b][:, None, 1:]
     distance, along = point_to_segment(probe[:, :, None], begin, end)
     nearest = distance.argmin(axis=2)
-    pick = np.ix_(np.arange(len(a)), np.arange(len(at)))
+    pick = np.ix_(np.arange(len(a)), np.arange(len(index)))
     along, distance = along[(*pick, nearest)], distance[(*pick, nearest)]
-    other = samples[b[:, None], nearest + 1] - samples[b[:, None], nearest]
-    turn = np.arctan2(other[..., 1], other[..., 0]) - np.arctan2(direction[..., 1], direction[..., 0])
+    chord = samples[b[:, None], nearest + 1] - samples[b[:, None], nearest]
+    turn = np.arctan2(chord[..., 1], chord[..., 0]) - np.arctan2(direction[..., 1], direction[..., 0])
     position = (nearest + along) / (_SAMPLES - 1)
     interior = (np.abs(wrap(turn)) < SAME_WAY_RAD) & (position > 1e-6) & (position < 1.0 - 1e-6)
-    arc = at / (_SAMPLES - 1) * length[a][:, None]
+    arc = index / (_SAMPLES - 1) * length[a][:, None]
     return interior, distance, position * length[b][:, None] - arc
 
 
 def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
 
-    Links to other lanes go uncounted: they lead out of the crop, or to lanes that are counted as not fitting.
+    Links to other lanes are not counted: they lead out of the crop, or to lanes that are counted as not fitting.
     """
     new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
     new_index[rows] = np.arange(len(rows))
@@ -405,7 +405,7 @@ def place_lights(
     """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``.
 
     Lights whose lane is missing and that are near no other lane of their level have no direction and are dropped. They
-    are counted in the box of ``path`` widened by ``margin_m``: elsewhere the lanes are cropped too.
+    are counted only in the box of ``path`` widened by ``margin_m``: elsewhere the lanes are cropped too.
     """
     graph, steps = lane_segments.graph, len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin

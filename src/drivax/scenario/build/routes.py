@@ -271,7 +271,7 @@ class _Drawer:
         lanes = (*prefix, *follow(graph, lane_path.lanes, ahead_m, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
         change_m, window_m = max(CHANGE_M, CHANGE_S * speed), (REACTION_S * speed, lane_path.goal_m)
-        # An alternative often has the lanes of the intended route; without lane changes the goal does not matter.
+        # Cached: alternatives often have the lanes of the intended route. Without lane changes the goal is irrelevant.
         changes = any(is_change(graph, a, b) for a, b in pairwise(lanes))
         key = lanes, begin, length, (lane_path.goal_m, place) if changes else None
         if key in self.drawn:
@@ -282,8 +282,8 @@ class _Drawer:
         missing_m = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
         xyz, label = continue_straight(line, 0.0, missing_m)
         points, index = resample(xyz, SPACING_M, self.most)
-        bent = points if self.plain else join(points, history, change_m)
-        self.drawn[key] = Route.along(bent, label[index], self.most)
+        route_xyz = points if self.plain else join(points, history, change_m)
+        self.drawn[key] = Route.along(route_xyz, label[index], self.most)
         return self.drawn[key]
 
 
@@ -328,7 +328,7 @@ def _shifts(xyz: Float[Array, "point 3"], history: Float[Array, "step 2"]) -> tu
 
 
 def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
-    """Cubic from a shift and its slope to zero and level at ``length``, then zero."""
+    """Cubic from a shift and its slope to zero shift and slope at ``length``, then zero."""
     t = np.clip(distance / length, 0.0, 1.0)
     return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
 
@@ -369,8 +369,8 @@ def _continuation(lane_segments: LaneSegments, pose: Float[Array, "3"], heading:
 def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     """Arc length of the logged ego along a route at every step, never decreasing, metres; gaps repeat the last value.
 
-    The first position, whose value earlier steps have too, is searched on the whole route; each other one no further
-    ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
+    The first position is searched on the whole route, and earlier steps get its value; each later position is searched
+    no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
     """
     rows = np.flatnonzero(ego.valid)
     xy = ego.positions[:, :2]

@@ -134,9 +134,9 @@ def _drop_short(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " p
     start = np.append(begin, len(points))
     counts = np.diff(start)
     arc = arc_lengths(points, start)
-    long = (counts >= 2) & (arc[start[1:] - 1] > _LEAST_LENGTH_M) if len(points) else counts >= 2
-    keep = np.repeat(long, counts)
-    return Polylines(points[keep], np.concatenate(([0], np.cumsum(counts[long]))), arc[keep]), keep
+    is_long = (counts >= 2) & (arc[start[1:] - 1] > _LEAST_LENGTH_M) if len(points) else counts >= 2
+    keep = np.repeat(is_long, counts)
+    return Polylines(points[keep], np.concatenate(([0], np.cumsum(counts[is_long]))), arc[keep]), keep
 
 
 def cut(roads: RoadLines) -> Segments:
@@ -282,15 +282,15 @@ def rank(group: Int[Array, " row"], distance: Float[Array, " row"]) -> Int[Array
     order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
     """
     ring = np.floor(distance / RING_M).astype(np.int64)
-    label, place = ring * 3 + group, np.zeros(len(group))
+    label, position = ring * 3 + group, np.zeros(len(group))
     for number in np.unique(label):
         members = np.flatnonzero(label == number)
-        place[members] = (_bit_reversed_place(len(members)) + 0.5) / len(members)
-    return np.lexsort((np.arange(len(group)), place, ring))
+        position[members] = (_bit_reversed_rank(len(members)) + 0.5) / len(members)
+    return np.lexsort((np.arange(len(group)), position, ring))
 
 
 @lru_cache(maxsize=256)
-def _bit_reversed_place(count: int) -> Int[Array, " count"]:
+def _bit_reversed_rank(count: int) -> Int[Array, " count"]:
     """Rank of each of ``count`` items in the order of their bit-reversed indices."""
     bits = max(int(count - 1).bit_length(), 1)
     index = np.arange(count)

@@ -117,15 +117,15 @@ def place(tracks: LocalTracks, preferred: Sequence[int], agents: int, parked: in
     where those that move rank 50 m nearer. Tracks without a valid step are dropped.
     """
     pose = median_pose(tracks)
-    away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
+    offset_m = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
     turn = np.abs(wrap(tracks.heading - pose[:, None, 3]))
-    stands = ((away <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
+    is_still = ((offset_m <= PARKED_M) & (turn <= PARKED_RAD)) | ~tracks.valid
     has_pose = tracks.valid.any(axis=1)
-    parks = stands.all(axis=1) & has_pose
-    parks[tracks.ego] = False
-    rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), preferred)
+    is_parked = is_still.all(axis=1) & has_pose
+    is_parked[tracks.ego] = False
+    rank = _rank(tracks, np.where(tracks.valid, offset_m, 0.0).max(axis=1), preferred)
     order = np.argsort(rank, kind="stable")
-    moving_rows, parked_rows = order[(has_pose & ~parks)[order]], order[parks[order]]
+    moving_rows, parked_rows = order[(has_pose & ~is_parked)[order]], order[is_parked[order]]
     overflow = +Counter(agents=len(moving_rows) - agents, parked=len(parked_rows) - parked)
     return Placement(moving_rows[:agents], parked_rows[:parked], pose, overflow)
 
@@ -164,14 +164,14 @@ def extend(
     direction = np.stack((np.cos(heading), np.sin(heading)), axis=-1)
     points = xyz[:, None, :2] + distance[:, None] * direction[:, None]
     lane, s, _ = lane_segments.nearest(xyz, heading, reach_m=3.0, turn_rad=np.deg2rad(45.0))
-    drives = among(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
-    follows = np.flatnonzero((lane >= 0) & drives)
-    if len(follows) == 0:
+    can_follow = among(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
+    followers = np.flatnonzero((lane >= 0) & can_follow)
+    if len(followers) == 0:
         return points
-    lines, lane, s = lane_segments.graph.lines, lane[follows], s[follows]
-    offset = xyz[follows, :2] - lines.at(lane, s)[..., :2]
+    lines, lane, s = lane_segments.graph.lines, lane[followers], s[followers]
+    offset = xyz[followers, :2] - lines.at(lane, s)[..., :2]
     lateral = np.einsum("ai,ai->a", offset, left_normals(lines.heading(lane, s)))
     lane_points, lane_heading = walk(lane_segments.graph, lane, s, EXTENSION_STEP_M, count)
     fade = np.maximum(1.0 - distance / FADE_M, 0.0)
-    points[follows] = lane_points + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
+    points[followers] = lane_points + (lateral[:, None] * fade)[..., None] * left_normals(lane_heading)
     return points

@@ -25,7 +25,7 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.select.tags import TAGS
 from drivax.seal import check_seal
 
-#: Number of missing names in an error message.
+#: Most missing names in an error message.
 _MOST_NAMES = 3
 #: Most lines of a file of names; each takes 200 bytes of memory.
 _MOST_LINES = 4_000_000
@@ -118,7 +118,7 @@ def vocabulary() -> dict[str, Quantity]:
 class Filter:
     """One condition on a quantity: ``text`` as written by the user, and its parts.
 
-    ``values`` are alternatives (words, numbers or truths); a comparison has one number.
+    ``values`` are alternatives (words, numbers or Booleans); a comparison has one number.
     """
 
     text: str
@@ -161,7 +161,7 @@ class Filter:
         return is_match if self.operator == "=" else not is_match
 
     def find(self, entry: Mapping[str, Any]) -> Any:
-        """Return the value in a manifest entry: a number, a word, a truth or a set of words; None if unknown."""
+        """Return the value in a manifest entry: a number, a word, a Boolean or a set of words; None if unknown."""
         group, _, name = self.name.partition(".")
         if group == "flag":
             return frozenset(entry["flags"])
@@ -198,8 +198,8 @@ class Selection:
 
     def unknown(self, entries: Iterable[Mapping[str, Any]]) -> dict[str, int]:
         """Return the nonzero numbers of scenarios without the value of a filter, by filter."""
-        known = list(entries)
-        counts = {rule.text: sum(rule.find(entry) is None for entry in known) for rule in self.filters}
+        all_entries = list(entries)
+        counts = {rule.text: sum(rule.find(entry) is None for entry in all_entries) for rule in self.filters}
         return {text: count for text, count in counts.items() if count}
 
 
@@ -270,7 +270,7 @@ def read_names(file: Path) -> list[_Name]:
 
 
 def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
-    """Indices of scenarios by name, in all data sets for an id alone; an unknown name is the path of a file, if any."""
+    """Return the indices of named scenarios (an id alone: in all data sets); unknown names may be paths of files."""
     rows: dict[str, set[int]] = {}
     for row, entry in enumerate(data.entries):
         for text in (entry["scenario_id"], f"{entry['dataset']}\t{entry['scenario_id']}"):
@@ -301,12 +301,12 @@ def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
     datasets = sorted(
         {str(entry["dataset"]) for entry in data.entries if entry["scenario_id"] == scenario_id}
     )
-    near = difflib.get_close_matches(scenario_id, [str(entry["scenario_id"]) for entry in data.entries], n=1)
+    guess = difflib.get_close_matches(scenario_id, [str(entry["scenario_id"]) for entry in data.entries], n=1)
     cure = "use ids that drivax inspect --json lists"
     if datasets and not others:
         cure = f"the set has this id in data set {', '.join(datasets)}"
-    elif near and not others:
-        cure = f"did you mean {near[0]!r}?"
+    elif guess and not others:
+        cure = f"did you mean {guess[0]!r}?"
     more = "".join(f", {name.label}" for name in others[: _MOST_NAMES - 1])
     more += f" and {len(others) - _MOST_NAMES + 1} more" if len(others) >= _MOST_NAMES else ""
     which = "are" if others else "is"
@@ -336,8 +336,8 @@ def _find_quantity(text: str, name: str) -> Quantity:
         return known[name]
     # Match names without their group too: log_collides suggests audit.log_collides.
     by_end = {full.rpartition(".")[2]: full for full in known} | {full: full for full in known}
-    near = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
-    cure = f"did you mean {by_end[near[0]]!r}?" if near else f"write tag.{name} for a tag of your own"
+    guess = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
+    cure = f"did you mean {by_end[guess[0]]!r}?" if guess else f"write tag.{name} for a tag of your own"
     raise _refusal(text, f"unknown quantity {name!r}", cure)
 
 

@@ -40,16 +40,16 @@ def parse_shares(text: str) -> Shares:
 
 
 def split_of(dataset: str, segment: str, shares: Shares) -> str:
-    """Return the split of a recording, by its :func:`_place`."""
-    place = _place(dataset, segment)
+    """Return the split of a recording (one of :data:`NAMES`), by its :func:`_hash_fraction`."""
+    fraction = _hash_fraction(dataset, segment)
     train, validation, test = shares
     # An empty split gets no recording, even if the percentages add up to slightly less than 100.
-    if place * 100.0 < train or validation == test == 0:
+    if fraction * 100.0 < train or validation == test == 0:
         return NAMES[0]
-    return NAMES[1] if place * 100.0 < train + validation or test == 0 else NAMES[2]
+    return NAMES[1] if fraction * 100.0 < train + validation or test == 0 else NAMES[2]
 
 
-def _place(dataset: str, segment: str) -> float:
+def _hash_fraction(dataset: str, segment: str) -> float:
     """Return the SHA-256 of a recording as a number in [0, 1)."""
     digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
@@ -96,14 +96,14 @@ def hold_out(
 
 
 def _choose(sizes: Mapping[tuple[str, str], int]) -> set[tuple[str, str]]:
-    """Return the recordings that fit into the share, taken in the order of their place; else the smallest one."""
+    """Return the recordings that fit into the share, tried in the order of their hashes; the smallest if none fits."""
     if len(sizes) < 2:
         return set()
-    order = sorted(sizes, key=lambda recording: _place(*recording))
-    free, chosen = min(HELD_OUT_SHARE * sum(sizes.values()), MOST_HELD_OUT), set()
+    order = sorted(sizes, key=lambda recording: _hash_fraction(*recording))
+    room, chosen = min(HELD_OUT_SHARE * sum(sizes.values()), MOST_HELD_OUT), set()
     for recording in order:
-        if sizes[recording] <= free:
-            free -= sizes[recording]
+        if sizes[recording] <= room:
+            room -= sizes[recording]
             chosen.add(recording)
     return chosen or {min(order, key=lambda recording: sizes[recording])}
 
@@ -111,7 +111,7 @@ def _choose(sizes: Mapping[tuple[str, str], int]) -> set[tuple[str, str]]:
 def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Shares) -> dict[str, int]:
     """Write ``splits/{train,validation,test}.txt`` and return the number of scenarios per split.
 
-    Each has one line ``dataset<TAB>scenario_id`` per scenario, in order.
+    Each file has one line ``dataset<TAB>scenario_id`` per scenario, in order.
     """
     lines: dict[str, list[str]] = {name: [] for name in NAMES}
     for entry in entries:

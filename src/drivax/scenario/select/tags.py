@@ -117,23 +117,23 @@ def type_of(path: EgoPath, graph: LaneGraph) -> str:
         return "straight"
     junction = junction_lanes(graph)
     lanes = path.lane[path.lane >= 0]
-    crosses = bool(junction[lanes].any())
+    is_in_junction = bool(junction[lanes].any())
     turn = _sharpest_turn(path)
-    if abs(turn) >= TURN_RAD and (crosses or len(lanes) < len(path.lane)):
+    if abs(turn) >= TURN_RAD and (is_in_junction or len(lanes) < len(path.lane)):
         if abs(turn) >= U_TURN_RAD:
             return "u_turn"
         return "turn_left" if turn > 0 else "turn_right"
     if _merges(lanes, graph, junction):
         return "merge"
-    if crosses:
+    if is_in_junction:
         return "junction"
     return "straight" if np.ptp(path.heading) < STRAIGHT_RAD else "lane_follow"
 
 
 def _sharpest_turn(path: EgoPath) -> float:
     """Largest change of heading within 40 m of driving, left positive, radians."""
-    within = np.abs(path.arc[:, None] - path.arc) <= TURN_WITHIN_M
-    turn = np.where(np.triu(within), path.heading - path.heading[:, None], 0.0)
+    is_within = np.abs(path.arc[:, None] - path.arc) <= TURN_WITHIN_M
+    turn = np.where(np.triu(is_within), path.heading - path.heading[:, None], 0.0)
     return float(turn.flat[np.abs(turn).argmax()])
 
 
@@ -146,9 +146,9 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
     for links, heading in ((graph.successor, end), (graph.predecessor, begin)):
         angle = wrap(heading[links][:, :, None] - heading[links][:, None])
         # A missing link (-1) reads the heading of the last lane; pairs with it do not count.
-        both = (links >= 0)[:, :, None] & (links >= 0)[:, None]
-        forks = (both & (np.abs(angle) > FORK_RAD)).any(axis=2)
-        result[links[forks]] = True
+        both_exist = (links >= 0)[:, :, None] & (links >= 0)[:, None]
+        is_fork = (both_exist & (np.abs(angle) > FORK_RAD)).any(axis=2)
+        result[links[is_fork]] = True
     return result & ((graph.lines.length <= JUNCTION_LANE_M) | graph.interpolating)
 
 
@@ -164,9 +164,9 @@ def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:
     """Return the density of road users within 50 m at the current step: below 5, 5 to 19, 20 or more."""
-    users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
-    users[tracks.ego] = False
-    distance = _ego_distance(tracks, np.flatnonzero(users))[:, current_step]
+    is_user = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
+    is_user[tracks.ego] = False
+    distance = _ego_distance(tracks, np.flatnonzero(is_user))[:, current_step]
     return TAGS["density"][int(np.searchsorted(DENSITY, (distance <= NEAR_M).sum(), side="right"))]
 
 
@@ -191,8 +191,8 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
 def _ego_distance(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row time"]:
     """Distance of tracks from the ego at every step, infinite if either is invalid."""
     offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
-    both = tracks.valid[rows] & tracks.valid[tracks.ego]
-    return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
+    both_valid = tracks.valid[rows] & tracks.valid[tracks.ego]
+    return np.where(both_valid, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:
@@ -200,14 +200,14 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
     rows = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
     rows = rows[rows != tracks.ego]
     angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
-    crosses = (angle >= CROSSING_RAD[0]) & (angle <= CROSSING_RAD[1])
+    is_crossing = (angle >= CROSSING_RAD[0]) & (angle <= CROSSING_RAD[1])
     speed = np.hypot(tracks.velocity[rows, :, 0], tracks.velocity[rows, :, 1])
-    return bool((crosses & (speed >= CROSSING_MPS) & (_ego_distance(tracks, rows) <= CROSSING_M)).any())
+    return bool((is_crossing & (speed >= CROSSING_MPS) & (_ego_distance(tracks, rows) <= CROSSING_M)).any())
 
 
 def _brakes(tracks: LocalTracks) -> bool:
-    """Whether the logged ego is slower by 2 m/s one second after some step."""
+    """Whether the logged ego is slower by 2 m/s or more one second after some step."""
     speed = np.hypot(*tracks.velocity[tracks.ego].T)
     valid, steps = tracks.valid[tracks.ego], round(1.0 / DT_S)
-    both = valid[steps:] & valid[:-steps]
-    return bool((both & (speed[:-steps] - speed[steps:] >= BRAKING_MPS)).any())
+    both_valid = valid[steps:] & valid[:-steps]
+    return bool((both_valid & (speed[:-steps] - speed[steps:] >= BRAKING_MPS)).any())
