@@ -85,7 +85,7 @@ def _load(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], 
 
 @partial(jax.jit, static_argnums=0)
 def _reset(simulator: Simulator, bank: ScenarioBank, row: Any) -> tuple[SimState, dict[str, Array]]:
-    """Return the first state of an episode and its observation."""
+    """Return the initial state of an episode and its observation."""
     state = simulator.reset(bank, row)
     return state, _observe(simulator, bank, state)
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from drivax.kernels.library import call, constants, in_use
 
-#: Arrays of all scenarios (``scenario.bank.scenario_bank``): agents, sizes, parked agents and when, states of lights.
+#: Arrays of all scenarios (``scenario.bank.scenario_bank``): agents, sizes, parked agents and their steps, lights.
 Logs = tuple[
     Float[Array, "N T A 8"], Float[Array, "N S 4"], Float[Array, "N S 8"], Shaped[Array, "N W S"],
     Int[Array, "N T L"],
@@ -26,7 +26,7 @@ Logs = tuple[
 Maps = tuple[Float[Array, "M R 7"], Int[Array, " M"], Float[Array, "N F L"]]
 #: Rows of an observation group and their mask.
 Group = tuple[Float[Array, "K F"], Bool[Array, " K"]]
-#: Kernel and bias of both layers of a set encoder, and their widths that are compiled.
+#: Kernel and bias of both layers of a set encoder, and the widths that are compiled.
 Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 _WIDTHS = (32, 64)
 
@@ -53,16 +53,16 @@ def read_frame(
     logs: Logs, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""], motion: Float[Array, " 4"],
     direction: Float[Array, " 2"],
 ) -> tuple[Agents, Int[Array, " L"]]:  # fmt: skip
-    """Return the agents at a step, and the states of lights; the driven agent is at its motion and the log's height.
+    """Return the agents at a step, the driven one with ``motion`` but its logged height, and the states of lights.
 
-    Without its own height, the frame depends on nothing that measuring changes: XLA computes it once per step.
+    The simulated height is left out because measuring changes it; without it, XLA computes the frame once per step.
 
     Args:
         logs: Arrays of all scenarios.
         index: Scenario.
-        step: Of the log.
-        slot: That of the driven agent; slots beyond the moving agents drive none.
-        motion: Its x, y, heading and speed.
+        step: Step of the log.
+        slot: Slot of the driven agent; no agent is driven if it is beyond the slots of moving agents.
+        motion: The driven agent's x, y, heading and speed.
         direction: Cosine and sine of its heading.
     """
     slots, lights = logs[1].shape[1], logs[4].shape[2]
@@ -81,13 +81,13 @@ def measure_contacts(
     agents: Agents, previous: tuple[Float[Array, "S 2"], Bool[Array, " S"]], slot: Int[Array, ""],
     speed: Float[Array, ""], unlawful: Bool[Array, ""], before: Int[Array, " S"], rules: Mapping[str, float],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """Return contact codes, whether a new contact is at fault, the type of the nearest one, and time to collision.
+    """Return contact codes, whether a new contact is at fault, type of the nearest new contact, time to collision (s).
 
     Args:
         agents: All agents.
         previous: Their velocities and ``valid`` one step before.
         slot: Slot of the driven agent.
-        speed: Its larger one of before and after the step, m/s.
+        speed: The larger of its speeds before and after the step, m/s.
         unlawful: Whether it is at fault in a lateral hit.
         before: Contact codes one step before.
         rules: ``ContactRules`` in ``native/contacts.cc``.
@@ -112,11 +112,11 @@ def look_ahead(
 
     Args:
         maps: Routes, numbers of their points, and stop lines of all scenarios.
-        agents: All agents, whose kinds do not count.
-        lights: States.
+        agents: All agents; their kinds are not used.
+        lights: States of the lights.
         numbers: Slot, scenario and route of the driven agent, and row of the arc lengths of stop lines on that route.
-        route_m: Arc length of the agent along it, m.
-        speed: Of the agent, m/s.
+        route_m: Arc length of the driven agent along its route, m.
+        speed: Speed of the driven agent, m/s.
         min_gap_m: Gap that the driver keeps behind a standing leader.
         rules: ``FollowingRules`` in ``native/following.cc``.
     """
@@ -133,10 +133,10 @@ class SegmentGrid(NamedTuple):
 
     Attributes:
         segments: Segments of lanes or of edges, by feature.
-        start: First segment of each cell, and the end.
+        start: Index of the first segment of each cell, and of the end of the last cell.
         origin: Smallest x, y of each grid.
-        cell_m, longest_run: Size of a cell; longest run of three neighbouring cells.
-        long_ego: Whether corners of some vehicle lie outside of the cells around its centre.
+        cell_m, longest_run: Size of a cell; largest number of segments in three neighbouring cells of a row.
+        long_ego: Whether corners of some ego can lie outside of the cells around its centre.
     """
 
     segments: Float[Array, "N features S"]
@@ -176,7 +176,7 @@ class Lanes(NamedTuple):
 def supports_grid(
     grid: SegmentGrid, corners: Float[Array, "corners 2"], *others: Float[Array, "..."]
 ) -> bool:
-    """Whether the native kernels are in use and have these types: single precision, and four corners."""
+    """Return whether native kernels are in use and support these arrays: float32, int16 cell starts, four corners."""
     types = {array.dtype for array in (grid.segments, corners, *others)}
     is_compiled = types == {jnp.dtype(jnp.float32)} and grid.start.dtype == jnp.int16 and len(corners) == 4
     return is_compiled and in_use()
@@ -186,15 +186,15 @@ def query_lanes(
     grid: SegmentGrid, map_box: Float[Array, "N 4"], index: Int[Array, ""], box: Box, ego: Int[Array, ""],
     routed: Bool[Array, ""], rules: Mapping[str, float],
 ) -> Lanes:  # fmt: skip
-    """Return what is known of the lanes around a box.
+    """Query the lanes around a box.
 
     Args:
         grid: Segments of lanes.
         map_box: Smallest and largest x, y of each map.
-        index: Number of the scenario.
+        index: Scenario.
         box: Pose of the box.
-        ego: Number of the ego of the scenario whose corridor counts.
-        routed: Whether lanes of the corridor are driven before others.
+        ego: Number of the scenario's ego whose corridor counts.
+        routed: Whether the box drives lanes of the corridor rather than other lanes that fit.
         rules: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
     """
     flag, number = (jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.bool_, jnp.float32))
@@ -216,12 +216,12 @@ def query_edges(
     Args:
         grid: Segments of edges.
         sides: Packed drivable sides of the parts of cells, ``split`` along each axis.
-        index: Number of the scenario.
+        index: Scenario.
         centre: Centre of the box.
-        corners: Its corners.
+        corners: Corners of the box.
         near_lane: Whether a lane is near each corner.
-        ground: Height of the ground.
-        rules: ``cutoff_m``, ``level_m``, and of the parts of cells ``split`` and ``not_drivable``.
+        ground: Height of the ground, m.
+        rules: ``cutoff_m``, ``level_m``, and for the parts of cells ``split`` and ``not_drivable``.
     """
     results = [jax.ShapeDtypeStruct((4,), jnp.float32)]
     batched = (index, centre, corners, near_lane, ground)
@@ -257,15 +257,15 @@ def observe_road(
     road_at: Float[Array, "N 3 O"], road: Float[Array, "N O 7"], curvature: Float[Array, "N O"], ego: Ego,
     count: int, columns: Sequence[int], layers: Sequence[int], rules: Mapping[str, float],
 ) -> Group:  # fmt: skip
-    """Return the first ``count`` pieces of road of some ``layers`` in a box around ego.
+    """Return the first ``count`` pieces of road that lie in a box around ego and are of some ``layers``.
 
     Args:
-        road_at: Positions and layers of the bank's pieces.
-        road: These pieces.
+        road_at: Positions and layers of all pieces in the bank.
+        road: All columns of these pieces.
         curvature: Their ``road_curvature``.
         ego: The driven agent.
         count: Number of rows K.
-        columns: Numbers of the columns F among all of the group.
+        columns: Numbers of the F columns among all columns of the group.
         layers: Numbers of the layers.
         rules: Range and units: the numbers of ``RoadRows`` in ``native/road_rows.cc``.
     """
@@ -284,18 +284,18 @@ def observe_agents(
 
     Args:
         sizes: ``agent_box`` of the bank.
-        routes: Routes, their numbers of points, and the places on ego's, relative to ego (m), on which agents are
-            projected.
+        routes: Routes, their numbers of points, and the arc lengths relative to ego (m) of the points on its route that
+            agents are projected on.
         frame: Boxes, velocities, validity and kinds of all agents (``simulator.types.Frame``).
         ego: The driven agent.
         count: Number of rows K.
-        columns: Numbers of the columns F among all of the group.
+        columns: Numbers of the F columns among all columns of the group.
         kinds: Kinds of agents, in the order of the columns of their types.
         rules: Units: the numbers of ``AgentRows`` in ``native/agent_rows.cc``.
     """
     box, velocity, valid, kind = frame
-    places = _int(ego.slot), _int(ego.index), _int(ego.row), ego.route_m, ego.has_route
-    batched = (box, velocity, valid, _int(kind), *places, ego.motion, ego.direction)
+    ego_state = _int(ego.slot), _int(ego.index), _int(ego.row), ego.route_m, ego.has_route
+    batched = (box, velocity, valid, _int(kind), *ego_state, ego.motion, ego.direction)
     attributes = constants(rules) | {"columns": _numbers(columns), "kinds": _numbers(kinds)}
     rows, mask = call(
         "observe_agents", _shapes(count, columns), (sizes, *routes), batched, attributes=attributes
@@ -311,10 +311,10 @@ def observe_route(
 
     Args:
         routes: Routes and their numbers of points.
-        goal: As in the bank.
+        goal: x, y of each route's goal.
         ego: The driven agent.
-        columns: Numbers of the columns F among all of the group.
-        offsets_m: Places of the K points.
+        columns: Numbers of the F columns among all columns of the group.
+        offsets_m: Arc lengths of the K points relative to ego, m.
         rules: Window of the curvature and units: the numbers of ``RouteRows`` in ``native/route_rows.cc``.
     """
     batched = (_int(ego.row), ego.route_m, ego.has_route, ego.motion, ego.direction)
@@ -338,7 +338,7 @@ def _numbers(values: Sequence[int]) -> np.ndarray:
 
 
 def supports_layers(layers: Layers, activation: str) -> bool:
-    """Whether the native kernel is in use and has these layers: two of the same width, with relu."""
+    """Return whether native kernels are in use and support these layers: two of one compiled width, with relu."""
     widths = {bias.shape[0] for _, bias in layers}
     is_compiled = len(layers) == 2 and len(widths) == 1 and widths <= set(_WIDTHS)
     return is_compiled and activation == "relu" and in_use()

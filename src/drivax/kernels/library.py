@@ -35,27 +35,27 @@ def _load() -> ctypes.CDLL | str:
     """Return the library with its kernels registered, or why it is not used."""
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
-    build = "make native" if (SOURCES / "build.py").is_file() else "install drivax again"
+    cure = "make native" if (SOURCES / "build.py").is_file() else "install drivax again"
     if not PATH.exists():
-        return f"none: {build} (on Linux x86-64)"
+        return f"none: {cure} (on Linux x86-64)"
     try:
         if problem := _access_problem():
             return f"none: {PATH} or its folder {problem}"
         problem = _build_problem()
-        return f"none: {PATH} {problem}: {build}" if problem else _register()
+        return f"none: {PATH} {problem}: {cure}" if problem else _register()
     except (OSError, AttributeError, ValueError, RuntimeError) as error:
         message = str(error).partition("\n")[0]
-        return f"none: {PATH} does not load here ({message}): {build}"
+        return f"none: {PATH} does not load here ({message}): {cure}"
 
 
 def _access_problem() -> str | None:
     """Return why the library is easier to write than the package's own code, and the cure, or None."""
-    own = Path(__file__).stat()
+    own_status = Path(__file__).stat()
     for path in (PATH.resolve(), PATH.resolve().parent, PATH.parent):
         status = path.stat()
-        if status.st_mode & ~own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        if status.st_mode & ~own_status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             return f"is writable by other users: chmod go-w {path}"
-        if status.st_uid not in {0, os.getuid(), own.st_uid}:
+        if status.st_uid not in {0, os.getuid(), own_status.st_uid}:
             return f"belongs to another user: chown {os.getuid()} {path}"
     return None
 
@@ -70,14 +70,14 @@ def _build_problem() -> str | None:
     for name, value in stamp(SOURCES).items():
         if built.get(name) != value:
             return f"was built for {name} {built.get(name)}, this is {value}"
-    # Loading it without the sanitizer ends the process.
+    # Loading a library with sanitizers ends a process without them.
     if "sanitize" in built.get("options", "") and "asan" not in os.environ.get("LD_PRELOAD", ""):
         return "is for tests with sanitizers"
     return None
 
 
 def _register() -> ctypes.CDLL:
-    # Backends that start later would raise the errors of registration, such as of XLA's version, and not start.
+    # Start the backend first: a later start would raise errors of registration, such as of XLA's version, and fail.
     jax.default_backend()
     library = ctypes.CDLL(str(PATH))
     for name in ("drivax_kernels", "drivax_target", "drivax_hash"):
@@ -89,12 +89,12 @@ def _register() -> ctypes.CDLL:
 
 
 def _target_name(library: ctypes.CDLL, kernel: str) -> str:
-    """Name with the hash of the build, since compiled programs are cached longer than builds live."""
+    """Return a name with the hash of the build, because cached programs outlive builds."""
     return f"drivax_{kernel}_{library.drivax_hash().decode()}"
 
 
 def state() -> str:
-    """Return what is in use, or why none is, as in ``drivax doctor``."""
+    """Return which library is in use, or why none is, for ``drivax doctor``."""
     library = _load()
     if isinstance(library, str):
         return library
@@ -103,7 +103,7 @@ def state() -> str:
 
 
 def in_use() -> bool:
-    """Whether programs that are traced now call native kernels: on CPUs, if the library is there, in float32."""
+    """Return whether programs that are traced now call native kernels: in float32 on CPUs, if the library loads."""
     is_float32 = jax.dtypes.canonicalize_dtype(float) == jnp.float32
     is_loaded = not isinstance(_load(), str)
     return _allowed.value and is_float32 and is_loaded and jax.default_backend() == "cpu"
@@ -115,7 +115,7 @@ def without_kernels() -> contextlib.AbstractContextManager[None]:
 
 
 def with_reference(native: Callable[..., Any], reference: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``native`` with the derivatives of ``reference``, which computes the same of the same arrays."""
+    """Return ``native`` with the derivatives of ``reference``, which computes the same values from the same arrays."""
     function = jax.custom_jvp(native)
 
     @function.defjvp
@@ -163,8 +163,8 @@ def call(
         return _divide(run_share, lead(batched), sums)(common, batched)
 
     def run_share(common: Any, batched: Any) -> list[Any]:
-        first = () if sums else lead(batched)
-        shapes = [jax.ShapeDtypeStruct((*first, *result.shape), result.dtype) for result in results]
+        axes_shape = () if sums else lead(batched)
+        shapes = [jax.ShapeDtypeStruct((*axes_shape, *result.shape), result.dtype) for result in results]
         return list(jax.ffi.ffi_call(name, shapes)(*common, *batched, **(attributes or {})))
 
     def lead(batched: Any) -> tuple[int, ...]:

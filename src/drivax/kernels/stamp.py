@@ -1,4 +1,4 @@
-"""What a compiled library is for; the build appends it to the file, which is checked before it is loaded.
+"""Stamp of a compiled library, which says what it was built for: appended by the build, and checked before loading.
 
 ``native/build.py`` runs this file by its path: it needs only JAX and the standard library.
 """
@@ -17,7 +17,7 @@ _VERSION = re.compile(r"#define XLA_FFI_API_MAJOR (\d+)")
 
 
 def stamp(sources: Path) -> dict[str, str]:
-    """Return platform, major version of XLA's foreign function interface, and hash of the sources, if any."""
+    """Return platform, major version of XLA's foreign function interface, and hash of the sources if they exist."""
     header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h")
     values = {"platform": sysconfig.get_platform(), "XLA FFI": "".join(_VERSION.findall(header.read_text()))}
     if (sources / "build.py").is_file():
@@ -30,13 +30,13 @@ def stamp(sources: Path) -> dict[str, str]:
 
 
 def append_stamp(library: bytes, values: dict[str, str]) -> bytes:
-    """Return a library with its stamp and, as the last line, the SHA-256 of all before."""
+    """Return a library with its stamp and, as the last line, the SHA-256 of everything before it."""
     stamped = library + b"\n" + json.dumps(values).encode()
     return stamped + b"\n" + hashlib.sha256(stamped).hexdigest().encode()
 
 
 def read_stamp(library: bytes) -> dict[str, str] | None:
-    """Return the stamp of a library; None: it has none, or is not complete."""
+    """Return the stamp of a library; None if it has none or is incomplete."""
     stamped, _, digest = library.rpartition(b"\n")
     if hashlib.sha256(stamped).hexdigest().encode() != digest:
         return None

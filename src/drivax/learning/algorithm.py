@@ -1,4 +1,4 @@
-"""Protocols of algorithms: what the training loop needs of a built-in algorithm or of one of your own."""
+"""Protocols of algorithms: what the training loop needs from a built-in algorithm or from your own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivax.errors import UsageError
 from drivax.learning.environment import Environment, Environments, Outcome, Rollout, SampledAction
 from drivax.planners.planner import Planner
 
-#: An additional loss of a policy: from its parameters and a key to the loss, and values to log.
+#: An additional loss of a policy: maps its parameters and a key to the loss and values to log.
 AuxiliaryLoss = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
@@ -21,7 +21,7 @@ class LearnerState(Protocol):
     """A pytree with all that a run needs to continue: a ``scenario.record.record``, so that leaves have names.
 
     A class attribute ``networks`` names the fields that fine-tuning takes over from another run, by default
-    ``parameters``; a field may be such a state itself. Training stops if a number is not finite, other than in fields
+    ``parameters``; a field may itself be such a state. Training stops if a number is not finite, except in the fields
     ``environments`` and ``replay``.
     """
 
@@ -38,13 +38,13 @@ class LearnerState(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """An algorithm in one environment; everything computed is in the state.
+    """An algorithm in one environment; everything that training changes is in the state.
 
-    A learner that divides its batches among devices has their size as attribute ``batch``.
+    A learner that divides its batches among devices has the batch size as attribute ``batch``.
     """
 
     def init(self, data: Any, key: Array) -> Any:
-        """Return the first state (:class:`LearnerState`). Pure."""
+        """Return the initial state (:class:`LearnerState`). Pure."""
         ...
 
     def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
@@ -61,10 +61,10 @@ class Learner(Protocol):
 
 @runtime_checkable
 class Agent(Learner, Protocol):
-    """A learner that interacts with its environment, in parts for a training loop of your own.
+    """A learner that interacts with its environment, split into parts for a training loop of your own.
 
-    ``iterate`` is a rollout of :meth:`sample_action`, then ``update(data, state, rollout)`` on-policy; off-policy
-    ``buffer.add`` to ``state.replay`` and ``update(data, state)``.
+    ``iterate`` collects a rollout with :meth:`sample_action`. On-policy it then calls ``update(data, state, rollout)``;
+    off-policy it adds the rollout to ``state.replay`` (``buffer.add``) and calls ``update(data, state)``.
     """
 
     environment: Any
@@ -78,7 +78,7 @@ class Agent(Learner, Protocol):
         ...
 
     def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
-        """Return one row of a rollout, with what this agent learns from."""
+        """Return one row of a rollout, with the arrays that this agent learns from."""
         ...
 
 
@@ -88,11 +88,11 @@ class AlgorithmConfig(Protocol):
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps that one iteration counts as."""
+        """Number of environment steps that one iteration counts as."""
         ...
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Learner:
-        """Return the learner of a run of ``iterations``; reads only shapes of the data."""
+        """Return the learner of a run of ``iterations``; only shapes of the data are read."""
         ...
 
 
@@ -101,7 +101,7 @@ class OfflineAlgorithm(Protocol):
     """Settings of an algorithm that learns from logged steps, which are prepared once before training."""
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the ``data`` of :meth:`Learner.iterate`: the environment's data, with steps drawn by weight.
+        """Return the ``data`` of :meth:`Learner.iterate`: the environment's data, with logged steps to draw by weight.
 
         None if these settings use no logged steps.
         """
@@ -120,15 +120,15 @@ class HeldOutMetrics(Protocol):
 def training_data(
     config: AlgorithmConfig, environment: Environment, data: Any, weights: np.ndarray | None = None
 ) -> Any:
-    """Return the data of a learner's iterations: the environment's, or the logged experience in them.
+    """Return the data of a learner's iterations: the environment's data, or the logged experience in it.
 
-    ``weights`` are ``[N, T]`` of every logged step, at least 0; None: uniform.
+    ``weights`` ``[N, T]`` are the sampling weights of all logged steps, at least 0; None: uniform.
 
     Raises:
         UsageError: There are weights, but the algorithm does not draw logged steps by weight.
     """
-    offline = isinstance(config, OfflineAlgorithm)
-    experience = config.experience(environment, data, weights) if offline else None
+    is_offline = isinstance(config, OfflineAlgorithm)
+    experience = config.experience(environment, data, weights) if is_offline else None
     if experience is not None:
         return experience
     if weights is not None:

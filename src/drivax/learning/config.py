@@ -40,7 +40,7 @@ Algorithm = (
 SELF = "self"
 #: Largest number of kinds of traffic in a training.
 MOST_SHARES = 16
-#: Largest difference of a sum of shares from 1.
+#: Largest deviation of the sum of shares from 1.
 _ROUNDING = 1e-3
 
 
@@ -55,14 +55,14 @@ class TrainConfig:
         task: Actions, observation, reward, termination, and the metrics that are logged during training.
         algorithm: Learning algorithm and its settings.
         traffic: How other agents move; see :func:`~drivax.learning.policies.find_traffic`. ``self``: the policy in
-            training drives them. A mixture gives the share of the environments of each, which sum to 1.
+            training drives them. A mixture maps traffic to its share of the environments; shares sum to 1.
         self_play: Settings of the traffic ``self``.
         start: How training episodes begin; those of self-play and of validation begin as logged, the latter at step 10.
-        egos: Who drives in training: the recorded ego, or any vehicle of the set with a route and a goal (``moving``,
-            of a set made with ``--egos``). Validation episodes are those of the recorded ego.
+        egos: Vehicle that the policy drives in training: the recorded ego, or any vehicle with a route and a goal
+            (``moving``, of a set made with ``--egos``). In validation it is the recorded ego.
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two (exceptions:
-            :class:`~drivax.learning.driving.Driving`); the first ones of a run also later, so that they end at
-            different times.
+            :class:`~drivax.learning.driving.Driving`). The first episodes of a run may also begin later, so that they
+            end at different times.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
             over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.
@@ -70,7 +70,7 @@ class TrainConfig:
         keep: Number of newest checkpoints to keep in addition to the best.
         checkpoint_rule: How validation ranks checkpoints; see :data:`~drivax.learning.training_log.Rule`.
         patience: Validations without improvement after which training stops; 0: never.
-        devices: Number of this machine's devices; None: the most that divide seeds, environments or batch.
+        devices: Number of local devices; None: the largest number that divides seeds, environments or batch.
     """
 
     total_steps: int = 2_000_000
@@ -119,20 +119,20 @@ class TrainConfig:
         self.environment(LogTraffic())  # checks the steps at which episodes begin
 
     def environment(self, traffic: Traffic) -> Driving:
-        """Return an environment of training with a traffic model (``policies.find_traffic``)."""
+        """Return the training environment with a traffic model (``policies.find_traffic``)."""
         simulator = Simulator(self.task, traffic, self.start)
         return Driving(simulator, self.latest_start, self.earliest_start, self.egos)
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of the environments of each traffic, without shares of 0."""
+        """Share of the environments of each kind of traffic; shares of 0 are left out."""
         if isinstance(self.traffic, str):
             return {self.traffic: 1.0}
         return {name: share for name, share in self.traffic.items() if share}
 
     @property
     def validation_traffic(self) -> str:
-        """Traffic of validation: the log, or the largest share other than ``self`` of a training without it."""
+        """Traffic of validation: the log, or if training does not use it, the largest share other than ``self``."""
         others = {name: share for name, share in self.shares.items() if name != SELF}
         return "log" if "log" in others else max(others, key=lambda name: others[name], default="log")
 

@@ -29,9 +29,9 @@ from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import Discrete, Route
 from drivax.tasks.task import Task
 
-#: Drivers of training episodes: the recorded ego, or any of the set's egos (``scenario.build.assemble``).
+#: Vehicles that the policy drives in training: recorded egos, or any ego of a scenario (``scenario.build.assemble``).
 Egos = Literal["recorded", "moving"]
-#: Logs that are replayed in one batch.
+#: Number of logs that are replayed in one batch.
 _BATCH = 64
 
 
@@ -42,9 +42,9 @@ class Driving:
     Attributes:
         simulator: Task, traffic and kind of start.
         latest_start, earliest_start: Episodes begin at a random step of the log between the two, those of
-            :meth:`start` up to the third last; at step 10 if the ego is not valid then, or if the third last step of
-            its log is before ``earliest_start``.
-        egos: Who drives: the recorded ego, or one of the egos of the scenario, with equal odds. Rows of logged steps
+            :meth:`start` up to the third last. They begin at step 10 if the ego is not valid at that step, or if the
+            third last step of its log is before ``earliest_start``.
+        egos: Vehicle to drive: the recorded ego, or a uniformly drawn ego of the scenario. Rows of logged steps
             (:data:`~drivax.learning.experience.StepIndex`) are scenarios, or the rows of all egos in the bank.
     """
 
@@ -74,7 +74,7 @@ class Driving:
 
     @property
     def action_size(self) -> int:
-        """Size of an action."""
+        """Number of components of an action."""
         return self.task.actions.size
 
     @property
@@ -89,16 +89,17 @@ class Driving:
 
     @property
     def penalties(self) -> dict[str, float]:
-        """Minus the weights below 0 of the reward, by term, without weights that a condition changes."""
+        """Absolute values of the reward's negative weights, by term, except of weights that are conditions."""
         conditions = {condition.name for condition in self.task.conditions}
-        return {name: x for name, x in self.task.rewards.penalties.items() if name not in conditions}
+        penalties = self.task.rewards.penalties
+        return {name: weight for name, weight in penalties.items() if name not in conditions}
 
     def prepare(self, data: ScenarioBank) -> ScenarioBank:
         """Return the bank with the data that the traffic model needs."""
         return prepare_bank(self.simulator.traffic, data)
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
-        """Shapes of one observation by group."""
+        """Return the shape of each group of one observation."""
         # Traffic and start change no shape; those of the log need no prepared bank.
         simulator = replace(self.simulator, traffic=LogTraffic(), start=LogStart())
         observation = jax.eval_shape(
@@ -112,11 +113,11 @@ class Driving:
         Raises:
             UsageError: ``earliest_start`` or ``latest_start`` is too late.
         """
-        last = data.steps - 3
-        if self.earliest_start > last:
-            raise UsageError(f"earliest_start is {self.earliest_start}", cure=f"use 0 to {last}")
-        if self.latest_start > last:
-            cure = f"use {self.earliest_start} (earliest_start) to {last}"
+        last_step = data.steps - 3
+        if self.earliest_start > last_step:
+            raise UsageError(f"earliest_start is {self.earliest_start}", cure=f"use 0 to {last_step}")
+        if self.latest_start > last_step:
+            cure = f"use {self.earliest_start} (earliest_start) to {last_step}"
             raise UsageError(f"latest_start is {self.latest_start}", cure=cure)
         state, over = self._reset(data, key, count)
         return Environments(state, over, self.observe_all(data, state.context))
@@ -143,7 +144,7 @@ class Driving:
     ) -> tuple[Environments, Outcome]:
         """Hold a decision for ``Task.hold`` steps in every environment, or reset it where its episode is over.
 
-        An episode that ends while a decision is held counts no further step. Rewards of the steps are added.
+        The rewards of these steps are summed. Steps after the end of an episode do not count.
         """
         return map_over_devices(self._step_all, data, (now, cache, action, drawn))
 
@@ -152,8 +153,8 @@ class Driving:
     ) -> tuple[Environments, Outcome]:
         """Return environments and outcomes after a decision, given where new episodes would start.
 
-        ``Outcome.totals`` have an axis of devices (on one device of size 1): their sum after the rollout takes a single
-        exchange.
+        ``Outcome.totals`` have an axis of devices (of size 1 on one device), so that devices exchange their sums only
+        once, after the rollout.
         """
         now, cache, action, start = batch
         state, result = self._step_or_reset(data, now, cache, action, start)
@@ -161,25 +162,25 @@ class Driving:
 
         def step_on(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
             """Take another step of the decision of every episode that neither ended nor started."""
-            state, last, (reward, terms, terminated, truncated) = carry
+            state, last_step, (reward, terms, terminated, truncated) = carry
             idle = now.over | terminated | truncated
             state, result = self._step_on(data, state, action, idle)
-            last = jnp.where(idle, last, state.context.step)
-            more = jax.tree.map(
+            last_step = jnp.where(idle, last_step, state.context.step)
+            step_rewards = jax.tree.map(
                 lambda value: jnp.where(idle, 0.0, value), (result.reward, result.reward_terms)
             )
-            reward, terms = jax.tree.map(jnp.add, (reward, terms), more)
+            reward, terms = jax.tree.map(jnp.add, (reward, terms), step_rewards)
             ends = (terminated | (result.terminated & ~idle), truncated | (result.truncated & ~idle))
-            return (state, last, (reward, terms, *ends)), None
+            return (state, last_step, (reward, terms, *ends)), None
 
-        last = state.context.step
-        # Even a scan over nothing is traced and compiled.
+        carry = (state, state.context.step, summed)
+        # Even a scan of length 0 is traced and compiled.
         if self.task.hold > 1:
-            (state, last, summed), _ = jax.lax.scan(step_on, (state, last, summed), None, self.task.hold - 1)
-        reward, terms, terminated, truncated = summed
+            carry, _ = jax.lax.scan(step_on, carry, None, self.task.hold - 1)
+        state, last_step, (reward, terms, terminated, truncated) = carry
         ends = terminated | truncated
         # Metrics end with the episode, although vehicles of self-play drive on.
-        episodes = replace(state, context=replace(state.context, step=last))
+        episodes = replace(state, context=replace(state.context, step=last_step))
         totals = {n: total[None] for n, total in _totals(data, episodes, terms, ends, now.over).items()}
         outcome = Outcome(reward, terminated, truncated, self.cache(data, state), totals, terms)
         over = self._over(data, state, now.over, ends)
@@ -207,7 +208,7 @@ class Driving:
     def _over(
         self, data: ScenarioBank, state: SimState, over: Bool[Array, " B"], ends: Bool[Array, " B"]
     ) -> Bool[Array, " B"]:
-        """Return which episodes are over after a step, given those before and those that ended in it."""
+        """Return which episodes are over after a step, given which were over before it and which end in it."""
         return ends
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:
@@ -215,8 +216,8 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        All steps of an ego at which it is valid, then and in the next two, are equally probable. Of an ego without any,
-        step 10 is taken.
+        Steps are drawn uniformly from those at which the ego is valid, as it is at the two after them; if an ego has no
+        such step, step 10 is drawn.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
@@ -240,7 +241,7 @@ class Driving:
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
 
-        All agents follow the log, because the outcome of the expert's actions is only known among these.
+        All agents follow the log, because only then is the outcome of the expert's actions known.
         """
         egos = 1 if self.egos == "recorded" else data.most_egos
         rows = jnp.arange(len(data) * egos)
@@ -261,7 +262,7 @@ class Driving:
         return Simulator(replace(self.task, metrics="none"))
 
     def _ego_of(self, bank: ScenarioBank, row: Array) -> tuple[Array, Any]:
-        """Return scenario and slot of a row of logged steps; rows without an ego have the slot of the recorded one."""
+        """Return scenario and slot of a row of logged steps; a row without an ego has the slot of the recorded ego."""
         if self.egos == "recorded":
             return row, 0
         return bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
@@ -277,35 +278,35 @@ class Driving:
     ) -> tuple[Int[Array, " B"], Int[Array, " B"], Any, Array]:
         """Draw scenarios, steps, slots of egos, and keys of episodes.
 
-        Steps are at most the third last. Where the ego is not valid, step 10 is taken; with ``has_action``, where the
-        expert has no action, another step that has one is drawn, if there is any. The slot is None if all egos are the
-        recorded ones.
+        Steps are at most the third last, and step 10 where the ego is not valid. With ``has_action``, a step without an
+        expert action is drawn again from those with one, or is step 10 if there is none. The slot is None if all egos
+        are the recorded ones.
         """
         index_key, step_key = jax.random.split(key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
         slot, row = None, index * bank.most_egos
         if self.egos == "moving":
-            number = jax.random.randint(
+            ego_number = jax.random.randint(
                 jax.random.fold_in(index_key, 1), (count,), 0, (bank.egos[index] >= 0).sum(axis=1)
             )
-            slot, row = bank.egos[index, number], row + number
-        last = bank.last_step[row] - 2
-        last = last if latest is None else jnp.minimum(last, latest)
-        step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last, earliest) + 1)
+            slot, row = bank.egos[index, ego_number], row + ego_number
+        last_step = bank.last_step[row] - 2
+        last_step = last_step if latest is None else jnp.minimum(last_step, latest)
+        step = jax.random.randint(step_key, (count,), earliest, jnp.maximum(last_step, earliest) + 1)
         # Egos are always valid at the current step.
-        ego, other = 0 if slot is None else slot, jnp.int32(CURRENT_STEP)
+        ego_slot, fallback_step = 0 if slot is None else slot, jnp.int32(CURRENT_STEP)
         if has_action:
             steps = jnp.arange(bank.steps)
-            usable = _has_successors(bank.agents[index, :, ego, AgentColumn.VALID] > 0)
-            usable &= (earliest <= steps) & (steps <= last[:, None])
+            usable = _has_successors(bank.agents[index, :, ego_slot, AgentColumn.VALID] > 0)
+            usable &= (earliest <= steps) & (steps <= last_step[:, None])
             rank = jax.random.randint(jax.random.fold_in(step_key, 2), (count,), 1, usable.sum(axis=1) + 1)
             drawn = jnp.argmax(jnp.cumsum(usable, axis=1) == rank[:, None], axis=1)
-            other = jnp.where(usable.any(axis=1), drawn, other)
+            fallback_step = jnp.where(usable.any(axis=1), drawn, fallback_step)
             is_usable = usable[jnp.arange(count), step]
         else:
-            is_usable = (bank.agents[index, step, ego, AgentColumn.VALID] > 0) & (step <= last)
-        step = jnp.where(is_usable, step, other)
-        # Unused, and not computed, with logged starts and without conditions.
+            is_usable = (bank.agents[index, step, ego_slot, AgentColumn.VALID] > 0) & (step <= last_step)
+        step = jnp.where(is_usable, step, fallback_step)
+        # Logged starts without conditions use no keys; the compiler then removes this line.
         keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
         return index, step, slot, keys
 
@@ -320,30 +321,30 @@ class Driving:
     def _expert_action(
         self, bank: ScenarioBank, context: AgentContext
     ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
-        """Return the expert's action within bounds and rates (``route``: bounds), and whether it exceeded bounds."""
+        """Return the expert's action, clipped to bounds (and rates unless ``route``), and whether it exceeds bounds."""
         space = self.task.actions
         action = expert_action(bank, context, space)
-        # In the space ``route`` the executed action is another one than that which a policy requests.
+        # In the space ``route``, the executed action is not in the space of the requested one.
         is_route = isinstance(space, Route)
         target = jnp.clip(action, -1.0, 1.0) if is_route else self.task.actuate(bank, context, action)
         return target, space.exceeds_bounds(action)
 
     def _rollout(self, bank: ScenarioBank, row: Int[Array, ""]) -> tuple[Array, ...]:
-        """Action, reward, terminated, truncated and clipped of an expert from the current step on."""
+        """Return action, reward, terminated, truncated and clipped of the expert from the current step on."""
         simulator, (index, slot) = self._log_simulator, self._ego_of(bank, row)
-        first = simulator.reset(bank, index, slot=slot)
-        first = replace(first, context=self._logged_context(bank, index, first.start, slot))
+        initial = simulator.reset(bank, index, slot=slot)
+        initial = replace(initial, context=self._logged_context(bank, index, initial.start, slot))
 
         def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
             action, clipped = self._expert_action(bank, state.context)
             after, result = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
             return after, (action, result.reward, result.terminated, result.truncated, clipped)
 
-        return jax.lax.scan(step, first, None, bank.steps - 1 - CURRENT_STEP)[1]
+        return jax.lax.scan(step, initial, None, bank.steps - 1 - CURRENT_STEP)[1]
 
 
 def keep(mask: Bool[Array, " B"], old: Any, new: Any) -> Any:
-    """Return a batch with its ``old`` elements where masked, else the ``new`` ones."""
+    """Return a batch with the ``old`` elements where ``mask`` holds, else the ``new`` ones."""
     return jax.vmap(lambda mask, old, new: jax.tree.map(partial(jnp.where, mask), old, new))(mask, old, new)
 
 
@@ -359,7 +360,7 @@ def _bind_bank(function: Callable[..., Any], bank: ScenarioBank) -> Callable[...
 def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
     """Mask of steps with an expert action, for the first ``egos`` egos of each scenario.
 
-    From the current step on, the ego must be valid at the step and at the two after it.
+    These are steps from the current one on at which the ego is valid, as it is at the next two.
     """
     steps, slot = jnp.arange(bank.steps), bank.egos[:, :egos, None]
     valid = bank.agents[jnp.arange(len(bank))[:, None, None], steps, slot, AgentColumn.VALID] > 0
@@ -369,7 +370,7 @@ def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
 
 
 def _has_successors(valid: Bool[Array, "M T"]) -> Bool[Array, "M T"]:
-    """Mask of steps that are valid, as are the two after them."""
+    """Mask of valid steps that are followed by two valid steps."""
     return jnp.pad(valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:], ((0, 0), (0, 2)))
 
 

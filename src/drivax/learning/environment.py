@@ -23,7 +23,7 @@ from drivax.scenario.record import record
 class Environments:
     """State and observation of a batch of environments.
 
-    Where an episode is ``over``, the next step resets it, or waits (self-play): it is no step to learn from.
+    Where an episode is ``over``, the next step resets the environment or waits (self-play); mask that step.
     """
 
     #: The axis that counts environments, which several devices divide.
@@ -43,9 +43,9 @@ class Outcome:
         terminated: The episode ended by a failure: bootstrap zero.
         truncated: The episode was cut off: bootstrap the value of the next state.
         cache: :meth:`Environment.cache` of the new state.
-        totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, or
-            ``"reward/<name>"`` over steps. Each is an array of any shape of partial sums.
-        terms: Terms of the reward by name, with their weights; those of ``Environment.penalties`` are read.
+        totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, and
+            ``"reward/<name>"`` over steps. Each is an array of partial sums, of any shape.
+        terms: Weighted terms of the reward by name; algorithms read those of ``Environment.penalties``.
     """
 
     reward: Float[Array, " B"]
@@ -60,23 +60,23 @@ class Outcome:
 class Environment(Protocol):
     """An environment that algorithms train in.
 
-    One whose reward algorithms may constrain has a mapping ``penalties``: the terms of its outcomes with a constant
-    weight below 0, and minus these weights. With a method ``past(count) -> PastPolicy`` it has environments that an
-    older copy of the policy drives.
+    An optional mapping ``penalties`` lets algorithms constrain the reward: it has the terms with a constant negative
+    weight, and the absolute values of these weights. An optional method ``past(count) -> PastPolicy`` returns the
+    environments that an older copy of the policy drives.
     """
 
     @property
     def action_size(self) -> int:
-        """Size of an action; each number lies in [-1, 1]."""
+        """Number of components of an action; each lies in [-1, 1]."""
         ...
 
     @property
     def levels(self) -> tuple[tuple[float, ...], ...] | None:
-        """Ascending values that each number of an action can take; None if actions are continuous."""
+        """Ascending values that each component of an action can take; None if actions are continuous."""
         ...
 
     def shapes(self, data: Any) -> dict[str, tuple[int, ...]]:
-        """Shapes of one observation by group; reads only shapes of the data."""
+        """Return the shape of each group of one observation; only shapes of the data are read."""
         ...
 
     def start(self, data: Any, key: Array, count: int) -> Environments:
@@ -84,7 +84,7 @@ class Environment(Protocol):
         ...
 
     def stored(self, state: Any) -> Any:
-        """Return the part of states that the replay buffer stores; they can be observed from it."""
+        """Return the part of states that the replay buffer stores, which suffices to observe them."""
         ...
 
     def observe_all(self, data: Any, stored: Any) -> dict[str, Array]:
@@ -110,9 +110,9 @@ class Environment(Protocol):
 
 
 class PastPolicy(NamedTuple):
-    """Environments ``[n]`` that an older copy of the policy drives: their steps are not learned from.
+    """Environments ``[n]`` that an older copy of the policy drives; their steps are masked in learning.
 
-    The copy is taken every ``refresh`` iterations.
+    The current policy replaces the copy every ``refresh`` iterations.
     """
 
     environments: np.ndarray
@@ -128,7 +128,7 @@ def past_policy(environment: Environment, count: int) -> PastPolicy | None:
 
 @record
 class Rollout:
-    """Experience ``[time, batch]``. ``alive`` is false where an episode was over before the step; mask it out.
+    """Experience ``[time, batch]``. Mask out steps that are not ``alive``: their episode was over before them.
 
     The successor of row t is in row t + 1, final states included; that of the last row is the environments' current
     state. Either ``observation`` or ``state`` (for the replay buffer) is kept, the other is None. ``terms`` are the
@@ -154,7 +154,7 @@ class SampledAction(NamedTuple):
     extra: dict[str, Array]
 
 
-#: The fields of :class:`SampledAction`; an actor samples them, given observations and a key.
+#: The fields of :class:`SampledAction`. An actor samples them, given observations and a key.
 Sampled = tuple[Array, Array, dict[str, Array]]
 Actor = Callable[[Mapping[str, Array], Array], Sampled]
 #: What a rollout keeps: observations, or states that can be observed again.
@@ -187,7 +187,7 @@ def collect(
     environment: Environment, data: Any, environments: Environments, actor: Actor, key: Array, steps: int,
     keep: Store = "observation", terms: Iterable[str] = (),
 ) -> tuple[Environments, Rollout, dict[str, Array]]:  # fmt: skip
-    """Unroll ``steps`` steps in every environment.
+    """Collect a rollout of ``steps`` steps in every environment.
 
     Returns:
         The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, the mean absolute action of each
@@ -209,8 +209,8 @@ def collect(
     _, (act_keys, step_keys) = jax.lax.scan(split, key, None, steps)
     # Drawn for all steps at once: on CPUs each call of the random generator is a loop of small operations.
     drawn = jax.vmap(lambda key: environment.draw(data, key, len(environments.over)))(step_keys)
-    first = (environments, environment.cache(data, environments.state))
-    (environments, _), (rollout, totals, ends, magnitudes) = jax.lax.scan(step, first, (act_keys, drawn))
+    initial = (environments, environment.cache(data, environments.state))
+    (environments, _), (rollout, totals, ends, magnitudes) = jax.lax.scan(step, initial, (act_keys, drawn))
     alive = rollout.alive.sum()
     sums = {"episodes": ends.sum(), "steps": alive}
     sums |= {"action_magnitude": magnitudes.sum(), "action_magnitude/n": alive}
@@ -220,9 +220,9 @@ def collect(
 
 @custom_vmap
 def any_across_learners(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
-    """Whether a condition holds anywhere in the batch and, under ``vmap``, in any learner.
+    """Return whether a condition holds anywhere in the batch and, under ``vmap``, in any learner.
 
-    ``jax.lax.cond`` computes both branches if it has a condition per learner; with this single one it computes one.
+    With a condition per learner, ``jax.lax.cond`` computes both branches; with this single one it computes one.
     """
     return condition.any()
 

@@ -3,8 +3,8 @@
 No observation is stored: a step is an index (scenario, step), observed when it is drawn. Rewards and episode ends
 depend on all earlier steps, so the log is replayed once before training.
 
-Steps are drawn by inverting the cumulative distribution, stored as 32-bit integers: of a million equal weights each
-changes by up to 0.02 % by rounding; in float32 it would be 6 %. A step of weight zero is never drawn.
+Steps are drawn by inverting the cumulative distribution, stored as 32-bit integers: rounding changes each of a million
+equal weights by up to 0.02 %; in float32 it would be 6 %. A step of weight zero is never drawn.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drivax.stats.intervals import effective_size
 
 #: Rows (scenarios, or egos of scenarios) and steps.
 StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
-#: Observations, expert actions within the bounds, and whether those were clipped.
+#: Observations, expert actions within the bounds, and whether the actions were clipped to them.
 ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
 
 _MAX_UINT32 = 2**32 - 1
@@ -65,10 +65,10 @@ def sampler(weights: np.ndarray) -> Sampler:
     Raises:
         DataError: All weights are 0.
     """
-    total = np.cumsum(weights.reshape(-1), dtype=np.float64)
-    if not total[-1] > 0.0:
+    sums = np.cumsum(weights.reshape(-1), dtype=np.float64)
+    if not sums[-1] > 0.0:
         raise DataError("all weights of usable steps are 0", cure="give one a weight above 0")
-    cumulative = np.floor(total / total[-1] * _MAX_UINT32).astype(np.uint32)
+    cumulative = np.floor(sums / sums[-1] * _MAX_UINT32).astype(np.uint32)
     effective = jnp.asarray(effective_size(weights), jnp.float32)
     return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
 
@@ -91,7 +91,7 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     if weights.shape != shape:
         problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
         raise UsageError(problem, cure="make weights for every step of this scenario set")
-    # Sums of squares stay finite.
+    # The bound keeps sums of squares finite.
     invalid = np.argwhere(~((weights >= 0.0) & (weights <= 1e100)))
     if len(invalid):
         scenario, step = invalid[0]
@@ -104,8 +104,8 @@ def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 class ExpertSteps:
     """Actions of experts, within the bounds, at T steps of M logs, and their outcome.
 
-    Steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to the next
-    state. ``hold`` is the number of steps per decision (``Task.hold``), ``egos`` the number of logs per scenario.
+    Values of steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to
+    the next state. ``hold`` is the number of steps per decision (``Task.hold``), ``egos`` that of logs per scenario.
     """
 
     action: Float[Array, "M T D"]
@@ -123,7 +123,7 @@ class LoggedEnvironment(Environment, Protocol):
     """An environment whose data hold episodes of an expert."""
 
     def expert_steps(self, data: Any) -> ExpertSteps:
-        """Return the expert's steps; usable are those with a valid expert before the end of the episode."""
+        """Return the expert's steps; usable steps have a valid expert and precede the end of the episode."""
         ...
 
     def observe_recorded(self, data: Any, index: StepIndex) -> dict[str, Array]:
@@ -151,9 +151,9 @@ class Experience:
         data: The environment's data.
         expert: The expert's steps.
         usable: Steps to learn from.
-        uniform: Sampler of usable steps without weights.
+        uniform: Sampler that draws usable steps with equal probability.
         critic: Sampler of steps for policy evaluation.
-        policy: Sampler of steps for policy improvement; None: the critic's.
+        policy: Sampler of steps for policy improvement; None: that of the critic.
     """
 
     data: Any
@@ -184,7 +184,7 @@ class ExperienceConfig:
     def of(self, environment: Environment, data: Any, weights: np.ndarray | None = None) -> Experience:
         """Return the experience in an environment's data, drawn by ``weights`` ``[N, T]`` or uniformly.
 
-        All logs of a scenario have its weights.
+        Weights of a scenario apply to all of its logs.
 
         Raises:
             UsageError: There is no expert, or the weights do not fit the data.
@@ -208,7 +208,7 @@ class ExperienceConfig:
 
 
 def environment_data(data: Any) -> Any:
-    """Return the environment's data, with or without experience."""
+    """Return the environment's data, given these or the experience that contains them."""
     return data.data if isinstance(data, Experience) else data
 
 
@@ -227,15 +227,15 @@ def expert_actions(environment: LoggedEnvironment, experience: Experience, index
 def transitions(
     environment: LoggedEnvironment, experience: Experience, index: StepIndex, gamma: float, steps: int = 1
 ) -> Transitions:
-    """Return returns of up to ``steps`` logged decisions, observed before and after.
+    """Return transitions over up to ``steps`` logged decisions, with observations before and after them.
 
     A decision that is held has the expert's action at its first step.
     """
     (scenario, step), expert = index, experience.expert
     observation, action, _ = expert_actions(environment, experience, index)
-    later = step + jnp.arange(steps * expert.hold).reshape(-1, *[1] * step.ndim)
+    window_steps = step + jnp.arange(steps * expert.hold).reshape(-1, *[1] * step.ndim)
     # The last step of the log is never usable, so it ends the window.
-    window = scenario, jnp.minimum(later, expert.usable.shape[1] - 1)
+    window = scenario, jnp.minimum(window_steps, expert.usable.shape[1] - 1)
     returns = n_step_returns(
         expert.reward[window], expert.terminated[window], expert.usable[window], gamma, expert.hold
     )

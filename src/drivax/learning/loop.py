@@ -42,7 +42,7 @@ from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, training_sets
 
-#: Problem and option, where inputs of a resumed run differ.
+#: Problem and option to report if an input of the resumed run differs.
 _RESUMED_WITH_OTHER = {
     "validation": ("was validated on other scenarios or none", "--validation"),
     "weights": ("was trained with other weights or none", "weights"),
@@ -72,7 +72,7 @@ def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """Options of :func:`train`. Unlike those of :class:`TrainConfig`, they are not saved in the run.
+    """Options of :func:`train`. Unlike the settings in :class:`TrainConfig`, they are not saved in the run.
 
     Attributes:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
@@ -106,7 +106,7 @@ def train(
             ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
-            its scenarios (and 256), else the smallest recording; none of a set of one recording. None trains on all
+            its scenarios (and 256), else the smallest recording; none if there is only one. None trains on all
             scenarios without validation.
         options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
@@ -118,41 +118,41 @@ def train(
         DrivaxError: Memory ran out.
         Preempted: SIGTERM stopped it, after a checkpoint.
     """
-    call, out, folders = TrainOptions(**options), Path(out), list[RunFolder]()
-    trust = (*call.trust, *modules_of(config))
+    opts, out, folders = TrainOptions(**options), Path(out), list[RunFolder]()
+    trust = (*opts.trust, *modules_of(config))
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
-    validation_set = _validation_set(data, validation, out, call.resume)
+    validation_set = _validation_set(data, validation, out, opts.resume)
     notes = hashes(validation_set, weights)
-    if call.resume:
-        config, folders = _resumed_folders(data, notes, out, call.seeds, trust)
+    if opts.resume:
+        config, folders = _resumed_folders(data, notes, out, opts.seeds, trust)
     else:
-        RunFolder.check(out, call.overwrite, "training")
+        RunFolder.check(out, opts.overwrite, "training")
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     scenarios, weights, validation_scenarios = _divide(config, data, weights, validation_set)
     environment, bank = _environment(config, scenarios, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
     held_out = _held_out(config, environment, learner, validation_scenarios)
-    seeds = range(config.seed, config.seed + (len(folders) or call.seeds))
+    seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
-    if call.resume:
-        warn_of_other_bits(folders[0].info, len(program.devices), call.log)
+    if opts.resume:
+        warn_of_other_bits(folders[0].info, len(program.devices), opts.log)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.check()
     if isinstance(validation_set, HoldOut):
-        call.log(validation_set.text())
-    call.log(memory.text())
-    # Read before folders are created, because they may not fit.
-    networks = {} if call.resume else pretrained_networks(config.begin_from, program, call.log)
+        opts.log(validation_set.text())
+    opts.log(memory.text())
+    # Read before folders are created, because an error must leave none.
+    networks = {} if opts.resume else pretrained_networks(config.begin_from, program, opts.log)
     rules = (config.checkpoint_rule, config.keep, config.patience)
     with contextlib.ExitStack() as stack:
         stack.enter_context(explain_full_disk(out))
         notes["devices"] = len(program.devices)
-        folders = folders or _create_folders(config, data, notes, out, seeds, call.overwrite)
+        folders = folders or _create_folders(config, data, notes, out, seeds, opts.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
-        _Training(config, program, logs, held_out, networks, call.log, trust).run()
+        _Training(config, program, logs, held_out, networks, opts.log, trust).run()
     return RunFolder.open(out)
 
 
@@ -164,8 +164,8 @@ def _validation_set(
         return validation
     if not resume:
         return hold_out(data.entries)
-    recorded = RunFolder.open(out).info.get("validation")
-    return hold_out(data.entries, recorded["recordings"]) if isinstance(recorded, dict) else None
+    note = RunFolder.open(out).info.get("validation")
+    return hold_out(data.entries, note["recordings"]) if isinstance(note, dict) else None
 
 
 def _divide(
@@ -174,10 +174,10 @@ def _divide(
     weights: np.ndarray | None,
     validation: ScenarioSet | HoldOut | None,
 ) -> tuple[Sequence[Scenario], np.ndarray | None, Sequence[Scenario] | None]:
-    """Return scenarios to train on, with their weights, and those to validate on, divided if the set holds out some.
+    """Return the scenarios to train on, their weights, and the scenarios to validate on (None: no validation).
 
     Raises:
-        UsageError: The validation set has another length, ``patience`` is set without one, or weights do not fit.
+        UsageError: Validation scenarios have another length, ``patience`` is set without any, or weights do not fit.
     """
     if isinstance(validation, HoldOut) and validation.recordings:
         if weights is not None:
@@ -192,7 +192,7 @@ def _divide(
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
-    """Return the logged steps ``[N, T]``, of any ego, that a training on a weighted set can draw.
+    """Return the mask ``[N, T]`` of the logged steps that training on a weighted set can draw, for any ego.
 
     ``trust`` is as for :func:`train`.
 
@@ -238,7 +238,7 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 def _held_out(
     config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: Sequence[Scenario] | None
 ) -> Validation | None:
-    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without any."""
+    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without scenarios."""
     if scenarios is None:
         return None
     held_out = Validation.of(scenarios)
@@ -314,7 +314,7 @@ def _resumed_folders(
 
 @dataclass(frozen=True)
 class _Training:
-    """The iterations of a training, with the log of each seed; ``networks`` are pretrained ones of a new run."""
+    """The iterations of a training, with the log of each seed; ``networks`` are the pretrained ones of a new run."""
 
     config: TrainConfig
     program: Program
@@ -333,8 +333,8 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
-        total, before = self._steps(config.iterations), self._steps(done)
-        with Progress("training", "steps", total, done=before) as progress, StopSignal() as stop:
+        total_steps, done_steps = self._steps(config.iterations), self._steps(done)
+        with Progress("training", "steps", total_steps, done=done_steps) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
                 if all(log.stopped for log in self.logs):
                     break
@@ -382,13 +382,13 @@ class _Training:
         if step is None:
             networks = self.networks or pretrained_networks(self.config.begin_from, self.program, self.log)
             return 0, initial_state(self.program, networks)
-        # Seeds that stopped write nothing more: they take the state of another.
+        # Stopped seeds write nothing more, so they take the state of any other seed.
         restored = dict(zip(active, states, strict=True))
         states = [restored.get(number, states[0]) for number in range(len(self.logs))]
         return step // self.config.algorithm.steps_per_iteration, self.program.state_of(states)
 
     def _restore(self, logs: Sequence[TrainingLog]) -> tuple[int | None, list[Any]]:
-        """Return the newest step of which each seed has a healthy checkpoint, and their states; None without any.
+        """Return the newest step at which all seeds have a healthy checkpoint, and their states; None if there is none.
 
         Raises:
             DataError: All checkpoints are damaged, or seeds have none of the same step.
@@ -407,7 +407,7 @@ class _Training:
             return step, states
         if errors:
             raise errors[0]
-        # A process that is killed at the first checkpoint has written that of some seeds.
+        # A process that was killed at the first checkpoint may have written it for some seeds only.
         if all(steps) or max(map(len, steps)) > 1:
             problem = "the seeds have no checkpoint of the same step"
             raise DataError(problem, file=logs[0].folder.path.parent, cure="start again with --overwrite")
@@ -429,8 +429,8 @@ class _Training:
                 self._stop_diverged(number, steps, problem)
                 continue
             for warning in log.new_warnings(rows[number]):
-                place = f"seed {seeds.seeds[number]}: {warning} at {steps:,} steps"
-                self.log(f"warning: {place}: training may diverge")
+                text = f"seed {seeds.seeds[number]}: {warning} at {steps:,} steps"
+                self.log(f"warning: {text}: training may diverge")
 
     def _stop_diverged(self, number: int, steps: int, problem: str) -> None:
         self.logs[number].diverge(steps, problem)
@@ -442,13 +442,13 @@ class _Training:
     ) -> None:
         """Log, validate and save one iteration of every seed that has not stopped."""
         config, seeds, steps = self.config, self.program.seeds, self._steps(iteration)
-        last = iteration == config.iterations
-        evaluates = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
-        saves = last or evaluates or preempted or iteration % config.checkpoint_every == 0
+        is_last = iteration == config.iterations
+        validates = is_last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+        saves = is_last or validates or preempted or iteration % config.checkpoint_every == 0
         logs = [(number, log) for number, log in enumerate(self.logs) if not log.stopped]
         for number, log in logs:
             row = rows[number]
-            if evaluates and self.validation is not None:
+            if validates and self.validation is not None:
                 try:
                     row |= self._validate(self.validation, state, number)
                 except DivergenceError as error:
@@ -456,7 +456,7 @@ class _Training:
             rank = log.write(steps, row)
             if saves and log.divergence is None:
                 log.save(steps, seeds.member(state, number), rank)
-            if log.out_of_patience and not last:
+            if log.out_of_patience and not is_last:
                 problem = f"no better for {config.patience} validations, stopped at {steps:,} steps"
                 self.log(f"seed {seeds.seeds[number]}: {problem}")
         # Not before all seeds have a checkpoint of this step, so that a killed run can resume.
@@ -478,7 +478,7 @@ class _Training:
 
 
 def _healthy_state(checkpoints: Checkpoints, template: Any, step: int) -> Any:
-    """Restore a state.
+    """Restore the state of a step.
 
     Raises:
         DataError: The checkpoint is damaged, does not match, or contains a number that is not finite.
@@ -590,9 +590,9 @@ def _is_state(value: Any) -> bool:
 
 
 def _source(path: str, stored: Iterable[str]) -> str | None:
-    """Return the path of a network in a checkpoint: its name in the state, or in the learner of a warm start."""
+    """Return the path of a network in a checkpoint: in the state or in a warm start's learner; None if missing."""
     name = path[path.rindex(".") :]
     for source in (name, f".learner{name}"):
         if any(is_part(leaf, [source]) for leaf in stored):
             return source
-    return name if name == ".parameters" else None
+    return name if name == ".parameters" else None  # restoring reports missing parameters

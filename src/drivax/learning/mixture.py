@@ -26,7 +26,7 @@ from drivax.simulator.types import SimState
 
 @dataclass(frozen=True)
 class Mixture:
-    """Blocks of environments that differ in their traffic; batches are those of the blocks in order.
+    """Blocks of environments that differ in their traffic; a batch concatenates those of the blocks in order.
 
     Logged steps and shapes of observations are the same in all blocks.
 
@@ -40,7 +40,7 @@ class Mixture:
 
     @property
     def action_size(self) -> int:
-        """Size of an action."""
+        """Number of components of an action."""
         return self._first.action_size
 
     @property
@@ -50,7 +50,7 @@ class Mixture:
 
     @property
     def penalties(self) -> dict[str, float]:
-        """Penalties of the reward, as of :class:`~drivax.learning.driving.Driving`."""
+        """Penalties of the reward, as in :class:`~drivax.learning.driving.Driving`."""
         return self._first.penalties
 
     @property
@@ -73,17 +73,17 @@ class Mixture:
         return data
 
     def past(self, count: int) -> PastPolicy:
-        """Return the environments that an older copy of the policy drives: of the block of self-play, if any."""
+        """Return the environments of the self-play block, if any, that an older copy of the policy drives."""
         sizes = self.sizes(count)
-        firsts = accumulate(sizes[:-1], initial=0)
-        for (_, block), size, first in zip(self.blocks, sizes, firsts, strict=True):
+        offsets = accumulate(sizes[:-1], initial=0)
+        for (_, block), size, offset in zip(self.blocks, sizes, offsets, strict=True):
             if isinstance(block, SelfPlay):
                 past = block.past(size)
-                return past._replace(environments=first + past.environments)
+                return past._replace(environments=offset + past.environments)
         return PastPolicy(np.arange(0), 1)
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
-        """Shapes of one observation by group."""
+        """Return the shape of each group of one observation."""
         return self._first.shapes(data)
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
@@ -93,11 +93,11 @@ class Mixture:
         return _concatenate([block.start(data, key, size) for (_, block), key, size in blocks])
 
     def stored(self, state: Any) -> NoReturn:
-        """Refuse replay buffers of states: those of the blocks differ."""
+        """Raise UsageError: a replay buffer cannot store states, because they differ between blocks."""
         refuse_stored_states("a mixture of traffic")
 
     def observe_all(self, data: ScenarioBank, stored: Any) -> NoReturn:
-        """Refuse, as :meth:`stored`."""
+        """Raise the error of :meth:`stored`."""
         self.stored(stored)
 
     def cache(self, data: ScenarioBank, state: tuple[SimState, ...]) -> tuple[Any, ...]:
@@ -115,7 +115,7 @@ class Mixture:
         self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"],
         drawn: list[Any],
     ) -> tuple[Environments, Outcome]:  # fmt: skip
-        """Step or reset the environments of every block; totals are those of all, which devices add in every step."""
+        """Step or reset the environments of every block; devices sum the totals of all blocks in every step."""
         sizes = self.sizes(len(action))
         after, outcomes = [], []
         for number, (start, end) in enumerate(pairwise(accumulate(sizes, initial=0))):
@@ -123,8 +123,8 @@ class Mixture:
                 lambda leaf, start=start, end=end: leaf[start:end], (now.over, now.observation, action)
             )
             environments, block = Environments(now.state[number], over, observation), self.blocks[number][1]
-            stepped, outcome = block.step(data, environments, cache[number], actions, drawn[number])
-            after.append(stepped)
+            environments, outcome = block.step(data, environments, cache[number], actions, drawn[number])
+            after.append(environments)
             outcomes.append(outcome)
         totals = jax.tree.map(
             lambda *sums: sum(map(jnp.sum, sums)), *(outcome.totals for outcome in outcomes)
@@ -177,9 +177,9 @@ def training_environment(config: TrainConfig, trust: Sequence[str] = ()) -> Driv
 
 
 def divide(count: int, shares: Mapping[str, float], groups: Mapping[str, int]) -> dict[str, int]:
-    """Divide environments by shares, with largest remainders.
+    """Divide environments by shares, with the largest remainder method.
 
-    Blocks of ``groups`` of some size come first: the closest multiple of that size, at least one group.
+    Blocks in ``groups``, which maps them to a group's size, first get the closest number of groups, at least one.
     """
     sizes = {name: size * max(round(shares[name] * count / size), 1) for name, size in groups.items()}
     others = {name: share for name, share in shares.items() if name not in groups}

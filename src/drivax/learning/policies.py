@@ -1,4 +1,4 @@
-"""Trained policies as planners and as traffic: of a training run, of an exported folder, or of the zoo."""
+"""Trained policies as planners and as traffic: from a training run, an exported folder, or the zoo."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
 from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, training_sets
 
-#: What an exported policy has instead of checkpoints.
+#: File with the parameters of an exported policy, which has no checkpoints.
 POLICY_FILE = "policy.npz"
-#: What ``run.json`` of an exported policy keeps of the training; paths are in the command alone.
+#: Entries of ``run.json`` that an exported policy keeps from its training; only the command may contain paths.
 _PROVENANCE = ("command", "started", "versions", "git", "validation", "step")
-#: Parameters do not depend on traffic and starts, and the traffic of the training may no longer exist.
+#: Overrides: parameters do not depend on traffic and starts, and the training's traffic may no longer exist.
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 
 
@@ -39,12 +39,12 @@ def open_policy(run: str | Path) -> RunFolder:
 
     Raises:
         UsageError: The folder contains several seeds, or the zoo has no such policy.
-        DataError: It is not a run folder, or of several seeds and without any.
+        DataError: It is not a run folder, or it should contain several seeds but has none.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
-        inside = seed_folders(folder.path)
-        raise UsageError(f"contains {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+        seeds = seed_folders(folder.path)
+        raise UsageError(f"contains {len(seeds)} seeds", file=folder.path, cure=f"name one, as {seeds[0]}")
     return folder
 
 
@@ -57,7 +57,7 @@ def load_policy(
     Args:
         run: As for :func:`open_policy`, with its errors; DataError if the parameters are missing or damaged.
         bank: Any bank; only shapes of its observations are read.
-        step: Step of the checkpoint, shown in the planner's name; None: the best, or the newest without a validation.
+        step: Step of the checkpoint, shown in the planner's name; None: the best one, or the newest without validation.
             UsageError for a step of an exported policy.
         samples: Whether to sample actions instead of taking the mode.
         trust: Modules outside drivax whose code the policy may name (own features, rewards, ...); UsageError for
@@ -78,15 +78,15 @@ def load_policy(
         name = run_name if step is None else f"{run_name}@{step}"
         return learner.planner(parameters, name, samples)
 
-    exported = folder.path / POLICY_FILE
-    if exported.is_file():
+    policy_file = folder.path / POLICY_FILE
+    if policy_file.is_file():
         if step is not None:
             problem = "is an exported policy without steps"
             raise UsageError(problem, file=folder.path, cure=f"leave out @{step}")
-        return unpack(exported, jax.eval_shape(planner, template)), config.task
+        return unpack(policy_file, jax.eval_shape(planner, template)), config.task
     checkpoints = Checkpoints(folder.checkpoints)
-    chosen = checkpoints.best_or_newest() if step is None else step
-    return planner(checkpoints.restore(template, chosen, part=".parameters")), config.task
+    checkpoint = checkpoints.best_or_newest() if step is None else step
+    return planner(checkpoints.restore(template, checkpoint, part=".parameters")), config.task
 
 
 def _name(run: str | Path) -> str:
@@ -99,10 +99,10 @@ def export_policy(
     run: str | Path, out: str | Path, bank: ScenarioBank, notes: Mapping[str, Any] | None = None, *,
     overwrite: bool = False, trust: Sequence[str] = (),
 ) -> RunFolder:  # fmt: skip
-    """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
+    """Write the best policy of a run (the newest without validation) to a folder that loads like the run.
 
     The folder holds the planner's parameters, the configuration, and the provenance: command as typed, versions,
-    commit and hashes of data sets. Only the command, and a run named as ``traffic``, may contain paths of the machine.
+    commit and hashes of data sets. Only the command, and a run named as ``traffic``, may contain local paths.
 
     Args:
         run: As for :func:`load_policy`, with its errors; the traffic of its training must still exist.
@@ -115,15 +115,15 @@ def export_policy(
     folder = open_policy(run)
     step = Checkpoints(folder.checkpoints).best_or_newest()
     planner, _ = load_policy(run, bank, step=step, trust=trust)
-    about = {name: folder.info.get(name) for name in _PROVENANCE}
+    entries = {name: folder.info.get(name) for name in _PROVENANCE}
     data = [{name: entry.get(name) for name in ("hash", "scenarios")} for entry in training_sets(folder.info)]
-    about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
+    entries |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
-        about["step"] = step
+        entries["step"] = step
     config = replace(folder.config(TrainConfig, trust=trust), begin_from=None)
     RunFolder.check(Path(out), overwrite, "policy")
     with replace_folder(Path(out)) as partial_folder:
-        exported = RunFolder.create(partial_folder, config, overwrite=True).note(**about)
+        exported = RunFolder.create(partial_folder, config, overwrite=True).note(**entries)
         pack(partial_folder / POLICY_FILE, planner)
         seal(partial_folder, POLICY_FILE)
     return RunFolder(Path(out), exported.info)
@@ -141,7 +141,7 @@ class PolicyTraffic(PlannerTraffic):
     def name(self) -> str:
         """Name in tables: ``driven_by_RUN``, with the traffic of the other agents unless it is the log.
 
-        Of a seed it is ``driven_by_RUN/seed-N``.
+        For one of several seeds, ``RUN`` is ``RUN/seed-N``.
         """
         base = "" if self.base.name == "log" else f"+{self.base.name}"
         name = _name(self.run)
@@ -169,17 +169,17 @@ def policy_traffic(
     """
     folder, trust = open_policy(run), tuple(trust)
     task, base = folder.config(TrainConfig, _AS_LOGGED, trust).task, base or LogTraffic()
-    # The absolute path of a folder is no name of the zoo.
+    # An absolute path cannot be mistaken for a name in the zoo.
     path = str(folder.path.absolute())
     return PolicyTraffic(task, count, base, run=path, samples=samples, trust=trust)
 
 
 def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
-    """Return the traffic of a name in a command line or a configuration.
+    """Return the traffic with a name from the command line or a configuration.
 
-    It is one of ``simulator.traffic.reactive.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
-    ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the traffic named after a
-    plus sign: ``zoo:NAME+idm``. ``trust`` is that of :func:`load_policy`.
+    The name is one of ``simulator.traffic.reactive.TRAFFIC``; ``package.module:name``; or a trained policy (a folder or
+    ``zoo:NAME``), which drives the vehicles nearest to ego. All other agents then follow the log, or the traffic named
+    after a plus sign (``zoo:NAME+idm``). ``trust`` is that of :func:`load_policy`.
 
     Raises:
         UsageError: There is no such traffic, or the run in the folder is no training.

@@ -1,7 +1,7 @@
 """One iteration of all seeds as a compiled program: its layout over devices, and the memory that it takes.
 
-Seeds are divided among devices where they can be, otherwise the environments or batches of each seed. Results do not
-depend on the number of devices except for the order of sums.
+Seeds are divided among devices where they can be, otherwise the environments or batches of each seed. Results depend
+on the number of devices only through the order of sums.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drivax.tracking.workers import available_cores
 _THREADS = 8
 #: Flag of XLA that sets the number of CPU devices.
 _DEVICE_FLAG = "--xla_force_host_platform_device_count"
-#: Axis of the mesh of devices that divide the work of one seed, and of those with whole seeds.
+#: Name of the mesh axis of devices that divide the work of each seed, and of devices that divide the seeds.
 _AXIS, _SEEDS = "devices", "seeds"
 
 _NETWORKS = "networks and optimiser"
@@ -50,10 +50,10 @@ _LISTED_FIELDS = ("replay", "environments")
 
 
 def widen_pool() -> None:
-    """Give XLA's CPU thread pool eight threads where cores are fewer, unless ``NPROC`` is set.
+    """Give XLA's CPU thread pool at least eight threads, unless ``NPROC`` is set. Call it before JAX starts.
 
-    Call it before JAX starts, for training of several seeds only: with two threads such programs deadlock once both
-    wait for others in the pool (jaxlib 0.10.2). Other programs are slower with more threads than cores.
+    Programs of several seeds can deadlock on a smaller pool, when every thread waits for a task that no thread is free
+    to run (jaxlib 0.10.2). Do not call it for other programs: they are slower with more threads than cores.
     """
     if (os.cpu_count() or 1) < _THREADS:
         os.environ.setdefault("NPROC", str(_THREADS))
@@ -83,7 +83,7 @@ class Seeds:
         return len(self.seeds) > 1
 
     def init(self, data: Any) -> Any:
-        """Return the first state."""
+        """Return the initial state."""
         if not self.is_stacked:
             return self.learner.init(data, jax.random.key(self.seeds[0]))
         keys = jnp.stack([jax.random.key(seed) for seed in self.seeds])
@@ -101,11 +101,11 @@ class Seeds:
 
     def member_shapes(self, shapes: Any) -> Any:
         """Return shapes of the state of one seed, given those of all."""
-        rank = int(self.is_stacked)
-        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[rank:], leaf.dtype), shapes)
+        axes = int(self.is_stacked)
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[axes:], leaf.dtype), shapes)
 
     def member(self, tree: Any, number: int) -> Any:
-        """Select one seed from a state, part of it, or logs."""
+        """Select one seed from a state, a part of a state, or logs."""
         return jax.tree.map(lambda leaf: leaf[number], tree) if self.is_stacked else tree
 
     def stack(self, states: Sequence[Any]) -> Any:
@@ -116,12 +116,12 @@ class Seeds:
 class Program:
     """An iteration of all seeds on some data, compiled before any array of the state is allocated.
 
-    ``devices`` is as ``requested`` of :func:`choose_devices`, with its errors.
+    ``devices`` is passed to :func:`choose_devices`, whose errors are raised.
     """
 
     def __init__(self, seeds: Seeds, data: Any, devices: int | None = 1) -> None:
         self.seeds = seeds
-        # Its trace is reused where the layout is the default.
+        # With one device, ``initial_state`` reuses this trace.
         self._init = jax.jit(seeds.init)
         shapes = self._init.eval_shape(data)
         batch = getattr(seeds.learner, "batch", None)
@@ -146,7 +146,7 @@ class Program:
             self.compiled = iterate.lower(data, shapes).compile()
         trained = trained_leaves(shapes)
         self._is_trained = [keystr(path) in trained for path, _ in jax.tree.leaves_with_path(shapes)]
-        # A program of its own, because fusions with it could round the parameters differently.
+        # A separate program: fused with the iteration, the check could change how parameters are rounded.
         self._all_finite = jax.jit(seeds.all_finite).lower(list(trained.values())).compile()
 
     def _iterate(self, data: Any, state: Any) -> tuple[Any, Any]:
@@ -162,7 +162,7 @@ class Program:
         return account(self.data, validation, self.shapes, self.compiled, self.devices)
 
     def initial_state(self) -> Any:
-        """Return the first state of all seeds."""
+        """Return the initial state of all seeds."""
         return self._init(self.data)
 
     def state_of(self, states: Sequence[Any]) -> Any:
@@ -198,7 +198,7 @@ def all_finite(leaves: Sequence[Array]) -> Bool[Array, ""]:
 
 
 def _listed_field(path: Sequence[Any]) -> str | None:
-    """Return the listed field that contains a leaf; None without one."""
+    """Return the listed field that contains a leaf; None if there is none."""
     return next((key.name for key in path if getattr(key, "name", "") in _LISTED_FIELDS), None)
 
 
@@ -232,7 +232,7 @@ def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | N
 
 def former_devices(info: Mapping[str, Any]) -> int:
     """Return the number of devices of a run, given its ``run.json``."""
-    return int(info.get("devices") or 1)  # Runs of version 0.1.0 do not say it; those on a CPU used one.
+    return int(info.get("devices") or 1)  # Runs of version 0.1.0 lack it; those on a CPU used one.
 
 
 def warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
@@ -269,11 +269,11 @@ def is_largest(name: str) -> bool:
 def sum_over_devices(
     function: Callable[[Any, Any], tuple[dict[str, Array], Any]], whole: Any, divided: Any, axis: int
 ) -> tuple[dict[str, Array], Any]:
-    """Return the logs and sums of a function, summed over devices, each with its share of ``divided`` along an axis.
+    """Return the logs and sums of ``function``, added over devices that divide ``divided`` along an axis.
 
-    Logs, sums and ``whole`` are floating-point numbers; of logs ``largest_*`` the result is the maximum, NaN if any is
-    NaN. The sum is taken once, where the compiler would take it in every step of a loop. The gradient of a sum is
-    exchanged as one vector, too. If shares would differ, nothing is divided.
+    Logs, sums and ``whole`` are floating-point numbers. Logs ``largest_*`` are maxima, NaN if any is NaN. Devices
+    exchange sums once, as one vector, and likewise the gradient of a sum; the compiler would do so in every step of a
+    loop. If the axis does not divide evenly, nothing is divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):
@@ -286,8 +286,8 @@ def sum_over_devices(
     def summed(parameters: Array, share: Any) -> Any:
         logs, sums = function(unravel_parameters(parameters), share)
         # A maximum has an element per device in the vector: ``pmax`` loses NaN on CPUs.
-        own = jax.lax.axis_index(_AXIS) == jnp.arange(count)
-        maxima = {n: jnp.where(own, log, 0.0) for n, log in logs.items() if is_largest(n)}
+        is_own = jax.lax.axis_index(_AXIS) == jnp.arange(count)
+        maxima = {n: jnp.where(is_own, log, 0.0) for n, log in logs.items() if is_largest(n)}
         vector, unravel = ravel_pytree((logs | maxima, sums))
         total_logs, total = unravel(jax.lax.psum(vector, _AXIS))
         return {n: log.max() if is_largest(n) else log for n, log in total_logs.items()}, total
@@ -296,7 +296,7 @@ def sum_over_devices(
 
 
 def compute_on_each_device(function: Callable[..., Any], *whole: Any) -> Any:
-    """Return ``function(*whole)``, which every device computes from whole arrays: its sums need no exchange."""
+    """Return ``function(*whole)``, computed by every device from whole arrays, so that its sums need no exchange."""
     if device_count() == 1:
         return function(*whole)
     return jax.shard_map(function, in_specs=PartitionSpec(), out_specs=PartitionSpec(), check_vma=False)(
@@ -305,9 +305,9 @@ def compute_on_each_device(function: Callable[..., Any], *whole: Any) -> Any:
 
 
 def mean_over_devices(x: Array) -> Float[Array, ""]:
-    """Return the mean of an array of which a function that :func:`sum_over_devices` runs may hold a device's share.
+    """Return the mean of an array over all devices, also where :func:`sum_over_devices` gives each device a share.
 
-    No gradient passes.
+    No gradient flows through it.
     """
     mean = jax.lax.stop_gradient(jnp.mean(x))
     return jax.lax.pmean(mean, _AXIS) if _AXIS in jax.sharding.get_abstract_mesh().manual_axes else mean
@@ -316,8 +316,8 @@ def mean_over_devices(x: Array) -> Float[Array, ""]:
 def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any) -> Any:
     """Return ``function(whole, divided)``, computed by each device for its share of ``divided``.
 
-    Arrays of ``divided`` and of the result are divided along their first axis. A result that sums over it has one sum
-    per device, so give it an axis of size 1. If shares would differ, nothing is divided.
+    Arrays of ``divided`` and of the result are divided along their first axis. A result that is a sum over it differs
+    between devices: give it a leading axis of size 1. If the axis does not divide evenly, nothing is divided.
     """
     count = device_count()
     if count == 1 or any(leaf.shape[0] % count for leaf in jax.tree.leaves(divided)):
@@ -333,8 +333,8 @@ def read_columns(
     """Return ``read(ring, row, column)`` of arrays ``[row, column, ...]`` that devices may divide by columns.
 
     ``read`` returns arrays ``[*batch, ...]``, each element read from its own column only. The result is whole on every
-    device: each evaluates ``read`` on its columns and contributes the bits of these, and zeros for others, where the
-    compiler would exchange the index for every leaf. Columns must be in range.
+    device: each device evaluates ``read`` on its columns, and their bits are summed, with zeros for other columns. The
+    compiler would exchange the index for every leaf instead. Columns must be in range.
     """
     count, shapes = device_count(), jax.eval_shape(read, ring, row, column)
     is_divided = count > 1 and all(leaf.shape[1] % count == 0 for leaf in jax.tree.leaves(ring))
@@ -345,14 +345,14 @@ def read_columns(
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def exchange(share: Any, index: tuple[Array, Array]) -> Any:
         size = jax.tree.leaves(share)[0].shape[1]
-        own = index[1] - size * jax.lax.axis_index(_AXIS)
-        is_own = (own >= 0) & (own < size)
+        local_column = index[1] - size * jax.lax.axis_index(_AXIS)
+        is_own = (local_column >= 0) & (local_column < size)
 
         def bits(leaf: Array) -> Array:
             value = _as_bits(leaf)
             return jnp.where(is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim)), value, 0)
 
-        columns = read(share, index[0], jnp.clip(own, 0, size - 1))
+        columns = read(share, index[0], jnp.clip(local_column, 0, size - 1))
         vector, unravel = ravel_pytree(jax.tree.map(bits, columns))
         return unravel(jax.lax.psum(vector, _AXIS))
 
@@ -391,7 +391,7 @@ def _layout(mesh: Mesh, is_stacked: bool, state: Any) -> Any:
 
 
 def _divisible(state: Any, is_stacked: bool) -> list[tuple[Any, int | None]]:
-    """Return the leaves of a state with the axis that counts environments, or None, as their records say."""
+    """Return each leaf of a state with its axis of environments, which its record declares, or None."""
 
     def axis_of(node: Any) -> int | None:
         return getattr(type(node), "environment_axis", None)
@@ -407,7 +407,7 @@ def _divisible(state: Any, is_stacked: bool) -> list[tuple[Any, int | None]]:
 
 @dataclass(frozen=True)
 class MemoryAccount:
-    """Memory of a run on its fullest device by purpose, in bytes, and what is free for it, None if unknown."""
+    """Bytes that a run takes on its fullest device, by purpose, and bytes that are free for it (None: unknown)."""
 
     sizes: Mapping[str, int]
     limit: int | None
@@ -426,11 +426,11 @@ class MemoryAccount:
 
     @property
     def cure(self) -> str:
-        """What makes the largest part smaller."""
+        """How to reduce the largest entry."""
         return _CURES[max(self.sizes, key=lambda name: self.sizes[name])]
 
     def check(self) -> None:
-        """Raise UsageError if the run does not fit, with a cure for its largest part."""
+        """Raise UsageError if the run does not fit, with a cure for its largest entry."""
         if self.limit is not None and self.total > self.limit:
             raise UsageError(f"training does not fit; {self.text()}", cure=self.cure)
 
@@ -449,7 +449,7 @@ def account(
         sizes[_listed_field(path) or _NETWORKS] += _leaf_bytes(leaf)
     sizes["program"] = _program_bytes(compiled)
     device, free = devices[0], free_memory(devices[0], len(devices))
-    # Scenarios are in memory already, the rest is not.
+    # Scenarios are already in memory, so they do not count as free; the rest is not allocated yet.
     limit = None if free is None else free + sizes["scenarios"] + sizes["validation"]
     return MemoryAccount(sizes, limit, f"{device.platform}:{device.id}")
 
@@ -459,14 +459,14 @@ def _bytes(tree: Any) -> int:
 
 
 def _leaf_bytes(leaf: Any) -> int:
-    """Bytes of an array, or of its shard on one device."""
+    """Return the bytes of an array, or of its shard on one device."""
     sharding = getattr(leaf, "sharding", None)
     shape = leaf.shape if sharding is None else sharding.shard_shape(leaf.shape)
     return math.prod(shape) * leaf.dtype.itemsize
 
 
 def _program_bytes(compiled: jax.stages.Compiled) -> int:
-    """Bytes of temporary values, of results that replace no argument, and of the program itself."""
+    """Return the bytes of temporary values, of results that replace no argument, and of the program itself."""
     analysis = compiled.memory_analysis()
     if analysis is None:
         return 0

@@ -1,11 +1,11 @@
-"""Replay buffer: a ring of transitions, stored as states that are observed when they are sampled.
+"""Replay buffer: a ring of transitions, stored as states or as observations.
 
-A state takes 0.4 kB in log traffic, an observation in bfloat16 1.2 kB (preset ``sac``) to 44 kB (``published/sac``);
-but states are observed when they are sampled, twice per step, and those of reactive traffic grow with the vehicles (2
-to 4 kB in the built-in world).
+A state takes 0.4 kB in log traffic, more with the number of vehicles in reactive traffic (2 to 4 kB in the built-in
+world), and is observed whenever it is sampled, twice per transition. An observation in bfloat16 takes 1.2 kB (preset
+``sac``) to 44 kB (``published/sac``).
 
-A row holds one step of all environments. What row t led to is in the next row, the final state of an episode in the
-row that resets it. The newest row has no next row yet and is not sampled.
+A row holds one step of all environments. Its successor is the next row; the final state of an episode is in the row
+that resets it. The newest row has no successor yet and is not sampled.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Replay:
         action: Actions in [-1, 1].
         reward: Rewards.
         terminated: Whether the episode ended by a failure.
-        alive: Whether the row is a step; false where an episode was over before it, or nothing was written yet.
+        alive: Whether the entry is a step; false where an episode was over before it, or nothing is written yet.
         next_row: Row to write next: the oldest, once the ring is full.
     """
 
@@ -90,12 +90,12 @@ ReplayIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 
 @record
 class Transitions:
-    """A batch of steps, or of n-step returns.
+    """A batch of transitions over one step or up to n steps.
 
     Attributes:
-        reward: Discounted sum of the rewards of up to n steps of one episode.
+        reward: Discounted sum of the rewards of these steps, which belong to one episode.
         terminated: Whether the episode ended by a failure in them.
-        next_observation: What they led to, final states included.
+        next_observation: Observation after them, final states included.
         discount: ``gamma`` to the power of the number of these steps (of decisions, where they are held).
     """
 
@@ -119,11 +119,11 @@ class ReplayBuffer:
         count = environments.over.shape[0]
         rows = self.config.rows(count)
         if self.config.store == "observation":
-            like = _cast(environments.observation, jnp.bfloat16)
+            template = _cast(environments.observation, jnp.bfloat16)
         else:
-            like = self.environment.stored(environments.state)
+            template = self.environment.stored(environments.state)
         return Replay(
-            stored=jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), like),
+            stored=jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), template),
             action=jnp.zeros((rows, count, self.environment.action_size)),
             reward=jnp.zeros((rows, count)),
             terminated=jnp.zeros((rows, count), jnp.bool_),
@@ -178,9 +178,9 @@ class ReplayBuffer:
     def sample(
         self, data: Any, replay: Replay, index: ReplayIndex, gamma: float, steps: int = 1
     ) -> Transitions:
-        """Return the n-step returns from an index of :meth:`draw`, observed before and after.
+        """Return the transitions over up to ``steps`` steps from an index of :meth:`draw`.
 
-        They have fewer than ``steps`` where the episode ends or the next state was not written yet.
+        They have fewer steps where the episode ends or the next state is not written yet.
         """
         rows = replay.reward.shape[0]
 
@@ -191,13 +191,13 @@ class ReplayBuffer:
             # A row that resets an environment, or the newest, ends the window.
             follows = alive & (window != (replay.next_row - 1) % rows)
             returns = n_step_returns(reward, terminated, follows, gamma)
-            following = (row + returns.steps) % rows
+            successor = (row + returns.steps) % rows
             return {
                 "observation": jax.tree.map(lambda leaf: leaf[row, column], ring["stored"]),
                 "action": ring["action"][row, column],
                 "reward": returns.reward,
                 "terminated": returns.terminated,
-                "next_observation": jax.tree.map(lambda leaf: leaf[following, column], ring["stored"]),
+                "next_observation": jax.tree.map(lambda leaf: leaf[successor, column], ring["stored"]),
                 "discount": returns.discount,
             }
 

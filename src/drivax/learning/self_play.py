@@ -60,12 +60,12 @@ class SelfPlay(Driving):
         Raises:
             UsageError: The share of ``past`` rounds to no group.
         """
-        size, number = self.config.vehicles, np.arange(count)
+        size, environments = self.config.vehicles, np.arange(count)
         groups = round(self.config.past * (count // size))
         if self.config.past and not groups:
             problem = f"self_play.past is {self.config.past:g} of {count // size} groups: none"
             raise UsageError(problem, cure="raise it, or environments")
-        is_past = (number // size < groups) & (number % size > 0)
+        is_past = (environments // size < groups) & (environments % size > 0)
         return PastPolicy(np.flatnonzero(is_past), self.config.refresh)
 
     def cache(self, data: ScenarioBank, state: SimState) -> Any:
@@ -73,7 +73,7 @@ class SelfPlay(Driving):
         return ()
 
     def stored(self, state: Any) -> NoReturn:
-        """Refuse replay buffers of states: an observation needs those of the whole group."""
+        """Raise UsageError: a replay buffer cannot store states, because observing one needs its whole group."""
         refuse_stored_states("self-play")
 
     def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
@@ -138,24 +138,24 @@ class SelfPlay(Driving):
     def _slots(
         self, bank: ScenarioBank, index: Array, step: Array, key: Array
     ) -> tuple[Int[Array, " K"], Array]:
-        """Return the slots of ego and of random further egos in the log for two more steps, then padding; and keys."""
-        padding, further = bank.agents.shape[2], bank.egos[index, 1:]
+        """Return the slots of ego and of random egos whose logs have two more steps, padded, and a key for each."""
+        padding, other_slots = bank.agents.shape[2], bank.egos[index, 1:]
         rows = index * bank.most_egos + jnp.arange(1, bank.most_egos)
-        present = bank.agents[index, step, further, AgentColumn.VALID] > 0
-        present &= (further >= 0) & (step <= bank.last_step[rows] - 2)
-        rank = jnp.where(present, jax.random.uniform(key, further.shape), jnp.inf)
-        slots = jnp.where(present, further, padding)[jnp.argsort(rank)[: self.config.vehicles - 1]]
+        is_present = bank.agents[index, step, other_slots, AgentColumn.VALID] > 0
+        is_present &= (other_slots >= 0) & (step <= bank.last_step[rows] - 2)
+        rank = jnp.where(is_present, jax.random.uniform(key, other_slots.shape), jnp.inf)
+        slots = jnp.where(is_present, other_slots, padding)[jnp.argsort(rank)[: self.config.vehicles - 1]]
         keys = jax.random.split(jax.random.fold_in(key, 1), self.config.vehicles)
         return jnp.pad(slots, (1, 0)).astype(jnp.int32), keys
 
     def _groups(self, tree: Any) -> Any:
-        """Return a batch of environments as groups."""
+        """Reshape a batch of environments ``[B, ...]`` into groups ``[G, K, ...]``."""
         size = self.config.vehicles
         return jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // size, size, *leaf.shape[1:]), tree)
 
 
 def _flatten(groups: Any) -> Any:
-    """Return groups as a batch of environments."""
+    """Reshape groups ``[G, K, ...]`` into a batch of environments ``[B, ...]``."""
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), groups)
 
 

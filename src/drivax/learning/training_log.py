@@ -1,6 +1,6 @@
 """The log of one seed's training: metrics, checkpoints, the validations that rank them, and divergence.
 
-Numbers that are not finite stop a seed, large ones warn.
+A number that is not finite stops a seed; a large one causes a warning.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _ORDER = ("accuracy", "progress_ratio", "comfortable")
 #: Absolute logged values beyond which training warns: a KL divergence of 1 nat per iteration, and Q values that only
 #: rewards of +-100 per step reach at a discount of 0.99.
 _BOUNDS = {"loss/kl": 1.0, "loss/mean_q": 1e4, "loss/largest_q": 1e4}
-#: Logged values that are finite in a healthy training; causes come first.
+#: Prefixes of logged values that must be finite, causes before their effects.
 _PREFIXES = ("rollout/action_magnitude", "reward/", "loss/")
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out scenarios that rank checkpoints, and the ``data`` of a learner's metrics on them, None without any."""
+    """Held-out scenarios that rank checkpoints, and the ``data`` of a learner's metrics on them (None: no metrics)."""
 
     bank: ScenarioBank
     names: Sequence[Mapping[str, str]]
@@ -87,9 +87,9 @@ def _split_unsuccessful(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return the shares of scenarios without success by reason."""
     names = ("success", "accuracy", "accuracy_at_fault")
     defined = np.isfinite(values["success"])
-    success, accuracy, lawful = (float(values[name][defined].mean()) for name in names)
-    # Each implies the next.
-    return {"late": accuracy - success, "at_fault": 1.0 - lawful, "not_at_fault": lawful - accuracy}
+    success, accuracy, no_fault = (float(values[name][defined].mean()) for name in names)
+    # Each metric implies the next one, so that differences are shares.
+    return {"late": accuracy - success, "at_fault": 1.0 - no_fault, "not_at_fault": no_fault - accuracy}
 
 
 def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
@@ -114,7 +114,7 @@ def _or_last(value: float | None, last: float = -1.0) -> float:
 
 
 def patience_exceeded(ranks: Sequence[tuple[float, ...]], patience: int) -> bool:
-    """Whether the last ``patience`` validations did not improve on the best before them; never if it is 0."""
+    """Return whether the last ``patience`` validations did not improve on the best before them; False if it is 0."""
     return 0 < patience < len(ranks) and max(ranks[-patience:]) <= max(ranks[:-patience])
 
 
@@ -127,7 +127,7 @@ class Preempted(DrivaxError):
 class StopSignal:
     """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
 
-    Batch systems send it some seconds before they take a machine away. Outside of the main thread it is not noted.
+    Batch systems send it some seconds before they end a job. The context has no effect outside of the main thread.
     """
 
     def __init__(self) -> None:
@@ -153,13 +153,13 @@ class DivergenceError(DrivaxError):
 
 
 def nonfinite_log(row: Mapping[str, float]) -> str | None:
-    """Return the first action, reward or loss of an iteration that is NaN or infinite; None without any."""
+    """Return the first action, reward or loss of an iteration that is NaN or infinite; None if there is none."""
     names = (name for prefix in _PREFIXES for name in row if name.startswith(prefix))
     return next((f"{name} is {_word(row[name])}" for name in names if not np.isfinite(row[name])), None)
 
 
 def nonfinite_leaf(state: Any) -> str | None:
-    """Return the first trained leaf of a seed's state with a NaN or infinite number; None without any."""
+    """Return the first trained leaf of a seed's state with a NaN or infinite number; None if there is none."""
     for name, leaf in trained_leaves(state).items():
         values = np.asarray(leaf, np.float32)
         if not np.isfinite(values).all():
@@ -266,7 +266,7 @@ class TrainingLog:
         self.folder = self.folder.note(divergence=None)
 
     def new_warnings(self, row: Mapping[str, float]) -> list[str]:
-        """Return what is too large in an iteration, each value only once per process."""
+        """Return warnings of large values in an iteration, only one per name and process."""
         texts = large_logs(row)
         warnings = [text for name, text in texts.items() if name not in self._warnings]
         self._warnings |= set(texts)

@@ -36,8 +36,8 @@ from drivax.networks.encoders import (
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
-#: Gains of orthogonal output weights. The small one of policies makes the first actions follow ``first_scale`` whatever
-#: the observation is.
+#: Gains of orthogonal output weights. The small gain of policies makes the first actions follow ``first_scale``,
+#: whatever the observation is.
 _POLICY_GAIN, _VALUE_GAIN = 0.01, 1.0
 
 #: Largest number of parameters of a network: 128 MiB. The largest preset has 0.7 million.
@@ -57,11 +57,11 @@ class NetworkConfig:
         encoder: The encoder; policy, value and each critic have their own, unless it is shared.
         head: Hidden layers between embedding and output.
         activation: Activation after each hidden layer of a head; outputs are linear.
-        first_scale: Standard deviation of an untrained policy, for all actions or for each: before squashing (gaussian,
-            each component of a mixture), of the action (beta), or of the Gaussian whose density weights the levels
-            (grid).
+        first_scale: Standard deviation of an untrained policy, one for all numbers of an action or one for each: before
+            squashing (gaussian, each component of a mixture), of the action (beta), or of the Gaussian whose density
+            weights the levels (grid).
         least_scale: Lower bound of the standard deviation, as a share of ``first_scale``, so that exploration does not
-            vanish; of ``gaussian`` only.
+            vanish; ``gaussian`` only.
         distribution: Action distribution; ``grid`` is for ``discrete`` actions.
         shared_encoder: Whether policy and value of PPO share one encoder; no effect on other algorithms.
         critic_norm: Layer normalisation before each activation of the critics' heads. It bounds the values of unseen
@@ -86,7 +86,7 @@ class NetworkConfig:
 
 
 def graph_of(network: Any) -> Any:
-    """Return the structure of a network, which may be that of ``nnx.eval_shape``.
+    """Return the structure of a network, which may be a result of ``nnx.eval_shape``.
 
     Raises:
         UsageError: It has too many parameters.
@@ -159,8 +159,8 @@ class Policy(nnx.Module):
         result = distribution(self.kind, self.head(embedding) + initial, self.actions)
         if not (self.least_scale and isinstance(result, SquashedGaussian)):
             return result
-        least = self.least_scale * np.asarray(self.first_scale, np.float32)
-        return replace(result, scale=jnp.maximum(result.scale, least))
+        min_scale = self.least_scale * np.asarray(self.first_scale, np.float32)
+        return replace(result, scale=jnp.maximum(result.scale, min_scale))
 
 
 class Value(nnx.Module):

@@ -60,7 +60,7 @@ class Attention(nnx.Module):
         tokens: Float[Array, "*batch k width"],
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
-        """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros without any."""
+        """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over tokens in ``mask`` (None: all); zeros if none are."""
         width, heads, size = self.query.shape
         count = heads * queries.shape[-2] * tokens.shape[-2]
         if count > MOST_WEIGHTS:
@@ -68,7 +68,7 @@ class Attention(nnx.Module):
             raise UsageError(
                 f"{problem} has {count:,} weights", cure=f"use {MOST_WEIGHTS:,} or less: observe less"
             )
-        # To project a token takes width^2 products, to compare it with projected queries width x heads per query.
+        # Projecting a token takes width^2 products, comparing it with projected queries width x heads per query.
         if queries.shape[-2] * heads < width:
             return self._attend_few_queries(queries, tokens, mask)
         query = self._einsum("...qd,dhc->...qhc", queries, self.query) * size**-0.5
@@ -108,7 +108,7 @@ class Attention(nnx.Module):
 def _masked_softmax(
     logits: Float[Array, "*batch h q k"], mask: Bool[Array, "*batch k"] | None
 ) -> Float[Array, "*batch h q k"]:
-    """Return the softmax over valid tokens, zeros without any."""
+    """Return the softmax over valid tokens; zeros if there are none."""
     if mask is None:
         return jax.nn.softmax(logits)
     valid = mask[..., None, None, :]
@@ -117,7 +117,7 @@ def _masked_softmax(
 
 
 class ResidualAttention(nnx.Module):
-    """``x + attention(norm(x), tokens)``; the caller normalises ``tokens``. Without them, self-attention."""
+    """``x + attention(norm(x), tokens)``; the caller normalises ``tokens``. Without tokens, self-attention."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -164,7 +164,7 @@ class SelfAttention(nnx.Module):
 def masked_mean(
     rows: Float[Array, "*batch rows width"], mask: Bool[Array, "*batch rows"]
 ) -> Float[Array, "*batch width"]:
-    """Return the mean over valid rows; zeros without any."""
+    """Return the mean over valid rows; zeros if there are none."""
     total = jnp.sum(jnp.where(mask[..., None], rows, 0.0), axis=-2)
     return total / jnp.maximum(mask.sum(axis=-1, keepdims=True), 1)
 

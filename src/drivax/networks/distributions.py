@@ -66,7 +66,7 @@ class Distribution(Protocol):
         ...
 
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch raw"]:
-        """Return the raw action of an action, of one just inside the bounds, or of the nearest levels of the grid."""
+        """Return the raw action that gives an action, clipped inside the bounds or, on the grid, its nearest levels."""
         ...
 
     def mode(self) -> Float[Array, "*batch action"]:
@@ -288,13 +288,12 @@ def initial_parameters(
 ) -> Float[np.ndarray, " parameters"]:
     """Return the parameters of a distribution centred at zero, to add to the outputs of an untrained head.
 
-    ``scale`` is, per action or for all, the standard deviation of the unsquashed Gaussian, of the Beta's action, or of
-    the Gaussian whose density weights the grid's levels; in a mixture, of each component, with means between ``-scale``
-    and ``scale``.
+    ``scale``, one for all numbers of an action or one for each, is the standard deviation of the unsquashed Gaussian,
+    of the Beta's action, or of the Gaussian whose density weights the grid's levels; in a mixture, of each component,
+    with means between ``-scale`` and ``scale``.
 
     Raises:
-        UsageError: A Gaussian cannot have this scale, a Beta with it has no peak, or there are scales of another number
-            of actions.
+        UsageError: A Gaussian cannot have this scale, a Beta with it has no peak, or the number of scales does not fit.
     """
     scales = np.atleast_1d(np.asarray(scale, np.float64))
     if len(scales) not in (1, actions.size):
@@ -305,13 +304,13 @@ def initial_parameters(
         return (-0.5 * (combinations(_levels(actions)) / scales) ** 2).sum(axis=-1)
     if kind != "beta" and (scales.min() < _MIN_SCALE or scales.max() > _MAX_SCALE):
         raise UsageError(f"first_scale of a {kind} is {scale}", cure=f"use {_MIN_SCALE:g} to {_MAX_SCALE:g}")
-    spread = np.log(np.expm1(scales))  # The inverse of softplus.
+    raw_scales = np.log(np.expm1(scales))  # the inverse of softplus
     if kind == "gaussian":
-        return np.concatenate([np.zeros(actions.size), spread]).astype(np.float32)
+        return np.concatenate([np.zeros(actions.size), raw_scales]).astype(np.float32)
     if kind == "mixture":
         # Equal components would stay equal; the one around zero starts with the largest weight.
         means = np.linspace(-1.0, 1.0, _COMPONENTS)
-        components = [np.concatenate([mean * scales, spread]) for mean in means]
+        components = [np.concatenate([mean * scales, raw_scales]) for mean in means]
         return np.concatenate([(means == 0.0).astype(float), *components]).astype(np.float32)
     # A symmetric Beta's action has the variance 1 / (2 alpha + 1).
     alpha_minus_1 = (scales**-2 - 1.0) / 2.0 - 1.0

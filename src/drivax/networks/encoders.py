@@ -69,8 +69,8 @@ class MlpConfig:
 
     Attributes:
         rows: Layers shared by the rows of each masked group, before a maximum over rows; empty: rows are flattened.
-        flat: Masked groups whose rows are flattened in any case, because their order counts, as that of route points;
-            missing names are ignored.
+        flat: Masked groups whose rows are always flattened, because their order matters, such as route points; missing
+            names are ignored.
         hidden: Width of each following layer; the last is the size of the embedding. Empty: no layers.
         activation: Activation after each layer.
     """
@@ -126,14 +126,14 @@ class MlpEncoder(nnx.Module):
         if mask is None:
             return value.reshape(*lead, -1)
         value = jnp.where(mask[..., None], value, 0.0)
-        pools = name in self.pooled
-        axes = (*lead, self.shapes[name][0], -1) if pools else (*lead, -1)
+        is_pooled = name in self.pooled
+        axes = (*lead, self.shapes[name][0], -1) if is_pooled else (*lead, -1)
         mask = mask.reshape(axes)
-        row = jnp.concatenate([value.reshape(axes), mask.astype(jnp.float32)], axis=-1)
-        if not pools:
-            return row
+        features = jnp.concatenate([value.reshape(axes), mask.astype(jnp.float32)], axis=-1)
+        if not is_pooled:
+            return features
         # A row is valid if any of its times is; without valid rows the embedding is zero.
-        return max_pool(self.activation, _weights(self.shared[name]), row, mask.any(axis=-1))
+        return max_pool(self.activation, _weights(self.shared[name]), features, mask.any(axis=-1))
 
 
 def check_widths(name: str, widths: tuple[int, ...]) -> None:
@@ -185,7 +185,7 @@ def max_pool(
 ) -> Float[Array, "*batch outputs"]:  # fmt: skip
     """Return the maximum of zero and the valid rows after the layers.
 
-    Equal rows share its gradient; in the native kernel the first takes all of it.
+    Equal rows share the gradient; in the native kernel the first of them takes all of it.
     """
     if activation not in _MONOTONE:
         return jnp.max(dense(activation, layers, rows), axis=-2, initial=0.0, where=valid[..., None])
@@ -265,7 +265,7 @@ _dense_and_max.defvjp(_save_dense_and_max, _dense_and_max_backward, symbolic_zer
 
 
 def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Float[Array, " F"]]]:
-    """Return mean and standard deviation of each feature over all valid rows; 0 and 1 without any.
+    """Return mean and standard deviation of each feature over all valid rows; 0 and 1 if there are none.
 
     Groups may have any leading axes. Rows share their statistics, so that neither order nor padding matters.
     """
@@ -275,12 +275,12 @@ def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Fl
 
 def _group_statistics(value: Array, mask: Array | None) -> tuple[Array, Array]:
     rows = value.reshape(-1, value.shape[-1]).astype(jnp.float32)
-    counts = jnp.ones(len(rows)) if mask is None else mask.reshape(-1).astype(jnp.float32)
-    share = (counts / jnp.maximum(counts.sum(), 1.0))[:, None]
+    valid = jnp.ones(len(rows)) if mask is None else mask.reshape(-1).astype(jnp.float32)
+    share = (valid / jnp.maximum(valid.sum(), 1.0))[:, None]
     mean = jnp.sum(jnp.where(share > 0, rows, 0.0) * share, axis=0)
     # From residuals, because differences of large squares cancel.
     variance = jnp.sum(jnp.where(share > 0, rows - mean, 0.0) ** 2 * share, axis=0)
-    return mean, jnp.where(counts.sum() > 0, jnp.sqrt(variance), 1.0)
+    return mean, jnp.where(valid.sum() > 0, jnp.sqrt(variance), 1.0)
 
 
 @dataclass(frozen=True)

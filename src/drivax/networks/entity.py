@@ -30,8 +30,8 @@ class EntityConfig:
     """Embed each row with one relu layer; the ego and its goal attend to the other rows.
 
     Attributes:
-        size: Width: 64 if ``published``, 32 if ``small``.
-        width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
+        size: Default of ``width``: 64 if ``published``, 32 if ``small``.
+        width: Width of an embedded row, a multiple of ``heads``; the embedding concatenates one to four of them.
         heads: Number of attention heads.
         goal: Groups whose mean is added to the query and appended to the embedding; missing names are ignored, here
             and in ``context``.
@@ -55,7 +55,7 @@ class EntityConfig:
 
     @property
     def entity_width(self) -> int:
-        """Width of a row, from ``width`` or ``size``."""
+        """Width of an embedded row, from ``width`` or ``size``."""
         return self.width if self.width is not None else {"published": 64, "small": 32}[self.size]
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> EntityEncoder:
@@ -72,7 +72,7 @@ class EntityEncoder(nnx.Module):
         self.parts = {name: _part_of(config, name, shape) for name, shape in self.group_shapes.items()}
         self.order = tuple(part for part in _PARTS if part in self.parts.values())
         self.width = width * len(self.order)
-        # The width of a row is that of its features at all times, and of the mask of a series.
+        # The inputs of a row are its features at all times and, in a series, its mask.
         sizes = {n: shape.times * (shape.features + shape.series) for n, shape in self.group_shapes.items()}
         self.layers = nnx.Dict({name: nnx.Linear(size, width, rngs=rngs) for name, size in sizes.items()})
         self.attention = Attention(width, config.heads, rngs, config.dtype)
@@ -80,17 +80,17 @@ class EntityEncoder(nnx.Module):
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Return the embedding of an observation or a batch; float32."""
-        rows = {}
+        entities = {}
         for part in self.order:
             names = [name for name, group_part in self.parts.items() if group_part == part]
-            rows[part] = concatenate_groups([self._entities(groups, name) for name in names])
-        means = {part: masked_mean(*rows[part]) for part in self.order}
-        if "others" in means:
-            query = sum((means[part] for part in ("ego", "goal") if part in means), jnp.zeros(()))
+            entities[part] = concatenate_groups([self._entities(groups, name) for name in names])
+        embeddings = {part: masked_mean(*entities[part]) for part in self.order}
+        if "others" in embeddings:
+            query = sum((embeddings[part] for part in ("ego", "goal") if part in embeddings), jnp.zeros(()))
             # Without ego and goal the query is the scalar zero.
-            query = jnp.broadcast_to(query, means["others"].shape)[..., None, :]
-            means["others"] = self.norm(self.attention(query, *rows["others"])[..., 0, :])
-        return jnp.concatenate([means[part] for part in self.order], axis=-1)
+            query = jnp.broadcast_to(query, embeddings["others"].shape)[..., None, :]
+            embeddings["others"] = self.norm(self.attention(query, *entities["others"])[..., 0, :])
+        return jnp.concatenate([embeddings[part] for part in self.order], axis=-1)
 
     def _entities(self, groups: Groups, name: str) -> tuple[Array, Array]:
         """Return an embedding per row, and whether any of its times is valid."""

@@ -150,8 +150,8 @@ class WayformerConfig(LatentConfig):
 class MtrConfig(TransformerConfig):
     """An encoder after the Motion Transformer (Shi et al. 2022, arXiv 2209.13508).
 
-    Each mover attends to its own times, then in each layer to all movers and to the map. Movers are series and groups
-    without a mask; the map is all other groups.
+    Each mover attends to its own times, then in each layer to all movers and to the map. Movers are the rows of series
+    and of groups without a mask; the map is all other rows.
     """
 
     kind: Literal["mtr"] = "mtr"
@@ -262,7 +262,7 @@ class LatentEncoder(nnx.Module):
 class MtrEncoder(nnx.Module):
     """Attention over the times of each mover, then over movers and map; the output is the mean over ego's tokens.
 
-    Without groups of ego it is the mean over all movers; without movers, all rows count as movers.
+    Without a group of ego the output is the mean over all movers; without movers, all rows count as movers.
 
     Attributes (names of stored parameters):
         time: Self-attention over the times of a mover.

@@ -69,12 +69,12 @@ def n_step_returns(
     """Return ``sum_k gamma^k r_{t+k}`` over the steps before the first false ``follows_t`` (Sutton 1988).
 
     ``follows_t`` holds where step t belongs to the episode and its next state is stored. ``hold`` steps of time make
-    one decision; their rewards share a discount. Nothing corrects for the later actions, which another policy may have
-    chosen.
+    one decision; their rewards share a discount. Later actions, which another policy may have chosen, get no off-policy
+    correction.
     """
     taken_t = jnp.cumprod(follows_t, axis=0, dtype=jnp.int32)
     decision = np.arange(len(reward_t)) // hold
-    # From the first decision to the state after the last one.
+    # Discounts from the first decision to the state after the last one.
     power = jnp.asarray(gamma ** np.arange(decision[-1] + 2), jnp.float32)
     weight = power[decision].reshape(-1, *[1] * (reward_t.ndim - 1))
     steps = taken_t.sum(axis=0)
@@ -93,9 +93,9 @@ def td_target(
     """Return the target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
 
     A truncated step bootstraps the value of its final state. No gradient flows into the targets. With n-step returns,
-    ``gamma`` is that of n steps.
+    ``gamma`` is the discount of n steps.
     """
-    # Selected for the reason in :func:`generalised_advantages`.
+    # Select, for the reason in :func:`generalised_advantages`.
     return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))
 
 

@@ -59,7 +59,7 @@ class Simulator:
         return self._initial_state(bank, context, alone(context))
 
     def _initial_state(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext) -> SimState:
-        """Return the first state of an episode."""
+        """Return the initial state of an episode."""
         frame = self.frame(bank, context, driven, 0)
         # Overlaps at the start are ignored until they separate, as if all agents had just appeared. No fault is
         # classified, so no previous frame is needed.

@@ -1,4 +1,4 @@
-"""Built-in algorithms, a module each, with settings, iteration, and whole loss (``Ppo._loss``, ``Sac.loss``, ...).
+"""Built-in algorithms, one module each, with settings, iteration, and total loss (``Ppo._loss``, ``Sac.loss``, ...).
 
 ``ppo`` and ``sac`` learn in an environment, ``behaviour_cloning``, ``cql``, ``iql`` and ``td3_bc`` from logged steps,
 and ``warm_start``, or ``sac`` with ``demonstrations``, from both. ``off_policy`` and ``offline`` are base classes. The

@@ -32,7 +32,7 @@ from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.scenario.record import record
 
-#: From parameters and a batch of observations to action distributions.
+#: Maps parameters and a batch of observations to action distributions.
 PolicyFunction = Callable[[Any, dict[str, Array]], Distribution]
 #: Parameters and the optimiser's state.
 Carry = tuple[Any, Any]
@@ -116,8 +116,8 @@ class Cloning:
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
         """Return the number of steps where ``mask`` holds, with sums of values to log over them, and of the loss."""
         error = policy.mode() - action
-        squared = self.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(action))
+        is_mse = self.loss == "mse"
+        loss = jnp.mean(error**2, axis=-1) if is_mse else -policy.log_prob(policy.raw_action(action))
         count, total = mask.sum(dtype=jnp.float32), jnp.sum(loss * mask)
         logs = {"count": count, "imitation_error": jnp.sum(jnp.mean(jnp.abs(error), axis=-1) * mask)}
         return logs, total
@@ -183,7 +183,7 @@ class Bc:
         return Policy(self.config.network, self.spec, nnx.Rngs(key), actions)
 
     def init(self, data: Any, key: Array) -> BcState:
-        """Return the first state."""
+        """Return the initial state."""
         network_key, key = jax.random.split(key)
         parameters = nnx.state(self._network(network_key), nnx.Param)
         return BcState(parameters, self.optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
@@ -211,7 +211,7 @@ class Bc:
 
 
 def _mean(sums: dict[str, Array], loss: Array, steps: int) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Return the mean loss and values to log, given the sums over the unmasked of these steps."""
+    """Return the mean loss and values to log, given sums over the unmasked of all ``steps`` steps."""
     share = 1.0 / jnp.maximum(sums["count"], 1.0)
     logs = {
         "imitation": loss * share,
@@ -230,8 +230,8 @@ def imitation_update(
     parameters, state = carry
     (_, logs), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
     logs["imitation_gradient_norm"] = optax.tree.norm(gradient)
-    change, state = optimiser.update(gradient, state, parameters)
-    return (optax.apply_updates(parameters, change), state), logs
+    updates, state = optimiser.update(gradient, state, parameters)
+    return (optax.apply_updates(parameters, updates), state), logs
 
 
 def require_expert(environment: Environment) -> ExpertEnvironment:

@@ -37,16 +37,16 @@ _MAX_LOG_WEIGHT = math.log(1e6)
 
 @dataclass(frozen=True)
 class CqlConfig(OfflineConfig):
-    """CQL(H), with ``imitation`` above 0 also a behaviour cloning term in the policy's loss.
+    """CQL(H); with ``imitation`` above 0, the policy's loss also has a behaviour cloning term.
 
     Attributes:
-        penalty: Weight of the conservative penalty relative to half the squared TD error; initial with a ``gap``.
+        penalty: Weight of the conservative penalty relative to half the squared TD error; initial value with a ``gap``.
         gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
         actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.
         next_actions: Also sample the penalty's actions from the policy at the next state.
         backup_actions: Number of actions sampled at the next state; the highest value (of the smaller critic) is backed
-            up. A single one has on average less value than the expert's action, an error that accumulates over steps.
+            up. A single one has a lower value than the expert's action on average, an error that accumulates.
         importance: Weight sampled actions by their inverse density; if false, add the logged action to the samples.
         penalty_temperature: Temperature of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss
@@ -108,7 +108,7 @@ class Cql(Offline[CqlConfig]):
     def loss(
         self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the sum of TD errors, penalty, and the losses of policy, temperature and multiplier."""
+        """Return the sum of TD error, penalty, and the losses of policy, temperature and multiplier."""
         policy_keys, *critic_keys = jax.vmap(partial(jax.random.split, num=5), out_axes=1)(keys)
         critic, critic_logs = self._penalised_critic_loss(trained, target, batch, critic_keys)
         policy, policy_logs = self._policy_loss(trained, policy_batch, policy_keys)
@@ -124,14 +124,14 @@ class Cql(Offline[CqlConfig]):
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
         next_value = jnp.max(jnp.min(next_q, axis=0), axis=0)
-        td = td_target(batch.reward, next_value, batch.terminated, batch.discount)
+        target_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         policy = self.distribution(parameters, batch.observation)
         action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_keys)
         # In one call, so that each observation is encoded and differentiated once.
         actions = jnp.concatenate([batch.action[None], action])
         q_values = self.q_values(trained["critic"], batch.observation, actions)
         q, sampled_q = q_values[:, 0], jnp.moveaxis(q_values[:, 1:], 1, 0)
-        error = squared_error(q, td)
+        error = squared_error(q, target_q)
         densities = jnp.broadcast_to(log_density[:, None], sampled_q.shape)
         penalty = conservative_penalty(sampled_q, densities, q, self.config.penalty_temperature)
         weight, weight_loss = self._penalty_weight(trained, penalty)

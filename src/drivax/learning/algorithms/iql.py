@@ -84,8 +84,8 @@ class Iql(Offline[IqlConfig]):
         weights = advantage_weights(advantage, config.inverse_temperature, config.largest_weight)
         policy = self.distribution(trained["policy"], observation)
         error = policy.mode() - expert
-        squared = config.loss == "mse"
-        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.raw_action(expert))
+        is_mse = config.loss == "mse"
+        loss = jnp.mean(error**2, axis=-1) if is_mse else -policy.log_prob(policy.raw_action(expert))
         imitation = jnp.mean(weights * loss)
         return value_loss + critic_loss + imitation, {
             "value": value_loss,

@@ -78,7 +78,7 @@ def target_entropy(config: Any, environment: Environment) -> float:
 
 
 def sample_each(policy: Distribution, keys: Array) -> Float[Array, "B raw"]:
-    """Sample a raw action from each distribution with its own key, whatever the others in the batch."""
+    """Sample a raw action from each distribution with its own key, independently of the rest of the batch."""
     return jax.vmap(type(policy).sample)(policy, keys)
 
 
@@ -124,20 +124,20 @@ class OffPolicy(Generic[Config]):
         """Return the policy as a planner."""
         return NetworkPlanner(parameters, self.graphs["policy"], name, samples)
 
-    #: Map trained parameters, target networks and a batch to the sum of all losses and values to log; the gradient of
+    #: Maps trained parameters, target networks and a batch to the sum of all losses and values to log; the gradient of
     #: each loss reaches only its own parameters.
     loss: Callable[..., tuple[Array, dict[str, Array]]]
     #: Maps trained parameters, target networks and a batch to values to log, and the gradient of the loss.
     gradient: Callable[..., tuple[dict[str, Array], Any]]
 
     def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:
-        """Take a gradient step of :meth:`loss` on a batch, then move the target networks."""
+        """Take a gradient step of :meth:`loss` on a batch, then update the target networks."""
         trained, target, optimiser = carry
         logs, gradient = self.gradient(trained, target, *batch)
         for name in ("policy", "critic"):
             logs[f"{name}_gradient_norm"] = optax.tree.norm(gradient[name])
-        change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-        trained: Any = optax.apply_updates(trained, change)
+        updates, optimiser = self.optimiser.update(gradient, optimiser, trained)
+        trained: Any = optax.apply_updates(trained, updates)
         online = {name: trained[name] for name in self.targets}
         return (trained, polyak(target, online, self.config.tau), optimiser), logs
 

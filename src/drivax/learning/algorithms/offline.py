@@ -96,7 +96,7 @@ class FittedQ:
         actions = Actions(self.environment.action_size, self.environment.levels)
         critic = Critic(self.network, self.environment.shapes(data.data), nnx.Rngs(network_key), actions)
         set_statistics(critic, statistics)
-        graph, first = nnx.split(critic, nnx.Param)
+        graph, initial = nnx.split(critic, nnx.Param)
         config = self.config
         optimiser = clipped_adam(config.rate, config.gradient_norm, updates=config.updates)
 
@@ -114,11 +114,11 @@ class FittedQ:
             def loss(parameters: Any) -> Array:
                 return squared_error(q_values(parameters, batch.observation, batch.action), target)
 
-            change, state = optimiser.update(jax.grad(loss)(parameters), state, parameters)
-            parameters: Any = optax.apply_updates(parameters, change)
+            updates, state = optimiser.update(jax.grad(loss)(parameters), state, parameters)
+            parameters: Any = optax.apply_updates(parameters, updates)
             return (parameters, polyak(target_parameters, parameters, config.tau), state), None
 
-        carry = (first, jax.tree.map(jnp.copy, first), optimiser.init(first))
+        carry = (initial, jax.tree.map(jnp.copy, initial), optimiser.init(initial))
         (parameters, _, _), _ = jax.lax.scan(update, carry, jax.random.split(key, config.updates))
         observation, weight = self._first_steps(data)
         return jnp.sum(q_values(parameters, observation, act(observation)) * weight) / weight.sum()
@@ -220,7 +220,7 @@ class Offline(OffPolicy[Config]):
     """An offline algorithm in one environment.
 
     :meth:`loss` takes the steps for policy evaluation, those for policy improvement (the same unless weights are for
-    the policy alone), and a key for each step. It is a mean over steps, of which devices take equal shares.
+    the policy alone), and a key for each step. It is a mean over steps, which devices divide equally.
     """
 
     def __init__(self, config: Config, environment: Environment, data: Any, iterations: int) -> None:
@@ -243,13 +243,13 @@ class Offline(OffPolicy[Config]):
         return {"policy": self.adam(self.config.policy_rate), "critic": self.adam(self.config.critic_rate)}
 
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
-        """Return Adam for a network that every n-th update changes."""
+        """Return Adam for a network that only every n-th update changes (``every``)."""
         config = self.config
         updates = max(round(config.decay_share * self.updates) // every, 1) if config.last_rate != 1.0 else 0
         return clipped_adam(rate, config.gradient_norm, updates=updates, last=config.last_rate)
 
     def init(self, data: Any, key: Array) -> OfflineState:
-        """Return the first state."""
+        """Return the initial state."""
         network_key, key = jax.random.split(key)
         networks = self.networks(network_key)
         # Loading a policy only needs shapes of its parameters, and has no experience.
@@ -277,9 +277,9 @@ class Offline(OffPolicy[Config]):
             loss_keys = jax.random.split(loss_key, self.config.batch)
             return self.update_networks(carry, *self._draw(data, draw_key), loss_keys)
 
-        first = ({"policy": state.parameters, **state.rest}, state.target, state.optimiser)
+        initial = ({"policy": state.parameters, **state.rest}, state.target, state.optimiser)
         keys = jax.random.split(update_key, self.config.updates)
-        (trained, target, optimiser), logs = jax.lax.scan(update, first, keys)
+        (trained, target, optimiser), logs = jax.lax.scan(update, initial, keys)
         after = OfflineState(
             trained["policy"], _without_policy(trained), target, optimiser, key, state.iteration + 1
         )
@@ -288,7 +288,7 @@ class Offline(OffPolicy[Config]):
     def gradient(
         self, trained: Trained, target: dict[str, Any], *batch: Any
     ) -> tuple[dict[str, Array], Trained]:
-        """Return values to log, and the gradient of :meth:`loss`; ``batch`` is as :meth:`_draw` returns, and keys."""
+        """Return values to log, and the gradient of :meth:`loss`; ``batch`` is a result of :meth:`_draw`, and keys."""
 
         def loss(trained: Trained, samples: Any) -> tuple[Array, dict[str, Array]]:
             transitions, policy_batch, keys = samples
@@ -300,7 +300,7 @@ class Offline(OffPolicy[Config]):
         return mean_gradients(loss, trained, jax.tree.map(lambda leaf: leaf[None], batch))
 
     def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch | None]:
-        """Draw the steps for policy evaluation, and those for policy improvement, None: the same."""
+        """Draw the steps for policy evaluation, and those for policy improvement (None: the same)."""
         environment, count = require_log(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
         index = sample_steps(data.critic, critic_key, count)

@@ -25,9 +25,9 @@ _CHUNK = 64
 
 
 def chunk_size(batch: int) -> int:
-    """Return the number of samples whose gradient is computed at a time: on GPUs all of the batch.
+    """Return the number of samples whose gradient is computed at a time: on GPUs the whole batch.
 
-    On CPUs it is the largest divisor of the batch with 17 to 64 samples per device, or all of the batch without one.
+    On CPUs it is the largest divisor of the batch with 17 to 64 samples per device, or without one the whole batch.
     """
     devices = device_count()
     sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -devices)
@@ -38,7 +38,7 @@ def chunk_size(batch: int) -> int:
 def in_chunks(batch: Any) -> Any:
     """Return a batch (leaves ``[sample, ...]``) as chunks ``[chunk, sample, ...]`` for :func:`sum_gradients`.
 
-    Each device has a consecutive share of the batch, and every chunk has as many samples of each share, so that no
+    Each device has a consecutive share of the batch, and every chunk equally many samples of each share, so that no
     sample moves to another device.
     """
     count = len(jax.tree.leaves(batch)[0])
@@ -57,8 +57,8 @@ def sum_gradients(
 ) -> tuple[dict[str, Array], Any]:
     """Return the sums of logs and gradients of a loss over ``samples`` (leaves ``[chunk, sample, ...]``).
 
-    The loss of a batch must be the sum of that of its chunks; logs ``largest_*`` are maxima. Devices divide the samples
-    of each chunk.
+    The loss of a batch must be the sum of those of its chunks; logs ``largest_*`` are maxima. Devices divide the
+    samples of each chunk.
     """
     gradient = jax.grad(loss, has_aux=True)
 
@@ -66,10 +66,10 @@ def sum_gradients(
         def add(sums: Any, chunk: Any) -> tuple[Any, None]:
             return _combine(sums, gradient(parameters, chunk)[::-1]), None
 
-        first = jax.tree.map(lambda leaf: leaf[0], samples)
+        first_chunk = jax.tree.map(lambda leaf: leaf[0], samples)
         if jax.tree.leaves(samples)[0].shape[0] == 1:
-            return gradient(parameters, first)[::-1]
-        shapes = jax.eval_shape(gradient, parameters, first)[::-1]
+            return gradient(parameters, first_chunk)[::-1]
+        shapes = jax.eval_shape(gradient, parameters, first_chunk)[::-1]
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return jax.lax.scan(add, zeros, samples)[0]
 
@@ -81,7 +81,7 @@ def sum_gradients(
 def mean_gradients(
     loss: Callable[[Any, Any], tuple[Array, dict[str, Array]]], parameters: Any, samples: Any
 ) -> tuple[dict[str, Array], Any]:
-    """Return logs and gradient as :func:`sum_gradients`, of a loss and logs that are means over samples."""
+    """Return logs and gradient as :func:`sum_gradients` does, for a loss and logs that are means over samples."""
     count = math.prod(jax.tree.leaves(samples)[0].shape[:2])
 
     def share_of_loss(parameters: Any, chunk: Any) -> tuple[Array, dict[str, Array]]:
@@ -93,7 +93,7 @@ def mean_gradients(
 
 
 def _combine(sums: tuple[dict[str, Array], Any], values: Any) -> tuple[dict[str, Array], Any]:
-    """Return the sums of logs and gradients, and of logs ``largest_*`` the maxima."""
+    """Return the sums of logs and gradients, but the maxima of logs ``largest_*``."""
     logs, gradient = jax.tree.map(jnp.add, sums, values)
     largest = {n: jnp.maximum(log, values[0][n]) for n, log in sums[0].items() if is_largest(n)}
     return logs | largest, gradient
@@ -159,7 +159,7 @@ def check_average(decay: float) -> None:
 
 
 def unless_first(state: Any, parameters: Any) -> Any:
-    """Return ``parameters``; before the first iteration those of the planner, which pretraining may have set."""
+    """Return ``parameters``, or in the first iteration those of the planner, which pretraining may have set."""
     return jax.tree.map(partial(jnp.where, state.iteration == 0), state.parameters, parameters)
 
 

@@ -69,14 +69,14 @@ class PpoConfig:
         gamma, lambda_: Discount, and decay of generalised advantages.
         clip: Clipping range of the probability ratio around 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        target_kl: The update on a minibatch whose divergence from the policy that sampled the rollout exceeds this is
-            skipped, with all later ones of the iteration; the learning rate does not decay in them. None: never.
+        target_kl: Largest KL divergence from the policy that sampled the rollout. A minibatch above it is skipped, with
+            all later ones of the iteration; the learning rate does not decay in them. None: no limit.
         gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
             share an encoder.
         average: Decay per iteration of an exponential moving average of the parameters, which is validated and
             exported in place of the newest ones; 0: no average.
-        constraints: Largest mean sum per episode of reward penalties by name, without their weights: of a failure that
-            ends the episode, the share of episodes. Lagrange multipliers replace the weights, at which they start.
+        constraints: Upper limits by penalty of the reward: of its mean sum per episode without its weight, which for a
+            failure that ends the episode is the share of episodes. Lagrange multipliers replace the weights.
         multiplier_rate: Step size of the multipliers per iteration.
     """
 
@@ -161,7 +161,7 @@ class Ppo:
             eps=1e-5,
             per_network=not config.network.shared_encoder,
         )
-        # Structure only: no number is drawn.
+        # Traced only: no random numbers are drawn.
         self.graph = graph_of(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> ActorCritic:
@@ -169,7 +169,7 @@ class Ppo:
         return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
     def init(self, data: Any, key: Array) -> PpoState:
-        """Return the first state."""
+        """Return the initial state."""
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
         environments = self.environment.start(data, environment_key, self.config.environments)
@@ -203,8 +203,8 @@ class Ppo:
         While ``settling`` the policy is fixed, a shared encoder included.
 
         Returns:
-            The next state, and sums (``rollout/*``, see ``environment.collect``) and means (``loss/*``, but sums with
-            counts of ``loss/cost/*``) to log.
+            The next state, and values to log: sums (``rollout/*``, see ``environment.collect``; ``loss/cost/*`` with
+            counts) and means (other ``loss/*``).
         """
         actor, key = partial(self.sample_action, state), self.rollout_key(state)
         environments, rollout, totals = collect(
@@ -287,8 +287,8 @@ class Ppo:
         (parameters, optimiser, stops), (minibatch, key) = carry, inputs
         logs, gradient = self._gradient(parameters, minibatch, key, auxiliary_loss)
         logs["gradient_norm"] = optax.tree.norm(gradient)
-        change, next_optimiser = self.optimiser.update(gradient, optimiser, parameters)
-        after = (optax.apply_updates(parameters, change), next_optimiser)
+        updates, next_optimiser = self.optimiser.update(gradient, optimiser, parameters)
+        after = (optax.apply_updates(parameters, updates), next_optimiser)
         if self.config.target_kl is not None:
             stops |= logs["kl"] > self.config.target_kl
             after = jax.tree.map(partial(jnp.where, stops), (parameters, optimiser), after)
@@ -296,18 +296,18 @@ class Ppo:
         return (*after, stops), logs
 
     def _past(self, state: PpoState, parameters: Any) -> Any:
-        """Return the older copy after an iteration, given the new parameters; None without any."""
+        """Return the older copy after an iteration, given the new parameters; None if there is none."""
         if self.past is None:
             return None
         refresh = (state.iteration + 1) % self.past.refresh == 0
         older = unless_first(state, state.past)
         return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
-    def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
+    def _batch(self, rollout: Rollout, last_value: Array) -> dict[str, Any]:
         """Return the flattened rollout with advantages, given the values of the last observations."""
         value_t = rollout.extra["value"]
         # The row after a truncated step holds its final state, so this is the value to bootstrap.
-        value_tp1 = jnp.concatenate([value_t[1:], last[None]])
+        value_tp1 = jnp.concatenate([value_t[1:], last_value[None]])
         advantage, target = generalised_advantages(
             rollout.reward, value_t, value_tp1, rollout.terminated, rollout.truncated, self.config.gamma,
             self.config.lambda_,
@@ -362,7 +362,7 @@ def _read(batch: dict[str, Any], order: Int[Array, "*samples"]) -> dict[str, Any
 
 
 def _split(minibatch: dict[str, Any]) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Return the arrays that every device has whole, and those of which each device has its share."""
+    """Return the arrays that every device has whole, and those that devices divide."""
     whole = {name: minibatch[name] for name in _WHOLE}
     return whole, {name: value for name, value in minibatch.items() if name not in whole}
 
@@ -384,7 +384,7 @@ def _normalise(samples: dict[str, Array]) -> tuple[dict[str, Array], Float[Array
 
 @dataclass(frozen=True)
 class Constraints:
-    """Limits of costs, and the dual ascent of their multipliers.
+    """Limits of costs, and dual ascent of their Lagrange multipliers.
 
     A cost is a penalty of the environment without its weight; that of a failure is 1 at its step.
 
@@ -416,7 +416,7 @@ class Constraints:
         return cls(limits, {name: weights[name] for name in limits}, rate)
 
     def init(self) -> dict[str, Array]:
-        """Return the first multipliers."""
+        """Return the initial multipliers."""
         return {name: jnp.asarray(weight, jnp.float32) for name, weight in self.weights.items()}
 
     def update(

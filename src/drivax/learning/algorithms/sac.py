@@ -63,7 +63,7 @@ from drivax.scenario.record import record
 
 #: Largest number of steps of n-step returns.
 MOST_RETURN_STEPS = 1000
-#: Steps of the replay buffer, and logged steps or None.
+#: Indices of steps in the replay buffer, and of logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 #: Two keys of each sample ``[batch, 2]``, and that of the auxiliary loss.
 _BatchKeys = tuple[Array, Array]
@@ -153,7 +153,7 @@ class SacConfig:
     def experience(
         self, environment: Environment, data: Any, weights: np.ndarray | None
     ) -> Experience | None:
-        """Return the logged steps that ``demonstrations`` are drawn from, if any are."""
+        """Return the logged steps to draw demonstrations from; None without ``demonstrations``."""
         return ExperienceConfig().of(environment, data, weights) if self.demonstrations else None
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Sac:
@@ -177,8 +177,8 @@ class SacParameters:
 class SacState:
     """State of a run.
 
-    ``parameters`` are those of the planner: with ``average``, the moving average of the policy's, which are
-    ``trained``; without, the policy's, and ``trained`` is None.
+    ``parameters`` are those of the planner. With ``average`` they are a moving average of the policy's parameters
+    ``trained``; without, they are the policy's parameters, and ``trained`` is None.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
@@ -210,7 +210,7 @@ class Sac(OffPolicy[SacConfig]):
         self.optimiser = optax.partition(optimisers, SacParameters("policy", "critic", "temperature"))
 
     def init(self, data: Any, key: Array) -> SacState:
-        """Return the first state."""
+        """Return the initial state."""
         network_key, environment_key, key = jax.random.split(key, 3)
         networks = self.networks(network_key)
         policy, critic = (nnx.state(networks[name], nnx.Param) for name in ("policy", "critic"))
@@ -283,9 +283,9 @@ class Sac(OffPolicy[SacConfig]):
         _, draw_key, update_key, key = jax.random.split(state.key, 4)
         steps_before = state.iteration * config.steps_per_iteration
         trained = SacParameters(trained_parameters(state), state.critic, state.log_temperature)
-        first: Carry = (trained, {"critic": state.target}, state.optimiser)
+        initial: Carry = (trained, {"critic": state.target}, state.optimiser)
 
-        @jax.jit  # so that the shapes of its logs do not trace it a second time
+        @jax.jit  # so that finding the shapes of its logs does not trace it a second time
         def learn() -> tuple[Carry, dict[str, Array]]:
             def update(carry: Carry, drawn: tuple[_BatchIndex, _BatchKeys]) -> tuple[Carry, dict[str, Array]]:
                 index, (keys, auxiliary_key) = drawn
@@ -297,12 +297,12 @@ class Sac(OffPolicy[SacConfig]):
             index = self._draw(data, state.replay, draw_key, updates)
             # In one call, which is faster than a call per update.
             keys = jax.vmap(self._batch_keys)(jax.random.split(update_key, updates))
-            carry, logs = jax.lax.scan(update, first, (index, keys))
+            carry, logs = jax.lax.scan(update, initial, (index, keys))
             return carry, _sums(logs)
 
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
-        warm = any_across_learners(steps_before + config.steps_per_iteration >= config.warm_up)
-        (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
+        is_warm = any_across_learners(steps_before + config.steps_per_iteration >= config.warm_up)
+        (trained, target, optimiser), losses = jax.lax.cond(is_warm, learn, lambda: (initial, zeros))
         after = replace(
             state,
             **average(state, trained.policy, config.average),
@@ -317,11 +317,11 @@ class Sac(OffPolicy[SacConfig]):
 
     def _draw(self, data: Any, replay: Replay, key: Array, updates: int) -> _BatchIndex:
         """Draw steps of the buffer and, with ``demonstrations``, of the log for all updates."""
-        logged = self.config.logged_batch
-        index = self.buffer.draw(replay, key, (updates, self.config.batch - logged))
-        if not logged:
+        logged_batch = self.config.logged_batch
+        index = self.buffer.draw(replay, key, (updates, self.config.batch - logged_batch))
+        if not logged_batch:
             return index, None
-        return index, sample_steps(data.critic, jax.random.fold_in(key, 1), (updates, logged))
+        return index, sample_steps(data.critic, jax.random.fold_in(key, 1), (updates, logged_batch))
 
     def _batch_keys(self, key: Array) -> _BatchKeys:
         key, auxiliary_key = jax.random.split(key)
@@ -333,8 +333,8 @@ class Sac(OffPolicy[SacConfig]):
         batch = self.buffer.sample(environment_data(data), replay, index[0], gamma, steps)
         if index[1] is None:
             return batch
-        logged = transitions(require_log(self.environment), data, index[1], gamma, steps)
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, logged)
+        demonstrations = transitions(require_log(self.environment), data, index[1], gamma, steps)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch, demonstrations)
 
     def gradient(
         self, trained: SacParameters, target: dict[str, Any], transitions: Transitions, keys: Array,
@@ -370,7 +370,7 @@ class Sac(OffPolicy[SacConfig]):
 
 
 def _keep_policy(settling: Bool[Array, ""], before: Carry, after: Carry) -> Carry:
-    """Return an update that, while settling, changes neither policy, temperature nor their optimisers."""
+    """Return the carry after an update that, while settling, leaves policy, temperature and their optimisers fixed."""
     (old, _, old_optimiser), (new, target, optimiser) = before, after
     keep = partial(jax.tree.map, partial(jnp.where, settling))
     fixed = {

@@ -1,4 +1,4 @@
-"""TD3+BC (Fujimoto and Gu 2021, arXiv 2106.06860): a deterministic policy between the best Q and the expert."""
+"""TD3+BC (Fujimoto and Gu 2021, arXiv 2106.06860): a deterministic policy that maximises Q and imitates the expert."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Td3BcConfig(OfflineConfig):
 
 
 class Td3Bc(Offline[Td3BcConfig]):
-    """TD3+BC in one environment. All target networks move in every update, also while the policy is not updated."""
+    """TD3+BC in one environment. Every update also updates all target networks, even if it skips the policy."""
 
     targets: ClassVar[tuple[str, ...]] = ("critic", "policy")
 

@@ -131,11 +131,11 @@ class WarmStartLearner:
     def __init__(self, config: WarmStart, online: Ppo | Sac, environment: Environment) -> None:
         self.config, self.online, self.environment = config, online, require_expert(environment)
         self.optimiser = config.cloning.optimiser(config.iterations * config.cloning.updates)
-        # Jitted, so that the names of logs do not trace them a second time.
+        # Jitted, so that finding the names of their logs does not trace them a second time.
         self._phases = jax.jit(self._clone), jax.jit(self._learn)
 
     def init(self, data: Any, key: Array) -> WarmStartState:
-        """Return the first state."""
+        """Return the initial state."""
         learner = self.online.init(data, key)
         optimiser = self.optimiser.init(learner.parameters)
         return self._state(learner, optimiser, jnp.zeros((), jnp.int32))
@@ -151,14 +151,14 @@ class WarmStartLearner:
         def run(phase: Any) -> tuple[Any, dict[str, Array]]:
             after, logs = phase(data, state)
             # Zero counts for what only the other phase logs.
-            leaves = {name: leaf for logged in shapes for name, leaf in logged.items()}
+            leaves = {name: leaf for log_shapes in shapes for name, leaf in log_shapes.items()}
             return after, {name: jnp.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()} | logs
 
-        cloning = any_across_learners(state.iteration < self.config.iterations)
-        return jax.lax.cond(cloning, *(partial(run, phase) for phase in self._phases))
+        is_cloning = any_across_learners(state.iteration < self.config.iterations)
+        return jax.lax.cond(is_cloning, *(partial(run, phase) for phase in self._phases))
 
     def _clone(self, data: Any, state: WarmStartState) -> tuple[WarmStartState, dict[str, Array]]:
-        """Update toward the expert, without stepping environments."""
+        """Run an iteration of behaviour cloning, which does not step environments."""
         key, update_key = jax.random.split(state.learner.key)
         carry, cloning = (state.parameters, state.optimiser), self.config.cloning
         carry, logs = cloning.run_updates(carry, self.optimiser, partial(self._imitation, data), update_key)
