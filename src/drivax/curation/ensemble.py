@@ -55,7 +55,7 @@ _BLOCK_SIZE = 4096
 _SAMPLES = 16
 #: Largest number of members.
 MOST_FOLDS = 1000
-#: Without past steps and the last action, which a policy could copy.
+#: Observation without past steps and the last action, which a policy could copy.
 _OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
 _NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
@@ -111,8 +111,8 @@ class EnsembleConfig:
 class Predictions:
     """Predictions of the members at every step of a set, and the expert's actions, in units of the action space.
 
-    ``action`` are the modes of the members. ``known`` marks usable steps (``ExpertSteps``) with an action within the
-    bounds. ``information`` is the mutual information of action and member in nats, for members trained by likelihood.
+    ``action`` holds the modes of the K members. ``known`` marks usable steps (``ExpertSteps``) with an action within
+    the bounds. ``information`` is the mutual information of action and member in nats; None for ``loss: mse``.
     """
 
     action: Float[Numbers, "N T K D"]
@@ -217,7 +217,7 @@ def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers,
 
 
 def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
-    """Return sorted scenarios of random whole recordings, at least ``count`` if there are as many; None: all."""
+    """Return sorted scenario indices of random whole recordings, at least ``count`` if there are as many; None: all."""
     if count is None:
         return np.arange(len(clusters))
     names, recording = np.unique(clusters, return_inverse=True)
@@ -280,11 +280,11 @@ _all_finite = jax.jit(jax.vmap(all_finite))
 
 def _check_finite(step: int, state: Any, logs: dict[str, Array]) -> None:
     """Raise DivergenceError if a loss or a trained leaf of a member is not finite."""
-    # A program of its own, because fusions with it could round the parameters differently.
-    rows, finite = jax.device_get((logs, _all_finite(list(trained_leaves(state).values()))))
-    for number in range(len(finite)):
-        problem = nonfinite_log({name: float(values[number]) for name, values in rows.items()})
-        if problem is None and not finite[number]:
+    # This is a separate program, because fused with the update it could change the rounding of parameters.
+    losses, is_finite = jax.device_get((logs, _all_finite(list(trained_leaves(state).values()))))
+    for number in range(len(is_finite)):
+        problem = nonfinite_log({name: float(values[number]) for name, values in losses.items()})
+        if problem is None and not is_finite[number]:
             problem = nonfinite_leaf(jax.tree.map(lambda leaf, number=number: leaf[number], state))
         if problem is not None:
             text = f"training of the ensemble diverged at step {step:,}: {problem} in member {number}"
@@ -298,8 +298,7 @@ def fit(
     """Return the trained parameters of all members, along a leading axis.
 
     With ``batched``, all members are updated in one batched computation instead of one after another, with the same
-    results up to rounding. By default this is used on all devices except CPUs, where batched products of small matrices
-    are slower.
+    results up to rounding. The default is True except on CPUs, where batched products of small matrices are slower.
 
     Raises:
         DivergenceError: A loss or a parameter is not finite.
@@ -316,7 +315,7 @@ def fit(
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, dict[str, Array]]:
             own_fold, member_state = member
             is_other_fold = fold[indices[0]] != own_fold
-            # Sort steps of the own fold last. Steps are independent draws, so the cut removes random other steps.
+            # Sort steps of the own fold last. Draws are independent, so the cut removes random steps of other folds.
             order = jnp.argsort(~is_other_fold, stable=True)[:steps_per_member]
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 

@@ -78,7 +78,7 @@ class KinematicConfig:
             "braking": jnp.clip(_required_braking(bank, log) / self.full_braking_mps2, 0.0, 1.0),
             "volatility": _volatility(self, log, bank.last_step[log.context.row[0]]),
             "off_road": _edge_nearness(self, bank, log),
-            "lane_deviation": _deviation(self, bank, log),
+            "lane_deviation": _lane_deviation(self, bank, log),
             "density": crowding(log, self.crowd),
         }
 
@@ -143,8 +143,8 @@ def _braking_at_step(
     gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
     leader_speed_mps = jnp.maximum(jnp.sum(frame.velocity[nearest] * projections.heading[nearest]), 0.0)
-    closing = jnp.maximum(speed_mps - leader_speed_mps, 0.0)
-    return closing * closing / (2.0 * jnp.maximum(gap[nearest], 0.1))
+    closing_mps = jnp.maximum(speed_mps - leader_speed_mps, 0.0)
+    return closing_mps * closing_mps / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
 
 def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:
@@ -163,9 +163,9 @@ def _volatility(config: KinematicConfig, log: LoggedScenario, last: Int[Array, "
     acceleration = (speed[1:] - speed[:-1]) / DT_S
     heading_change = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
     jerk = _derivative(acceleration, valid, _JERK_ORDER, 1)
-    # Like jerk, in the middle between two steps.
-    yaw = _derivative((heading_change[1:] + heading_change[:-1]) / 2, valid, _YAW_ORDER, 2)
-    share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
+    # Average headings to the middle between two steps, where the jerk is, too.
+    yaw_rps2 = _derivative((heading_change[1:] + heading_change[:-1]) / 2, valid, _YAW_ORDER, 2)
+    share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw_rps2) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
     return jnp.concatenate([share, share[-1:]]).at[last].set(share[last - 1])
 
@@ -175,7 +175,7 @@ def _derivative(
 ) -> Float[Array, " K"]:
     """Differentiate a polynomial fitted to the valid window around each sample; 0 without a valid window."""
     sample = jnp.arange(len(signal))
-    # Ends of the unbroken valid samples around each sample.
+    # First and last of the consecutive valid samples around each sample.
     first = jax.lax.cummax(jnp.where(valid, -1, sample)) + 1
     last = jax.lax.cummin(jnp.where(valid, len(signal), sample), reverse=True) - 1
     start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))
@@ -188,7 +188,7 @@ def _derivative(
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(box: Array, ground: Array) -> Array:
-        # Where its side of the edges is unknown, as on a driveway or outside the map, a logged car is on the road.
+        # A logged car whose side of the edges is unknown, as on a driveway or outside the map, is on the road.
         on_road = jnp.ones(4, bool)
         outside_m = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
         return jnp.max(jnp.clip(1.0 + outside_m / config.edge_m, 0.0, 1.0))
@@ -196,7 +196,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScena
     return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
 
 
-def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
+def _lane_deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(xy: Array, ground: Array) -> Array:
         distance = queries.lane_distance(bank, log.index, xy, ground)
         # Infinite without a lane nearby: in a car park, on a driveway, outside the map.
@@ -207,7 +207,7 @@ def _deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario)
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """The published kinematic heuristic, for comparison, and its scales, as those of :class:`KinematicConfig`.
+    """The published kinematic heuristic, for comparison; its scales are defined as in :class:`KinematicConfig`.
 
     It uses backward differences at 10 Hz, the product of distance and closing speed, and distances to map points (of
     lanes, only those for cars). Noise of 1 cm/s scores like violent driving, and distant traffic like a conflict
@@ -247,12 +247,13 @@ class PublishedConfig:
 
 
 def _published_volatility(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    """Return the larger of jerk and yaw acceleration, from backward differences that are 0 at the start."""
+    """Return the larger of scaled jerk and yaw acceleration, from backward differences that are 0 at the start."""
     heading = log.motion[:, 2]
     acceleration = _backward_difference(norm(log.velocity)) / DT_S
     yaw_rate = wrap(_backward_difference(heading)) / DT_S
-    jerk, yaw = _backward_difference(acceleration) / DT_S, _backward_difference(yaw_rate) / DT_S
-    return jnp.minimum(jnp.maximum(jnp.abs(jerk) / config.jerk_mps3, jnp.abs(yaw) / config.yaw_rps2), 1.0)
+    jerk, yaw_rps2 = _backward_difference(acceleration) / DT_S, _backward_difference(yaw_rate) / DT_S
+    share = jnp.maximum(jnp.abs(jerk) / config.jerk_mps3, jnp.abs(yaw_rps2) / config.yaw_rps2)
+    return jnp.minimum(share, 1.0)
 
 
 def _backward_difference(values: Float[Array, " T"]) -> Float[Array, " T"]:
@@ -262,10 +263,10 @@ def _backward_difference(values: Float[Array, " T"]) -> Float[Array, " T"]:
 def _interaction(config: PublishedConfig, log: LoggedScenario) -> Float[Array, " T"]:
     """Return the largest product of distance and closing speed, ``-dp . dv``, over its scale, within 0 and 1."""
 
-    def largest(frame: Frame, velocity: Array) -> Array:
-        offset, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
-        closing = -jnp.sum(offset * relative, axis=-1)
-        counts = frame.valid & (jnp.arange(len(closing)) > 0)
-        return jnp.max(jnp.where(counts, jnp.clip(closing / config.interaction_m2ps, 0.0, 1.0), 0.0))
+    def at_step(frame: Frame, velocity: Array) -> Array:
+        offset, relative_velocity = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
+        product = -jnp.sum(offset * relative_velocity, axis=-1)
+        counts = frame.valid & (jnp.arange(len(product)) > 0)
+        return jnp.max(jnp.where(counts, jnp.clip(product / config.interaction_m2ps, 0.0, 1.0), 0.0))
 
-    return jax.vmap(largest)(log.frame, log.velocity)
+    return jax.vmap(at_step)(log.frame, log.velocity)

@@ -31,7 +31,7 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """Log of one scenario; while ego is not observed, its last (at the start its first) motion is repeated.
+    """Log of one scenario; an unobserved ego has its last observed motion, or at the start its first.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
@@ -83,6 +83,7 @@ def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
 
 
 def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
+    """Return the context of ego at a step, with ``motion`` (zeros by default) at all steps of its history."""
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
     z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
     row = bank.row_of(index, 0) if bank.most_egos > 1 else None
@@ -90,25 +91,29 @@ def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> A
 
 
 def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
+    """Return the mask of agents that have overlapped ego at every step since they appeared."""
+
     def step(carry: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-        (ignored, was_valid), (touches, is_valid) = carry, inputs
-        ignored = touches & (ignored | ~was_valid)
+        (ignored, was_valid), (is_overlapping, is_valid) = carry, inputs
+        ignored = is_overlapping & (ignored | ~was_valid)
         return (ignored, is_valid), ignored
 
-    none = jnp.zeros(overlapping.shape[1], bool)
-    return jax.lax.scan(step, (none, none), (overlapping, valid))[1]
+    no_agents = jnp.zeros(overlapping.shape[1], bool)
+    return jax.lax.scan(step, (no_agents, no_agents), (overlapping, valid))[1]
 
 
 def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 2"]) -> Float[Array, " T"]:
-    def step(along: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
-        # Search only as far as the car can have moved, as the simulator does.
-        point, distance = inputs
-        projection = project_on_route(bank, index, point, along, 1.5 * distance + 2.0, logged=True)
-        along = jnp.maximum(along, projection.along_m)
-        return along, along
+    """Return ego's arc length along the logged route at every step, m; it never decreases."""
 
-    distance = jnp.concatenate([jnp.zeros(1), norm(xy[1:] - xy[:-1])])
-    return jax.lax.scan(step, jnp.zeros(()), (xy, distance))[1]
+    def step(along_m: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+        # Search only as far as the car can have moved, as the simulator does.
+        point, distance_m = inputs
+        projection = project_on_route(bank, index, point, along_m, 1.5 * distance_m + 2.0, logged=True)
+        along_m = jnp.maximum(along_m, projection.along_m)
+        return along_m, along_m
+
+    distance_m = jnp.concatenate([jnp.zeros(1), norm(xy[1:] - xy[:-1])])
+    return jax.lax.scan(step, jnp.zeros(()), (xy, distance_m))[1]
 
 
 @partial(jax.jit, static_argnums=0)

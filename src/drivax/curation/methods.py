@@ -36,7 +36,7 @@ PUBLISHED = Combination(
     {"volatility": 0.40, "interaction": 0.05, "off_road": 0.05, "lane_deviation": 0.47, "density": 0.03},
     {"volatility": "p99", "interaction": "p99", "off_road": "p99", "lane_deviation": "std", "density": "mean"},
 )  # fmt: skip
-#: The 95th percentile, because the rarest steps may be noise.
+#: Action rarity; a scenario is scored by its 95th percentile, because the rarest steps may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
 _ALL = Combination({"all": 1.0})
 #: Percentile of a set's disagreement that scores 0.5.
@@ -83,7 +83,7 @@ def curate(name: str, request: Request) -> ScoreTable:
     """Score a set.
 
     Raises:
-        UsageError: The method is unknown, lacks an argument, or takes other settings.
+        UsageError: The method is unknown, lacks an argument, or takes settings of another type.
         DataError: The method cannot score this set.
     """
     if name not in METHODS:
@@ -113,22 +113,22 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     """
     method, config_of_table = METHODS[table.method], json.loads(json.dumps(dict(table.config)))
     config = method.config if config is None else config
-    present: dict[str, Any] = {} if method.config is None else plain(config)
+    expected_values: dict[str, Any] = {} if method.config is None else plain(config)
     if method.config is not None:
         try:
-            config_of_table |= _rename_fields(config_of_table, config, present)
+            config_of_table |= _rename_fields(config_of_table, config, expected_values)
         except UsageError as error:
             raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
     if table.components:
-        present["combination"] = asdict(method.combination(config))
-    for name, value in present.items():
+        expected_values["combination"] = asdict(method.combination(config))
+    for name, value in expected_values.items():
         if config_of_table.get(name) != value:
             problem = f"scores of {table.method!r} have {name} {config_of_table.get(name)}, not {value}"
             raise DataError(problem, file=file, cure="score again with `drivax curate`")
 
 
 def _rename_fields(stored: Mapping[str, Any], config: Any, names: Collection[str]) -> dict[str, Any]:
-    """Return the stored settings of a table that are in ``names``; former names of their fields become today's."""
+    """Return the stored settings ``names`` of a table, with former names of fields replaced by present ones."""
     values = {name: stored[name] for name in names if name in stored}
     renamed = plain(settings.load(type(config), values, trust=()))
     return {name: value for name, value in renamed.items() if name in stored}
@@ -155,8 +155,8 @@ def make_table(
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
-    empty, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
-    table = ScoreTable(name, values, data.hash, ids, valid, empty, empty[:, 0], components)
+    zeros, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
+    table = ScoreTable(name, values, data.hash, ids, valid, zeros, zeros[:, 0], components)
     return table.recombine(METHODS[name].combination(config))
 
 
@@ -203,10 +203,10 @@ def _disagreement_components(
     disagreement: Float[np.ndarray[Any, Any], "N T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " N"]],
     scales: Sequence[float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return ``d / (d + scale)`` of the action's dimensions and of their sum, with a scale for each group."""
+    """Return ``d / (d + scale)`` for each dimension of the action and for their sum, with one scale per group."""
     scale = np.zeros((len(disagreement), 1))
-    for group, value in zip(groups, scales, strict=True):
-        scale[group] = np.maximum(value, np.finfo(np.float64).tiny)
+    for group, group_scale in zip(groups, scales, strict=True):
+        scale[group] = np.maximum(group_scale, np.finfo(np.float64).tiny)
     dimensions = enumerate(np.moveaxis(disagreement, -1, 0))
     components = {f"action_{index}": values / (values + scale) for index, values in dimensions}
     total = disagreement.sum(axis=-1)
@@ -214,7 +214,7 @@ def _disagreement_components(
 
 
 def _ensemble_combination(config: EnsembleConfig) -> Combination:
-    """Score a scenario by the ten steps with the largest disagreement."""
+    """Return the combination that scores a scenario by the ten steps with the largest disagreement."""
     name = "information" if config.cloning.loss == "likelihood" else "disagreement"
     return Combination({name: 1.0}, "top10")
 
@@ -250,7 +250,7 @@ def _oracle(name: str, request: Request) -> ScoreTable:
 
 
 def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:
-    """Return the steps within a labelled event of the built-in world.
+    """Return the mask of steps within a labelled event of the built-in world.
 
     Raises:
         DataError: The set is not from the built-in world.

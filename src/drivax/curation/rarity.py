@@ -35,13 +35,13 @@ class ExpertActions:
     """Score function that returns the logged action of every step, in the default action space."""
 
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Array]:
-        """Return the clipped ``action [T, 2]``, and ``known [T]``: ego is observed at the step and the next two.
+        """Return the clipped ``action [T, 2]``, and ``known [T]``: ego is observed at the step and at the next two.
 
         The curvature depends on the logged position two steps later.
         """
         action = jax.vmap(lambda context: expert_action(bank, context, _SPACE))(log.context)
-        later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
-        known = log.valid & later[1:-1] & later[2:]
+        padded_valid = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
+        known = log.valid & padded_valid[1:-1] & padded_valid[2:]
         return {"action": jnp.clip(action, -1.0, 1.0), "known": known}
 
 
@@ -80,9 +80,9 @@ class KernelRarity:
         edges = np.linspace(-1.0, 1.0, self.cells + 1)
         counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0]
         cell = 2.0 / self.cells
-        smooth = gaussian_filter(counts, self.bandwidth / cell, mode="reflect", truncate=6.0)
+        kernel_sum = gaussian_filter(counts, self.bandwidth / cell, mode="reflect", truncate=6.0)
         position = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
-        return map_coordinates(smooth, position, order=1, mode="nearest") / (len(actions) * cell * cell)
+        return map_coordinates(kernel_sum, position, order=1, mode="nearest") / (len(actions) * cell * cell)
 
     def scores(self, actions: Actions, at: QueryActions) -> QueryValues:
         """Return the scores of the actions ``at``, in [0, 1], from the density of ``actions``."""
@@ -128,8 +128,8 @@ class PublishedRarity:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
         pairs = zip(self.edges, values, strict=True)
-        acceleration, curvature = (np.searchsorted(edges, value, side="right") - 1 for edges, value in pairs)
-        return acceleration * 89 + curvature
+        row, column = (np.searchsorted(edges, value, side="right") - 1 for edges, value in pairs)
+        return row * 89 + column
 
 
 def rarity_steps(

@@ -109,8 +109,8 @@ def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
     sorted_scores = np.where(np.isinf(sorted_scores), 0.0, sorted_scores)
     if kind == "top":
         rank = np.arange(steps.shape[1])
-        largest = (rank < count[:, None]) & (rank >= count[:, None] - number)
-        return np.where(largest, sorted_scores, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
+        is_largest = (rank < count[:, None]) & (rank >= count[:, None] - number)
+        return np.where(is_largest, sorted_scores, 0.0).sum(axis=1) / np.maximum(is_largest.sum(axis=1), 1)
     position = (divisor - 1) * (number / 100.0)
     low = np.floor(position).astype(int)
     high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
@@ -123,9 +123,9 @@ SCORES_VERSION = 3
 OWN_SCORES = "scores.npz"
 _RERUN = "run `drivax curate` again"
 _COMPONENT = "component_"
-#: Largest table: bytes beyond its columns (ids, header), and columns of float32 per step.
+#: Size limits of a table: bytes of ids and header, and float32 columns of all steps.
 _MOST_BYTES, _MOST_COLUMNS = 64 << 20, 64
-#: Longest header, in characters; most have less than a thousand.
+#: Maximum length of the header in characters; most have less than a thousand.
 _MOST_HEADER = 1 << 20
 
 
@@ -152,9 +152,9 @@ class ScoreTable:
 
     @property
     def drawable(self) -> Valid:
-        """Steps at which ego is observed, also at the next one.
+        """Mask of steps such that ego is observed at the step and at the next one.
 
-        A training draws fewer: those of :func:`drivax.learning.loop.usable_steps`.
+        Training draws fewer steps: those of :func:`drivax.learning.loop.usable_steps`.
         """
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
 
@@ -225,7 +225,7 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         raise DataError("score table not found", file=file, cure=cure)
     arrays = read_arrays(file, _RERUN, _MOST_BYTES + len(data) * _MOST_COLUMNS * data.capacity.steps * 4)
     with explain_damage(file, _RERUN, "not a score table, or damaged"):
-        if (size := arrays["header"].nbytes) > 4 * _MOST_HEADER:  # of 4 bytes per character
+        if (size := arrays["header"].nbytes) > 4 * _MOST_HEADER:  # 4 bytes per character
             raise ValueError(f"a header of {size // 4:,} characters")
         header = parse_json(str(arrays.pop("header")[()]).encode())
         _check_source(header["version"], header["set_hash"], file, data)
@@ -248,7 +248,7 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
 
 
 def _digest(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of a table; tables of earlier versions lack it."""
+    """Return the SHA-256 (hex) of header and arrays, except for the entry ``sha256``, which old tables lack."""
     content = {name: value for name, value in header.items() if name != "sha256"}
     digest = hashlib.sha256(json.dumps(content).encode())
     for name in sorted(arrays):

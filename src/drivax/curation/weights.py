@@ -89,18 +89,18 @@ def sampling_weights(
 def _score_weights(
     scores: Float[Array, " n"], mass: Float[Array, " n"], config: WeightConfig
 ) -> Float[Array, " n"]:
-    """Return the weights of scores; ``mass`` is the number of steps of each score."""
+    """Return the weight of each score, with mean 1 over steps; ``mass`` is the number of steps of each score."""
     score = np.asarray(scores, np.float64)
     if config.normalise == "quantile":
         _, rank = np.unique(score, return_inverse=True)
-        ties = np.bincount(rank, mass)
-        score = ((np.cumsum(ties) - ties / 2.0) / mass.sum())[rank]
+        mass_by_rank = np.bincount(rank, mass)
+        score = ((np.cumsum(mass_by_rank) - mass_by_rank / 2.0) / mass.sum())[rank]
     # Logarithms avoid overflow and underflow at low temperatures.
     with np.errstate(divide="ignore"):
-        power = np.log(score + config.floor) / config.temperature
-    if not np.isfinite(power.max()):
+        log_weight = np.log(score + config.floor) / config.temperature
+    if not np.isfinite(log_weight.max()):
         return np.zeros(len(score))
-    weight = _clip(np.exp(power - power.max()), mass, config.most)
+    weight = _clip(np.exp(log_weight - log_weight.max()), mass, config.most)
     return (1.0 - config.uniform) * weight / np.average(weight, weights=mass) + config.uniform
 
 
@@ -110,7 +110,7 @@ def _clip(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> 
     sorted_weight, sorted_mass = weight[order], mass[order]
     if sorted_weight[0] <= most * np.average(weight, weights=mass):
         return weight
-    # Clipping the first k weights (mass m) to c gives c = most (m c + tail) / n; tail is the sum of the others.
+    # Clipping the k largest weights (mass m) to c gives c = most (m c + tail) / n; tail is the sum of the others.
     clipped_mass = np.cumsum(sorted_mass) - sorted_mass
     tail_sum = np.cumsum((sorted_weight * sorted_mass)[::-1])[::-1]
     remaining = mass.sum() - most * clipped_mass

@@ -26,9 +26,9 @@ Findings = dict[str, float | int | bool | str | None]
 
 #: Logs per batch.
 BATCH = 64
-#: The heading of an agent counts as wrong by pi if it reverses more than 20 m, or more than 5 m and 90 % of its way.
+#: An agent's heading counts as wrong by pi if it reverses more than 20 m, or more than 5 m and 90 % of its distance.
 REVERSE_M, MOSTLY_REVERSE_M, MOSTLY_REVERSE_SHARE = 20.0, 5.0, 0.9
-#: Slower motion is jitter.
+#: Slower motion counts as jitter of the positions.
 CREEP_MPS = 0.5
 _DRIVERS = (AgentKind.VEHICLE, AgentKind.CYCLIST)
 #: Largest distance between the goal of a route and the end of the log that it leads to, m (as for ``reached_goal``).
@@ -37,21 +37,21 @@ _FACTS = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
     "logged", "log_divergence_m",
 )  # fmt: skip
-#: Action spaces, by the finding that is the share of logged actions outside their bounds.
+#: Action space by finding; the finding is the share of logged actions outside the bounds of the space.
 _ACTION_SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
-    """Return the table keys of scenarios: ``dataset``, ``scenario_id`` and ``segment``."""
+    """Return ``dataset``, ``scenario_id`` and ``segment`` of each scenario."""
     return [{name: s.text(name) for name in ("dataset", "scenario_id", "segment")} for s in scenarios]
 
 
 def audit(scenarios: Sequence[Scenario]) -> list[Findings]:
-    """Replay the logs of scenarios of one capacity, from the current step to their end.
+    """Replay the logs of scenarios of one capacity, from the current step to the end.
 
     Returns:
         Findings of each scenario by name. A finding that does not apply is None (a route deviation without a route).
-        Logs that are too short to evaluate have only the findings that need no replay.
+        Logs that are too short to evaluate only have the findings that need no replay.
     """
     long_enough = [scenario for scenario in scenarios if scenario.steps >= LEAST_STEPS]
     batches = (long_enough[first : first + BATCH] for first in range(0, len(long_enough), BATCH))
@@ -117,9 +117,9 @@ class _EmptyTask:
 def replay(bank: ScenarioBank, index: Int[Array, " B"], use_dynamics: bool = False) -> dict[str, Array]:
     """Return facts of scenarios ``index`` from the current step on, ``[B, T - 10]`` each.
 
-    Keys are names of ``simulator.types.Facts``, and ``clipped_<space>``: whether the logged action into the step
-    exceeds the bounds of an action space. Ego is placed at its logged poses; with ``use_dynamics`` it follows the log
-    through the dynamics.
+    Keys are names of ``simulator.types.Facts``, and ``clipped_<space>``: whether the logged action that leads to the
+    step exceeds the bounds of an action space. Ego is placed at its logged poses; with ``use_dynamics`` it follows the
+    log by the dynamics of the action space ``physical``.
     """
     simulator = Simulator(_EmptyTask())
 
@@ -137,10 +137,10 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], use_dynamics: bool = Fal
         return next_state, _select_facts(next_state.facts) | exceeds_bounds
 
     def replay_scenario(scenario: Array) -> dict[str, Array]:
-        start = simulator.reset(bank, scenario)
-        first = _select_facts(start.facts) | dict.fromkeys(_ACTION_SPACES, jnp.zeros((), bool))
-        _, later = jax.lax.scan(step, start, None, length=bank.steps - 1 - CURRENT_STEP)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
+        state = simulator.reset(bank, scenario)
+        initial = _select_facts(state.facts) | dict.fromkeys(_ACTION_SPACES, jnp.zeros((), bool))
+        _, later = jax.lax.scan(step, state, None, length=bank.steps - 1 - CURRENT_STEP)
+        return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), initial, later)
 
     return jax.vmap(replay_scenario)(index)
 
@@ -150,7 +150,7 @@ def _select_facts(facts: Facts) -> dict[str, Array]:
 
 
 def _replay_batch(scenarios: Sequence[Scenario]) -> list[Findings]:
-    """Return findings of one batch, padded to ``BATCH`` without trimming, so that all batches share one program."""
+    """Return findings of one batch, padded to ``BATCH`` and not trimmed, so that all batches share one program."""
     batch = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
     bank = ScenarioBank.from_scenarios(batch, trim=False)
     series = jax.tree.map(np.asarray, replay(bank, jnp.arange(BATCH)))
@@ -197,18 +197,18 @@ def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, An
 
 
 def _reverse_and_forward_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
-    """Return how far vehicles and cyclists drive backwards and forwards after the current step, metres."""
+    """Return the distances (m) that vehicles and cyclists drive backwards and forwards after the current step."""
     future = slice(CURRENT_STEP, int(scenario.steps))
     valid, heading = scenario.agent_valid[future], scenario.agent_heading[future][:-1]
-    step = np.diff(scenario.agent_xy[future].astype(np.float64), axis=0)
-    along = step[..., 0] * np.cos(heading) + step[..., 1] * np.sin(heading)
-    drives = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
-    motions = (np.where(drives, sign * along, 0.0) for sign in (-1, 1))
-    return np.stack([np.where(motion > CREEP_MPS * DT_S, motion, 0.0).sum(axis=0) for motion in motions])
+    displacement = np.diff(scenario.agent_xy[future].astype(np.float64), axis=0)
+    forward_m = displacement[..., 0] * np.cos(heading) + displacement[..., 1] * np.sin(heading)
+    counts = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
+    distances = (np.where(counts, sign * forward_m, 0.0) for sign in (-1, 1))
+    return np.stack([np.where(step_m > CREEP_MPS * DT_S, step_m, 0.0).sum(axis=0) for step_m in distances])
 
 
 def _clipped_share(is_clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
-    """Return the share of clipped actions among those into an evaluated step from an evaluated or the current one."""
+    """Return the share of clipped actions; only actions between evaluated steps, or from the current step, count."""
     counts = evaluated.copy()
     counts[2:] &= evaluated[1:-1]
     return _round(is_clipped[counts].mean(), 4) if counts.any() else None

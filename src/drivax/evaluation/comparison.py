@@ -29,7 +29,7 @@ from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_boo
 from drivax.stats.seeds import CrossedEffect, difference_interval, seeds_interval
 from drivax.stats.significance import SignificanceResult
 
-#: Default of the smallest difference that matters, as a share of the standard deviation.
+#: Smallest difference that matters by default, in standard deviations.
 _SMALL_EFFECT = 0.1
 Values = Float64[np.ndarray, " n"]
 
@@ -52,9 +52,9 @@ class Comparison:
     """Result of a comparison.
 
     Attributes:
-        names, folders: Different names, and run folders of A and B; of several seeds the folder around the first run.
+        names, folders: Distinct names, and run folders, of A and B; with several seeds the parent of the first run.
         traffic: Traffic model of both.
-        scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are the same if paired.
+        scenarios, recordings: Numbers of scenarios and recordings of A and of B, which are equal if paired.
         strata: Number of strata of the split; 1 without strata.
         sensitivity: Sensitivity of the primary metric; None if its differences (in a split: its values) do not vary, or
             if too few scenarios or recordings define it.
@@ -93,7 +93,7 @@ class _Side:
         return np.stack([self.pairs.values(table, metric) for table in self.tables])
 
     def values(self, metric: str) -> Values:
-        """Return the mean over the seeds; NaN outside the arm, and if it is undefined for a seed."""
+        """Return the mean over seeds by scenario; NaN outside the arm, and if a seed has no defined value."""
         return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
@@ -127,8 +127,8 @@ class _Side:
         values = np.where(self.arm, self.by_seed(plan.primary), np.nan)
         defined = [seed_values[~np.isnan(seed_values)] for seed_values in values]
         means = tuple(float(seed_values.mean()) if seed_values.size else None for seed_values in defined)
-        draws = {"resamples": plan.resamples, "seed": plan.seed}
-        interquartile = interquartile_bootstrap(values, self.pairs.clusters, plan.confidence, **draws)
+        resampling = {"resamples": plan.resamples, "seed": plan.seed}
+        interquartile = interquartile_bootstrap(values, self.pairs.clusters, plan.confidence, **resampling)
         return SeedSpread(means, interquartile)
 
 
@@ -173,7 +173,7 @@ class _Contrast:
         )
 
     def _test(self, metric: str, x: Values, y: Values) -> tuple[Interval, SignificanceResult]:
-        """Return the difference of the means, and its significance test: with several seeds a t test."""
+        """Return the difference of the means, and the result of its test, which is a t test with several seeds."""
         plan, split, clusters = self.plan, self.split, self.clusters
         resampling = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
         if split is not None:
@@ -193,7 +193,7 @@ class _Contrast:
         return difference_interval(x, y, self.clusters, self.plan.confidence)
 
     def _paired_test(self, metric: str, x: Values, y: Values) -> SignificanceResult:
-        """Apply McNemar's test to rates in independent pairs, otherwise the plan's test of means by recording."""
+        """Apply McNemar's test to rates of independent pairs, else the plan's test of means by recording."""
         _, labels = drop_undefined(x, self.clusters)
         independent = labels.size == 0 or int(labels.max()) + 1 == labels.size
         values = np.concatenate((x, y))
@@ -255,7 +255,7 @@ def compare(
     plan: ComparisonPlan, a: Sequence[EpisodeTable], b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
 ) -> Comparison:  # fmt: skip
-    """Compare two planners by a plan, given an evaluation per seed of each.
+    """Compare two planners by a plan, given one evaluation for each of their seeds.
 
     ``entries`` are the manifest entries of the scenarios, which a stratified split needs.
 
@@ -279,9 +279,9 @@ def compare(
     if min(primary.a.n, primary.b.n) == 0:
         raise pairing.undefined_metric(plan.primary, (*a, *b), paired=split is None)
     primary = primary.with_winner(plan, primary.evidence.p)
-    metrics = [contrast.compare(metric) for metric in plan.secondary]
-    adjusted_p = significance.holm_adjust([metric.evidence.p for metric in metrics])
-    secondary = tuple(metric.with_winner(plan, p) for metric, p in zip(metrics, adjusted_p, strict=True))
+    results = [contrast.compare(metric) for metric in plan.secondary]
+    adjusted_p = significance.holm_adjust([result.evidence.p for result in results])
+    secondary = tuple(result.with_winner(plan, p) for result, p in zip(results, adjusted_p, strict=True))
     sensitivity = contrast.sensitivity()
     return Comparison(
         plan=plan,
@@ -300,7 +300,7 @@ def compare(
 
 
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
-    """Return the names of A and B; equal ones with the shortest different ends of their folders, if these differ."""
+    """Return distinct names of A and B: equal names are followed by the ends of their folders, or by A and B."""
     if a.name != b.name:
         return a.name, b.name
     if a.folder is None or b.folder is None or a.folder.resolve() == b.folder.resolve():

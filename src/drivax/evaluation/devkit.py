@@ -37,6 +37,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 REAR_AXLE_M = 1.461
 #: Corners of ``geometry.boxes`` in the devkit's order: front left, rear left, rear right, front right.
 _DEVKIT_ORDER = (0, 3, 2, 1)
+#: Thresholds and horizons of the devkit's metrics.
 _STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
 _AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
 _TTC_STEP_S, _TTC_HORIZON_S, _MIN_TTC_S = 0.1, 3.0, 0.95
@@ -58,9 +59,9 @@ class EgoMotion:
         acceleration: Acceleration of the rear axle along the heading, m/s2.
         yaw_rate: Yaw rate, rad/s.
         yaw_acceleration: Yaw acceleration, rad/s2.
-        size_m: Length and width.
-        rear_axle_m: Distance of the rear axle behind the centre.
-        dt_s: Time between samples.
+        size_m: Length and width, m.
+        rear_axle_m: Distance of the rear axle behind the centre, m.
+        dt_s: Time between samples, s.
     """
 
     xy: Float64[np.ndarray, "t 2"]
@@ -97,9 +98,9 @@ class Tracks:
         xy: Centres, m.
         heading: Headings, rad.
         speed: Speeds, m/s; 0 for static objects.
-        present: Whether an agent is in the sample.
-        size_m: Length and width of each.
-        kind: :class:`~drivax.scenario.schema.AgentKind` of each.
+        present: Whether an agent is in a sample.
+        size_m: Length and width of each agent, m.
+        kind: :class:`~drivax.scenario.schema.AgentKind` of each agent.
     """
 
     xy: Float64[np.ndarray, "t a 2"]
@@ -120,11 +121,11 @@ class RoadObject:
     """A lane or a lane connector.
 
     Attributes:
-        polygon: Its area.
-        line: Its centre line.
-        block: Its roadblock.
-        limit_mps: Speed limit; None if unknown.
-        connector: Whether it is a connector.
+        polygon: Area (shapely polygon).
+        line: Centre line (shapely line string).
+        block: Roadblock.
+        limit_mps: Speed limit, m/s; None if unknown.
+        connector: Whether the object is a connector.
         successors: Indices of the successors.
         predecessors: Indices of the predecessors.
     """
@@ -147,8 +148,8 @@ class Road:
 
     Attributes:
         objects: Lanes and connectors.
-        outside_m: Distance of ego's corners outside the drivable area (at most 0 inside).
-        intersection: Whether points are in an intersection.
+        outside_m: Function that returns how far ego's corners are outside the drivable area, m (at most 0 inside).
+        intersection: Function that returns whether points are in an intersection.
     """
 
     objects: Sequence[RoadObject]
@@ -156,7 +157,7 @@ class Road:
     intersection: Callable[[Points], Bool[np.ndarray, " n"]] = lambda points: np.zeros(len(points), bool)
 
     def containing(self, points: Points) -> Bool[np.ndarray, "n o"]:
-        """Return which objects contain each point."""
+        """Return a mask of the objects that contain each point."""
         inside = [shapely.contains_xy(lane.polygon, points[:, 0], points[:, 1]) for lane in self.objects]
         return np.stack(inside, axis=1) if inside else np.zeros((len(points), 0), bool)
 
@@ -175,7 +176,7 @@ class Collision:
 
     Attributes:
         sample: Sample of the contact.
-        agent: Index of the agent.
+        agent: Index of the agent in :class:`Tracks`.
         type: 0 ego stopped, 1 agent stopped, 2 front, 3 rear, 4 lateral.
         at_fault: Whether ego is at fault.
     """
@@ -216,8 +217,8 @@ class DevkitVerdict:
         collisions: First contacts.
         ttc_s: Time to collision of each sample, 0 to 2.9 s; inf if there is none.
         in_lane: Whether all corners are in one lane or in connected lanes, per sample.
-        backward_m: Largest distance against traffic within a second, at most 0.
-        progress_m: Progress of the expert and of ego; 0 without a route.
+        backward_m: Minus the largest distance against traffic within a second, m.
+        progress_m: Progress of the expert and of ego, m; 0 without a route.
         comfort: Comfort series.
     """
 
@@ -327,7 +328,7 @@ def _boxes(
 def _angle_deg(
     origin: Float64[np.ndarray, " 2"], heading: float, xy: Float64[np.ndarray, "a 2"]
 ) -> Float64[np.ndarray, " a"]:
-    """Return the angle between a heading and the direction from ``origin`` to each point."""
+    """Return the angle (degrees) between a heading and the direction from ``origin`` to each point."""
     offset = xy - origin
     distance = np.maximum(np.hypot(*offset.T), 1e-12)
     return np.degrees(np.arccos(np.clip(offset @ _directions(heading) / distance, -1.0, 1.0)))
@@ -367,7 +368,7 @@ def _candidates(road: Road, inside: Bool[np.ndarray, " o"], candidates: set[int]
 
 
 def _common_or_connected(road: Road, lanes_by_corner: Sequence[set[int]]) -> bool:
-    """Return whether the corners share a lane, or the lanes of the rear corners continue into those of the front."""
+    """Return whether all corners share a lane, or lanes of the rear corners continue into those of the front ones."""
     if set.intersection(*lanes_by_corner):
         return True
     front_left, rear_left, rear_right, front_right = lanes_by_corner
@@ -378,7 +379,7 @@ def _common_or_connected(road: Road, lanes_by_corner: Sequence[set[int]]) -> boo
 
 
 def _extend(road: Road, lanes: set[int], links: Literal["successors", "predecessors"]) -> set[int]:
-    """Return lanes and those that they are linked to."""
+    """Return lanes and their successors or predecessors."""
     return lanes.union(*(getattr(road.objects[index], links) for index in lanes))
 
 
@@ -408,7 +409,7 @@ def _collisions(ego: EgoMotion, tracks: Tracks, in_lane: Bool[np.ndarray, " t"])
 
 
 def _fault_score(collisions: Sequence[Collision], tracks: Tracks) -> float:
-    """Return 1 - n/2, at least 0, for n at-fault collisions; 0 if one is with a road user."""
+    """Return 1 - n/2, at least 0, for n at-fault collisions; 0 if one of them is with a road user."""
     at_fault = [tracks.kind[collision.agent] for collision in collisions if collision.at_fault]
     if not all(kind in (AgentKind.STATIC, AgentKind.OTHER) for kind in at_fault):
         return 0.0
@@ -419,7 +420,7 @@ def _time_to_collision(
     ego: EgoMotion, tracks: Tracks, road: Road, in_lane: Bool[np.ndarray, " t"],
     collisions: Sequence[Collision],
 ) -> Float64[np.ndarray, " t"]:  # fmt: skip
-    """Return the time to collision of every sample at constant velocities (``time_to_collision_within_bound``)."""
+    """Return the time to collision (s) of every sample at constant velocities (``time_to_collision_within_bound``)."""
     times = np.full(len(ego.xy), np.inf)
     fault_samples = {collision.sample for collision in collisions if collision.at_fault}
     first_contact = np.full(len(tracks.kind), len(ego.xy))
@@ -447,7 +448,7 @@ def _time_to_collision(
 def _sweep(
     boxes: Float64[np.ndarray, "*a 4 2"], heading: Any, speed: Any, times: Float64[np.ndarray, " k"]
 ) -> Any:
-    """Return the boxes at every time, moved along their headings at constant speed."""
+    """Return the boxes at every time (s), moved along their headings at constant speed."""
     direction = _directions(heading) * np.asarray(speed)[..., None]
     return shapely.polygons(boxes[..., None, :, :] + times[:, None, None] * direction[..., None, None, :])
 
@@ -468,7 +469,7 @@ def _stays_on_road(ego: EgoMotion, road: Road, route: Sequence[Sequence[int]]) -
 
 
 def _route(road: Road, points: Points) -> list[list[int]]:
-    """Return the lane or connectors of each point, given the points before it (``get_route``)."""
+    """Return the lane or the connectors of each point, given the previous points (``get_route``)."""
     containing, in_intersection = road.containing(points), road.intersection(points)
     route: list[list[int]] = []
     current: list[int] = []
@@ -505,7 +506,7 @@ def _drop_extra_connectors(road: Road, route: list[list[int]]) -> list[list[int]
 
 
 def _wrong_way_distance(road: Road, route: Sequence[Sequence[int]], ego: EgoMotion) -> float:
-    """Return minus the largest distance against traffic in a second (``driving_direction_compliance``)."""
+    """Return minus the largest distance (m) against traffic in a second (``driving_direction_compliance``)."""
     progress = np.zeros(len(ego.xy))
     last_object, last_position = (route[0][0] if route[0] else None), None
     for sample, objects in enumerate(route):
@@ -518,7 +519,7 @@ def _wrong_way_distance(road: Road, route: Sequence[Sequence[int]], ego: EgoMoti
             last_position = position
         else:
             last_object, last_position = objects[0], None
-    # As in the devkit: a window has one difference more than fits in its duration.
+    # As in the devkit: a window has one difference more than a second contains.
     samples = round(_DIRECTION_S / ego.dt_s)
     sums = [progress[max(0, end - samples) : end + 1].sum() for end in range(len(progress))]
     return -abs(float(min(sums)))
@@ -529,7 +530,7 @@ def _locate(line: Any, point: Float64[np.ndarray, " 2"]) -> float:
 
 
 def _progress(road: Road, expert_xy: Points, ego_xy: Points) -> tuple[float, float] | None:
-    """Return the progress of expert and ego along the expert's roadblocks; None if the expert has no route."""
+    """Return the progress (m) of expert and ego along the expert's roadblocks; None if the expert has no route."""
     blocks: list[tuple[int, Any]] = []
     for objects in _route(road, expert_xy):
         if objects and (not blocks or road.objects[objects[0]].block != blocks[-1][0]):

@@ -1,9 +1,10 @@
-"""Digest of standard episodes: one value on all machines that simulate the same up to rounding.
+"""Digest of standard episodes: equal on all machines whose simulations agree up to rounding.
 
-Rule-based planners drive 64 scenarios of the built-in world. The digest covers truths, counts, which of them are
-defined, and first events exactly, and some smooth quantities on a grid. On a fixed grid, values near an edge would
-differ between machines by float noise. The grid of each quantity is therefore shifted by the multiple of an eighth of
-its unit whose edges are farthest from all 64 values (docs/guide/reproducibility.md has distances).
+Rule-based planners drive 64 scenarios of the built-in world. The digest covers booleans, counts, which of them are
+defined, and the steps of first events exactly, and some continuous quantities as cells of a grid. On a fixed grid,
+values near an edge would fall into different cells on different machines. The grid of each quantity is therefore
+shifted by the multiple of an eighth of its cell whose edges are farthest from all 64 values
+(docs/guide/reproducibility.md has the distances).
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.reactive import make_traffic
 from drivax.synthetic.generate import Generation, generate
 
-#: Number and seed of the scenarios; planners with their traffic.
+#: Number and seed of the scenarios, and each planner with its traffic.
 SCENARIOS, SEED = 64, 33
 ROLLOUTS = (("constant_velocity", "log"), ("idm", "log"), ("idm", "idm"))
-#: Units of the grids, metres.
+#: Cell sizes of the grids, m.
 UNITS = {"distance": 2.0, "progress": 2.0, "goal_distance": 2.0, "ade": 1.0}
-#: Metrics that are truths or counts.
+#: Metrics that are booleans, codes or counts.
 EXACT = (*names_of(METRICS, "rate", "code"), "steps", "last_step", "ignored_overlaps")
-#: Candidates for the start of a grid, per unit.
-_STARTS = 8
-#: In place of an undefined truth or count.
+#: Number of candidate offsets of a grid, evenly spaced over a cell.
+_OFFSETS = 8
+#: Value of an undefined boolean, code or count.
 _UNDEFINED = -9.0
 
 
 def standard_digests() -> Iterator[tuple[str, str]]:
-    """Generate the standard scenarios, drive them, and yield (name, digest) of each rollout and of them all.
+    """Generate the standard scenarios, evaluate the planners, and yield (name, digest) of each rollout and of all.
 
-    The first pair is the hash of the set, which the last digest does not cover.
+    The first pair holds the hash of the set, which the last digest does not cover.
     """
     with TemporaryDirectory() as folder:
         options = Generation(workers=os.cpu_count() or 1)
@@ -56,8 +57,8 @@ def standard_digests() -> Iterator[tuple[str, str]]:
 
 
 def episode_digest(table: EpisodeTable) -> str:
-    """Return 16 hexadecimal digits for the episodes of a table from memory."""
-    assert table.in_memory is not None, "episodes in memory have their first events"
+    """Return the digest of a table in memory, 16 hexadecimal digits."""
+    assert table.in_memory is not None, "only a table in memory has the steps of first events"
     exact = [np.nan_to_num(table.metrics[name], nan=_UNDEFINED) for name in EXACT]
     cells = [grid_cells(table.metrics[name], unit)[0] for name, unit in UNITS.items()]
     columns = [*exact, *(table.in_memory.events[name] for name in EVENTS), *cells]
@@ -66,22 +67,22 @@ def episode_digest(table: EpisodeTable) -> str:
 
 def grid_cells(
     values: Float[np.ndarray, " n"], unit: float
-) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " start"]]:
-    """Return the cell of each value, and for each start of the grid the least distance of a value from an edge.
+) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " offset"]]:
+    """Return the cell of each value, and for each offset of the grid the smallest distance of a value from an edge.
 
-    Cells are numbered by their lower edge in eighths of ``unit``; undefined values (NaN) have the smallest int64.
-    Distances are shares of the unit.
+    ``unit`` is the size of a cell. Cells are numbered by their lower edge in eighths of ``unit``; undefined values
+    (NaN) have the smallest int64. Distances are shares of ``unit``.
     """
     defined = np.isfinite(values)
-    starts = np.arange(_STARTS) / _STARTS
-    phase = (values[defined, None] / unit - starts) % 1.0
+    offsets = np.arange(_OFFSETS) / _OFFSETS
+    phase = (values[defined, None] / unit - offsets) % 1.0
     distances = np.minimum(phase, 1.0 - phase).min(axis=0, initial=0.5)
     best = int(distances.argmax())
     cells = np.full(values.shape, np.iinfo(np.int64).min)
-    cells[defined] = np.floor(values[defined] / unit - starts[best]).astype(np.int64) * _STARTS + best
+    cells[defined] = np.floor(values[defined] / unit - offsets[best]).astype(np.int64) * _OFFSETS + best
     return cells, distances
 
 
 def _sha256(data: bytes) -> str:
-    """Return the first 16 hexadecimal digits."""
+    """Return the first 16 hexadecimal digits of the SHA-256."""
     return hashlib.sha256(data).hexdigest()[:16]

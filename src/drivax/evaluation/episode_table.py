@@ -47,12 +47,12 @@ NOT_SUMMARISED = tuple(name for name, column in COLUMNS.items() if not column.su
 FAILED = tuple(name for name, column in COLUMNS.items() if column.fails_on_crash)
 _RERUN = "run drivax evaluate again"
 _FILES = ("episodes.csv", "summary.json", "crashes.json", "trajectories.npz")
-#: Largest table: bytes per row (most rows have 300), and in all.
+#: Size limits of ``episodes.csv``, bytes: per row (a typical row has 300), and in total.
 _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
-#: Most cells of a table, of 8 bytes (1 GB in all): the 1.7 million episodes of the largest one count as up to 126
-#: million. A cell of a key counts as two (in a list, then in a tuple), a distinct text as the second number of cells.
+#: Memory limit of a table, in cells of 8 bytes (1 GB in total): the largest table, of 1.7 million episodes, takes up to
+#: 126 million. A key takes two cells (in a list, then in a tuple), a distinct text ``_TEXT_CELLS``.
 _MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
-#: Largest trajectories: bytes in addition to the episodes, and bytes per episode (more than any capacity takes).
+#: Size limits of ``trajectories.npz``, bytes: fixed part, and per episode (more than any capacity needs).
 _MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
@@ -64,7 +64,7 @@ Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 @dataclass(frozen=True)
 class Crash:
-    """Crash of a planner in one episode: the first step of the log at which it occurred, and the error."""
+    """First crash of a planner in one episode: the step of the log, and the error."""
 
     dataset: str
     scenario_id: str
@@ -132,8 +132,8 @@ class EpisodeTable:
         if run.is_sealed:
             require_entries(run.path, *_FILES)
         keys, metrics = _read_columns(run.path / "episodes.csv", _count_scenarios(run.info))
-        if difference := _difference(keys, run.info):
-            refuse_edited(run.path / "episodes.csv", *difference)
+        if mismatch := _mismatch(keys, run.info):
+            refuse_edited(run.path / "episodes.csv", *mismatch)
         crashes = _read_crashes(run.path / "crashes.json")
         for file in (CONFIG_FILE, "summary.json"):
             check_seal(run.path / file)
@@ -214,7 +214,7 @@ class EpisodeTable:
         return COLUMNS.get(name) or self.own_metrics.get(name)
 
     def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
-        """Return the mean of a metric over the defined episodes of each scenario; NaN if there are none."""
+        """Return the mean of a metric by scenario, over the episodes that define it; NaN if there are none."""
         column = self.metrics.get(metric, np.full(len(self), np.nan))
         defined_values: dict[ScenarioKey, list[float]] = {key: [] for key in self.scenarios}
         for key, value in zip(self.scenarios, column.tolist(), strict=True):
@@ -298,7 +298,7 @@ def fail_crashed(metrics: Mapping[str, Array], has_crashed: Any) -> dict[str, Ar
 
 
 def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Return the mean of a metric over its defined episodes, with a Wilson interval for rates, else a bootstrap."""
+    """Return the mean over defined values of a metric, with Wilson's interval for rates, else a bootstrap interval."""
     if name in RATES:
         return rate(values, clusters, confidence)
     return bootstrap_mean(values, clusters, confidence, seed=seed)
@@ -311,7 +311,7 @@ def _cell(value: Any) -> str:
 
 
 def _count_scenarios(info: Mapping[str, Any]) -> int:
-    """Return the number of scenarios of an evaluation, or 0 if its ``run.json`` does not say it."""
+    """Return the number of scenarios of the evaluated sets according to ``run.json``, 0 if unknown."""
     with contextlib.suppress(*DAMAGE):
         return sum(int(data["scenarios"]) for data in info["data"])
     return 0
@@ -319,8 +319,8 @@ def _count_scenarios(info: Mapping[str, Any]) -> int:
 
 def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
     """Read ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN for undefined values."""
-    most = min(max(MOST_TEXT, scenarios * _MOST_ROW_BYTES), _MOST_TABLE_BYTES)
-    rows = read_csv(require_file(path, _RERUN), _RERUN, most)
+    max_bytes = min(max(MOST_TEXT, scenarios * _MOST_ROW_BYTES), _MOST_TABLE_BYTES)
+    rows = read_csv(require_file(path, _RERUN), _RERUN, max_bytes)
     header = next(rows, [])
     missing = [key for key in KEYS if key not in header]
     if missing or len(set(header)) < len(header):
@@ -328,15 +328,15 @@ def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]
         raise DataError(problem, file=path, record="header", cure=_RERUN)
     keys: dict[str, list[str]] = {name: [] for name in KEYS}
     metrics = {name: array("d") for name in header if name not in KEYS}
-    texts: dict[str, str] = {}
+    distinct_texts: dict[str, str] = {}
     for number, row in enumerate(rows, start=1):
         if len(row) != len(header):
             raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_RERUN)
-        if number * (len(header) + len(KEYS)) + _TEXT_CELLS * len(texts) > _MOST_CELLS:
+        if number * (len(header) + len(KEYS)) + _TEXT_CELLS * len(distinct_texts) > _MOST_CELLS:
             raise DataError("the table has too many cells", file=path, record=number, cure=_RERUN)
         for name, cell in zip(header, row, strict=True):
             if name in keys:
-                keys[name].append(texts.setdefault(cell, cell))
+                keys[name].append(distinct_texts.setdefault(cell, cell))
             else:
                 metrics[name].append(_parse_metric(path, number, name, cell))
     if not keys[KEYS[0]]:
@@ -345,29 +345,29 @@ def _read_columns(path: Path, scenarios: int) -> tuple[dict[str, tuple[str, ...]
     return {name: tuple(cells) for name, cells in keys.items()}, columns
 
 
-def _difference(keys: Mapping[str, Sequence[str]], info: Mapping[str, Any]) -> tuple[str, int] | None:
-    """Return the first row of ``episodes.csv`` that is not as ``run.json`` says, and what is wrong with it.
+def _mismatch(keys: Mapping[str, Sequence[str]], info: Mapping[str, Any]) -> tuple[str, int] | None:
+    """Return problem and number of a row of ``episodes.csv`` that contradicts ``run.json``; None if all agree.
 
-    What ``run.json`` does not say, as with other programs, is not compared.
+    Entries that ``run.json`` lacks, as in runs of other programs, are not compared.
     """
     for name in ("planner", "traffic", "seed"):
         expected = info.get(name)
         for row, cell in enumerate(keys[name], start=1):
             if expected is not None and cell != str(expected):
                 return f"{name} is {cell!r}, not {str(expected)!r} as in run.json", row
-    rows, episodes, most = len(keys["scenario_id"]), info.get("episodes"), _count_scenarios(info)
+    rows, episodes, set_size = len(keys["scenario_id"]), info.get("episodes"), _count_scenarios(info)
     scenarios: set[ScenarioKey] = set()
     for row, scenario in enumerate(zip(keys["dataset"], keys["scenario_id"], strict=True), start=1):
         if episodes is not None and scenario in scenarios:  # Episodes of other programs may repeat scenarios.
             return f"scenario {scenario[1]!r} occurs twice", row
         scenarios.add(scenario)
-        if 0 < most < len(scenarios):
-            return f"scenario {scenario[1]!r} is one more than the {most} of the set in run.json", row
+        if 0 < set_size < len(scenarios):
+            return f"scenario {scenario[1]!r} is one more than the {set_size} of the set in run.json", row
     return None if episodes in (None, rows) else (f"has {rows} rows, not {episodes} as in run.json", rows)
 
 
 def _parse_metric(path: Path, row: int, name: str, cell: str) -> float:
-    """Parse the cell of a metric; an empty cell is undefined (NaN), all others must be finite."""
+    """Parse the cell of a metric: NaN (undefined) if empty, else a finite number."""
     if not cell.strip():
         return math.nan
     try:

@@ -14,7 +14,7 @@ import jax
 from drivax.errors import DrivaxError
 from drivax.files import format_bytes
 
-#: Maximum number of scenarios loaded at a time; those of the built-in world take 4 GB, in ``idm`` traffic 7 GB.
+#: Maximum number of scenarios loaded at a time; in the built-in world they take 4 GB, in ``idm`` traffic 7 GB.
 MOST = 10_000
 #: Bytes reserved per scenario of a program call; PDM-Closed needs half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
@@ -25,7 +25,7 @@ _MEMORY_INFO = Path("/proc/meminfo")
 
 
 def memory_of(device: Any) -> int | None:
-    """Return the bytes of a device, or None if unknown; of a CPU those of machine or container."""
+    """Return the memory of a device in bytes, None if unknown; for a CPU, that of the machine or container."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return int(stats["bytes_limit"])
@@ -36,9 +36,9 @@ def memory_of(device: Any) -> int | None:
 
 
 def free_memory(device: Any, share: int = 1) -> int | None:
-    """Return the free bytes of a device, or None if unknown; of a CPU those of machine or container over ``share``.
+    """Return the free bytes of a device, None if unknown; for a CPU, those of machine or container over ``share``.
 
-    The page cache of Linux counts as free; on other systems, all of the memory of a CPU does.
+    The page cache of Linux counts as free; on other systems, all memory of a CPU counts as free.
     """
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
@@ -57,8 +57,8 @@ def free_memory(device: Any, share: int = 1) -> int | None:
 def scenarios_at_a_time(scenario_bytes: int, width: int, free: int | None) -> int:
     """Return the number of scenarios to load at a time: as many as fit, with the program, in half of the free memory.
 
-    At least ``width``, the number of scenarios of a program call, and at most :data:`MOST`, which is returned if
-    ``free`` (bytes) is None. A scenario exists twice while its bank is built.
+    The number is at least ``width``, the scenarios per program call, and at most :data:`MOST`, which is returned if
+    ``free`` (bytes) is None. A scenario exists twice in memory while its bank is built.
     """
     if free is None:
         return MOST
@@ -119,6 +119,6 @@ def _read_number(file: Path) -> int | None:
 
 
 def _read_numbers(file: Path) -> dict[str, int]:
-    """Return the numbers of a file by name; a line is a name and its number."""
+    """Return the numbers of a file by name, from lines that start with a name and its number."""
     lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
     return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdecimal()}

@@ -1,8 +1,8 @@
 """Statistics of observation features, their correlation with collisions, and their importance to a policy.
 
-States of closed-loop episodes are sampled at regular steps. The statistics of a column are its mean, standard
-deviation and extremes over finite entries of valid rows, the number of its non-finite entries, its correlation with
-collisions, and its importance to the planner.
+States of closed-loop episodes are sampled at regular intervals. The statistics of a column are its mean, standard
+deviation, minimum and maximum over finite entries of valid rows, the number of its non-finite entries, its correlation
+with collisions, and its importance to the planner.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
-#: Steps between sampled states, scenarios per program call, and most states whose features are permuted.
+#: Steps between sampled states, scenarios per program call, and maximum number of states with permuted features.
 EVERY, BATCH, PERMUTED = 10, 64, 512
 Values = np.ndarray[Any, Any]
 
@@ -40,8 +40,8 @@ Values = np.ndarray[Any, Any]
 class SampledStates:
     """Sampled states of episodes, ``[episode, sample]``, with the planner's carry, random key and observation.
 
-    ``has_collided`` marks states from ego's first collision on, ``collides`` episodes with a collision, ``[episode]``.
-    The last state of a short log is repeated after its end.
+    ``has_collided`` marks states from ego's first collision on, and ``collides``, ``[episode]``, marks episodes with a
+    collision. The last state of a short log is repeated after its end.
     """
 
     state: SimState
@@ -109,7 +109,7 @@ class ObservationStatistics:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace floats that are not finite by None."""
+    """Replace NaN and infinite floats by None."""
     return {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in values.items()
@@ -128,7 +128,7 @@ def observation_statistics(
         task: Observations and actions.
         permute: Whether to measure the importance of features to the planner.
         traffic: Traffic model; log replay by default.
-        every: Steps between two sampled states; a shorter rest of the steps has no sample.
+        every: Steps between two sampled states; a shorter remainder at the end of an episode is not sampled.
         seed: Seed of the planner, as in an evaluation, and of the permutations.
 
     Raises:
@@ -169,7 +169,7 @@ def observation_statistics(
 def _planner_importances(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, samples: SampledStates, indices: Values, seed: int
 ) -> tuple[dict[tuple[str, int], float], dict[str, float]]:  # fmt: skip
-    """Return the :func:`importances` for a planner in the sampled states with the given flat indices."""
+    """Return the :func:`importances` for a planner in the sampled states with these flat ``indices``."""
 
     def select(leaf: Array) -> Array:
         return leaf.reshape(samples.has_collided.size, *leaf.shape[2:])[indices]
@@ -209,15 +209,16 @@ def column_statistics(
             dimensions = (*has_collided.shape, *(1,) * (valid.ndim - has_collided.ndim))
             before_collision = valid & ~has_collided.reshape(dimensions)
             correlation = collision_correlation(values, before_collision, collides)
-            change = importance.get((group, column), math.nan)
-            statistics.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, change))
+            column_importance = importance.get((group, column), math.nan)
+            moments = _moments(values, valid)
+            statistics.append(FeatureStatistics(group, name, *moments, correlation, column_importance))
     return tuple(statistics)
 
 
 def sample_states(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0
 ) -> SampledStates:
-    """Return sampled states of one episode per scenario: until a crash, those of an evaluation with this seed."""
+    """Return sampled states of one episode per scenario, the same as in an evaluation with this seed until a crash."""
     batches, size = [], min(BATCH, len(bank))
     for first in range(0, len(bank), BATCH):
         scenarios = np.arange(first, min(first + BATCH, len(bank)))
@@ -233,10 +234,10 @@ def sample_states(
 def _sample_batch(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array, every: int
 ) -> SampledStates:  # fmt: skip
-    return jax.vmap(partial(_episode, simulator, planner, bank, every))(index, keys)
+    return jax.vmap(partial(_sample_episode, simulator, planner, bank, every))(index, keys)
 
 
-def _episode(
+def _sample_episode(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, index: Array, key: Array
 ) -> SampledStates:
     state = simulator.reset(bank, index)
@@ -316,7 +317,7 @@ def importances(
     between the actions of independent states. The result is NaN if the action is the same in all states.
 
     Args:
-        act: From a batch of observations to actions ``[state, D]``.
+        act: Function from a batch of observations to actions ``[state, D]``.
         observation: Observations ``[state, ...]`` by group.
         seed: Seed of the permutations.
     """

@@ -19,27 +19,27 @@ from drivax.stats.clusters import cluster_strata, dense_labels
 
 #: Settings of an evaluation that must agree between paired episodes.
 _START_SETTINGS = ("noisy_start", "start_step")
-#: Smaller strata are merged.
+#: Minimum number of clusters of a stratum; smaller strata are merged.
 _MIN_CLUSTERS = 10
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """The common scenarios of several evaluations, in the order of the first, and their clusters."""
+    """The scenarios that several evaluations have in common, in the order of the first, and their clusters."""
 
     keys: tuple[ScenarioKey, ...]
     clusters: tuple[str, ...]
 
     @classmethod
     def of(cls, first: EpisodeTable, *others: EpisodeTable) -> Pairs:
-        """Return the common scenarios of evaluations."""
+        """Return the scenarios that all these evaluations contain."""
         cluster = dict(zip(first.scenarios, first.clusters, strict=True))
         other_scenarios = [set(other.scenarios) for other in others]
         keys = tuple(key for key in cluster if all(key in scenarios for scenarios in other_scenarios))
         return cls(keys, tuple(cluster[key] for key in keys))
 
     def values(self, table: EpisodeTable, metric: str) -> Float64[np.ndarray[Any, Any], " scenario"]:
-        """Return the values of a metric in one evaluation; repeated episodes of a scenario are averaged."""
+        """Return a metric of one evaluation by scenario, averaged over repeated episodes; NaN if undefined."""
         means = table.by_scenario(metric)
         return np.array([means[key] for key in self.keys], np.float64)
 
@@ -78,9 +78,9 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
     """
     tables = (*a, *b)
     runs = [id(table) if table.folder is None else table.folder.resolve() for table in tables]
-    if repeated := [table for row, table in enumerate(tables) if runs[row] in runs[:row]]:
+    if duplicates := [table for index, table in enumerate(tables) if runs[index] in runs[:index]]:
         problem = "A and B are the same run" if len(tables) == 2 else "is named twice"
-        raise UsageError(problem, file=repeated[0].folder, cure="name different runs")
+        raise UsageError(problem, file=duplicates[0].folder, cure="name different runs")
     for side in (a, b):
         # A name ends with the seed's number and the checkpoint. Another checkpoint is another planner.
         names = [table.name.removesuffix(MARK) for table in side]
@@ -100,7 +100,7 @@ def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) 
     """Check that a comparison can use a metric.
 
     Raises:
-        UsageError: An evaluation lacks the metric, the metric has no mean, or ``primary`` has no better direction.
+        UsageError: The metric is missing or has no meaningful mean, or is ``primary`` without a better direction.
     """
     for table in tables:
         if metric not in table.metrics:
@@ -151,20 +151,20 @@ class Split:
 
 
 def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list[str]:
-    """Return the stratum of each scenario (manifest entry): the values of its tags, joined by spaces.
+    """Return the stratum of each scenario (manifest entry): its values of ``tags``, joined by spaces.
 
     Raises:
         UsageError: A tag does not occur in any scenario.
     """
-    names = dict.fromkeys(name for entry in entries for name in entry["tags"])
+    known_tags = dict.fromkeys(name for entry in entries for name in entry["tags"])
     for tag in tags:
-        if tag not in names:
-            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, names))
+        if tag not in known_tags:
+            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, known_tags))
     return [" ".join(str(entry["tags"].get(tag, "unknown")) for tag in tags) for entry in entries]
 
 
 def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, seed: int) -> Split:
-    """Randomly assign whole clusters to two arms; the first arm gets a share of ``ratio``, in each stratum if given.
+    """Randomly assign whole clusters to two arms; the first gets a share ``ratio`` of the clusters of each stratum.
 
     A cluster belongs to the most frequent stratum of its scenarios (of equally frequent ones, the first by name).
     Strata of fewer than ten clusters are merged. Rounding errors carry over to the next stratum.
@@ -196,5 +196,5 @@ def _majority_strata(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> 
     votes: dict[int, Counter[str]] = {}
     for label, stratum in zip(labels, strata, strict=True):
         votes.setdefault(int(label), Counter())[stratum] += 1
-    winner = {label: min(counts, key=lambda name: (-counts[name], name)) for label, counts in votes.items()}
-    return [winner[int(label)] for label in labels]
+    majority = {label: min(counts, key=lambda name: (-counts[name], name)) for label, counts in votes.items()}
+    return [majority[int(label)] for label in labels]

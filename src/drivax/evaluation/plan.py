@@ -21,7 +21,7 @@ class ComparisonPlan:
 
     Attributes:
         name: Heading of the page.
-        a, b: Run folders of ``drivax evaluate``; the command line may name them instead.
+        a, b: Run folders of ``drivax evaluate``, unless the command line names them.
         primary: The metric that decides.
         secondary: Further metrics to report; the primary metric is removed from them.
         split: ``paired`` compares on every common scenario; ``random`` and ``stratified`` give each planner its own
@@ -29,12 +29,12 @@ class ComparisonPlan:
         ratio: Share of the recordings for A in a split.
         strata: Tags that a stratified split balances between the arms.
         minimum_scenarios: Number of scenarios that a decision requires.
-        confidence: Level of intervals; tests reject at 1 - confidence.
+        confidence: Confidence level of intervals; tests reject if p is below 1 - confidence.
         power: Probability of detecting the smallest difference that matters, required for "no difference".
         smallest_difference: The smallest difference that matters, in the unit of the primary metric; null: a tenth of
             ``Sensitivity.deviation``.
-        test: Test of means in pairs: ``permutation``, or ``bootstrap`` if differences are far from symmetric.
-        resamples: Number of permutations, and of bootstrap samples except for the mean of one run, which has 10,000.
+        test: Test of mean paired differences: ``permutation``, or ``bootstrap`` if they are far from symmetric.
+        resamples: Number of permutations and bootstrap samples; the interval of a single run's mean always has 10,000.
         seed: Seed of the split and of all resampling.
     """
 
@@ -83,7 +83,7 @@ class Sensitivity:
         deviation: Standard deviation of the paired differences, or within the arms of a split.
         design_effect: Factor by which clustering in recordings increases the required number of scenarios.
         smallest: The smallest difference that matters.
-        power: Probability of detecting it with these scenarios.
+        power: Probability of detecting ``smallest`` with these scenarios.
         detectable: The smallest difference that is detected with the plan's power; None if there is none.
         needed: Number of scenarios that detect ``smallest`` with the plan's power; None if seeds vary too much for any
             number.
@@ -142,7 +142,7 @@ class Decision:
     Attributes:
         recommendation: The planner to choose, no difference, or not enough scenarios to decide.
         because: The part of the rule that decided.
-        needed: Required number of scenarios, if there are too few; one more than there are if it is unknown.
+        needed: Required number of scenarios, more than there are; None unless more scenarios would allow a decision.
         caveats: Secondary metrics in which the recommended planner is worse.
     """
 
@@ -168,8 +168,8 @@ def decide(
     if n < plan.minimum_scenarios:
         return Decision("not enough scenarios", "minimum", needed, ())
     if primary.winner is not None:
-        worse = tuple(metric.metric for metric in secondary if metric.winner not in (None, primary.winner))
-        return Decision(primary.winner, "test", None, worse)
+        caveats = tuple(metric.metric for metric in secondary if metric.winner not in (None, primary.winner))
+        return Decision(primary.winner, "test", None, caveats)
     if sensitivity is None and primary.difference.mean == 0:
         return Decision("no difference", "equal", None, ())
     if sensitivity is not None and sensitivity.power >= plan.power:

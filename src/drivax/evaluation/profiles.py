@@ -43,14 +43,14 @@ TERMS = {
 _NEGATED = ("fault_score", "drivable")
 #: Longest window for the speeds of simulated traffic, steps.
 _SPEED_STEPS = 5
-#: Terms that differ by more are counted as different.
+#: Largest difference of terms that count as equal.
 _TOLERANCE = 0.005
 FILE = "devkit.csv"
 
 
 @dataclass(frozen=True)
 class ProfileRow:
-    """An episode by both definitions.
+    """Terms of an episode by both definitions.
 
     Attributes:
         dataset: Data set of the scenario.
@@ -114,7 +114,7 @@ def devkit_episode(scenario: Scenario, trajectories: Trajectories, row: int, siz
     Args:
         scenario: Scenario of the episode.
         trajectories: Trajectories of the evaluation.
-        row: Row of the episode.
+        row: Row of the episode in ``trajectories``.
         sizes: Sizes of the set's banks.
     """
     start, last = int(trajectories.start[row]), int(scenario.steps)
@@ -126,9 +126,9 @@ def devkit_episode(scenario: Scenario, trajectories: Trajectories, row: int, siz
 
 
 def write_rows(rows: Sequence[ProfileRow], path: Path) -> None:
-    """Write both values of every term, and the names of the terms that differ, as CSV."""
+    """Write a CSV file with both values of every term, and the names of the terms that differ."""
     columns = (f"{side}_{name}" for name in TERMS for side in ("drivax", "devkit"))
-    # A column for edited files, if any were read.
+    # Mark results of edited files.
     edited = {f"edited: {name}": "1" for name in edited_files()}
     lines = [["dataset", "scenario_id", *columns, "differ", *edited]]
     for row in rows:
@@ -139,7 +139,7 @@ def write_rows(rows: Sequence[ProfileRow], path: Path) -> None:
 
 
 def format_rows(rows: Sequence[ProfileRow]) -> str:
-    """Return a table of the terms: both means and the number of episodes that differ."""
+    """Format a table of the terms: both means, the number of episodes that differ, and the number with both."""
     lines = []
     for name, metric in TERMS.items():
         pairs = np.array([(row.ours[name], row.devkit[name]) for row in rows])
@@ -157,9 +157,9 @@ def format_rows(rows: Sequence[ProfileRow]) -> str:
 
 
 def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: int) -> EgoMotion:
-    """Return ego's motion; accelerations are backward differences, yaw rates forward ones.
+    """Return ego's motion; accelerations are backward differences, and yaw rates forward differences.
 
-    The first acceleration uses the log if ego starts at a logged pose after another one, and is 0 otherwise.
+    The first acceleration is 0 unless ego starts at its logged position, and the previous step is in the log.
     """
     x, y, heading, speed = motion.T
     previous_step = max(start - 1, 0)
@@ -184,7 +184,7 @@ def _ego(scenario: Scenario, motion: Float[np.ndarray[Any, Any], "t 4"], start: 
 
 
 def _tracks(scenario: Scenario, steps: slice, others: Float[np.ndarray[Any, Any], "t A 3"] | None) -> Tracks:
-    """Return the other agents: those that traffic moves, and parked ones."""
+    """Return the other agents on ego's level: those that traffic moves, and parked ones."""
     slots = slice(1, scenario.agent_xy.shape[1] if others is None else others.shape[1])
     xy, heading, speed, moving = _moving_agents(scenario, steps, slots, others)
     ego_z = _fill_gaps(scenario.agent_z[:, :1], scenario.agent_valid[:, :1])[steps]
@@ -268,7 +268,7 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
 def _corner_distances(
     bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
 ) -> Float[Array, "t 4"]:
-    """Return the distance of the corners of boxes beyond the road edges."""
+    """Return how far each corner of ego's boxes is beyond the road edges, m, at ground heights ``z``."""
     index = jnp.zeros((), jnp.int32)
 
     def box_distances(box: Float[Array, " 6"], ground: Float[Array, ""]) -> Float[Array, " 4"]:

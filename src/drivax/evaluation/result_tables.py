@@ -44,8 +44,8 @@ _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 class MetricLabel:
     """Presentation of a metric: label with unit, better direction (``-`` for none), unit, and explanation.
 
-    The unit is ``rate`` for built-in shares of episodes, ``share`` for other numbers without a unit. An unknown metric
-    has no explanation.
+    The unit is ``rate`` for built-in shares of episodes, and ``share`` for other numbers without a unit. An unknown
+    metric has no unit and no explanation.
     """
 
     text: str
@@ -66,9 +66,9 @@ class MetricLabel:
 
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
-    """Return the label of a metric; ``runs`` contain the descriptions of user-defined metrics."""
-    own_columns = (run.own_metrics[name] for run in runs if name in run.own_metrics)
-    metric = COLUMNS.get(name) or next(own_columns, None)
+    """Return the label of a metric; ``runs`` describe user-defined metrics."""
+    user_columns = (run.own_metrics[name] for run in runs if name in run.own_metrics)
+    metric = COLUMNS.get(name) or next(user_columns, None)
     if metric is None:
         return MetricLabel(name.replace("_", " "), "-", "", "")
     text = metric.label or name.replace("_", " ")
@@ -90,14 +90,14 @@ def headline_names(names: Sequence[str]) -> list[str]:
 
 
 def sort_metrics(names: Sequence[str]) -> list[str]:
-    """Sort metrics in the order of their definition, with unknown ones last, and drop codes and counts."""
+    """Sort metrics in the order of their definition, unknown metrics last, and drop codes and counts."""
     rank = {name: index for index, name in enumerate(COLUMNS)}
-    means = (name for name in names if name not in NOT_SUMMARISED)
-    return sorted(means, key=lambda name: rank.get(name, len(rank)))
+    summarised_names = (name for name in names if name not in NOT_SUMMARISED)
+    return sorted(summarised_names, key=lambda name: rank.get(name, len(rank)))
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
-    """Return the mean of a metric over episodes (``rows``), with its interval as in ``summary.json``.
+    """Return the mean of a metric over the episodes ``rows``, with its interval as in ``summary.json``.
 
     The result is undefined if the evaluation lacks the metric.
     """
@@ -109,8 +109,8 @@ def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interv
 def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
     """Return ``run - other`` of a metric, paired by scenario; repeated episodes are averaged first."""
     pairs = Pairs.of(run, other)
-    values, others = pairs.values(run, metric), pairs.values(other, metric)
-    return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
+    values, other_values = pairs.values(run, metric), pairs.values(other, metric)
+    return paired_bootstrap(values, other_values, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
 def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> tuple[Interval, str]:
@@ -136,14 +136,14 @@ def _verdict(interval: Interval, better: str) -> str:
 
 def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Return a table with planners in rows and metrics in columns; the best mean of each column is marked."""
-    cells = [[Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic") for run in runs]]
+    column_cells = [[Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic") for run in runs]]
     for name in metrics:
         means = [summarise(run, name) for run in runs]
         best_mean = _best_mean(means, metric_label(name, runs))
         links = ({"run": run.name, "metric": name} for run in runs)
-        cells.append([_cell(runs, name, *pair, best_mean) for pair in zip(means, links, strict=True)])
+        column_cells.append([_cell(runs, name, *pair, best_mean) for pair in zip(means, links, strict=True)])
     columns = (Column("planner", label=True), *_metric_columns(metrics, runs))
-    return Table("planners", columns, tuple(zip(*cells, strict=True)))
+    return Table("planners", columns, tuple(zip(*column_cells, strict=True)))
 
 
 def _best_mean(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
@@ -155,11 +155,12 @@ def _best_mean(intervals: Sequence[Interval], label: MetricLabel) -> float | Non
 
 
 def _cell(
-    runs: Sequence[EpisodeTable], metric: str, interval: Interval, link: Mapping[str, Any], best: float | None = None
+    runs: Sequence[EpisodeTable], metric: str, interval: Interval, link: Mapping[str, Any],
+    best_mean: float | None = None,
 ) -> Cell:  # fmt: skip
     if interval.mean is None:
         return interval_cell(interval, "", metric)
-    style = "best" if best is not None and interval.mean == best else ""
+    style = "best" if best_mean is not None and interval.mean == best_mean else ""
     return interval_cell(interval, metric_label(metric, runs).unit, metric, style=style, link=link)
 
 
@@ -183,7 +184,7 @@ def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table
     return Table("results", columns, tuple(rows), f"Mean and {CONFIDENCE:.0%} interval", "planner")
 
 
-#: Text of each verdict; the symbol makes it readable without the colour.
+#: Text of each verdict; the symbol makes it readable without colour.
 _MARKS = {"better": "▲ better", "worse": "▼ worse", "unclear": "unclear", "same": "= same", "none": ""}
 
 
@@ -235,16 +236,16 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
 def strata_table(runs: Sequence[EpisodeTable], tags: Tags, tag: str, metrics: Sequence[str]) -> Table:
     """Return a table with a row for each value of a tag and run, and metrics in columns.
 
-    Scenarios without the tag have the value ``unknown``. A tag with several words (``scenario_types``) counts in the
-    row of each word.
+    Scenarios without the tag have the value ``unknown``. A scenario with several values, separated by ``|``
+    (``scenario_types``), counts in the row of each.
     """
-    words = [[tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs]
+    all_values = [[tags.get(key, {}).get(tag, UNKNOWN).split("|") for key in run.scenarios] for run in runs]
     rank = {value: index for index, value in enumerate(TAGS.get(tag, ()))}
-    values = {value for words_of_run in words for episode in words_of_run for value in episode}
+    values = {value for run_values in all_values for episode_values in run_values for value in episode_values}
     rows = []
     for value in sorted(values, key=lambda value: (rank.get(value, len(rank)), value)):
-        for run, words_of_run in zip(runs, words, strict=True):
-            episodes = np.flatnonzero([value in episode for episode in words_of_run])
+        for run, run_values in zip(runs, all_values, strict=True):
+            episodes = np.flatnonzero([value in episode_values for episode_values in run_values])
             if episodes.size:
                 link = {"run": run.name, "tags": {tag: value}}
                 means = ((name, summarise(run, name, episodes)) for name in metrics)
@@ -262,7 +263,7 @@ def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     }
     short_names = {key: _set_name(entry) for key, entry in entries.items()}
     names = list(short_names.values())
-    # Without a hash the key is a path, whose start may be that of another set.
+    # Without a hash the key is a path, whose first characters may be those of another set's path.
     suffixes = {key: key[:6] if entry.get("hash") else f"({key})" for key, entry in entries.items()}
     return {
         key: name if names.count(name) == 1 else f"{name} {suffixes[key]}"
@@ -286,11 +287,11 @@ def _planner_key(run: EpisodeTable) -> str:
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """Return the name of each planner by its key: its own name, or the shortest unique end of its path."""
-    own_names = {_planner_key(run): run.planner for run in runs}
+    """Return the name of each planner by its key; planners of one name have the shortest unique ends of their paths."""
+    name_by_key = {_planner_key(run): run.planner for run in runs}
     names = {}
-    for key, name in own_names.items():
-        namesakes = [Path(other) for other in own_names if other != key and own_names[other] == name]
+    for key, name in name_by_key.items():
+        namesakes = [Path(other) for other in name_by_key if other != key and name_by_key[other] == name]
         names[key] = path_end(Path(key), namesakes) if namesakes else name
     return names
 
@@ -313,8 +314,8 @@ def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
         cells.setdefault(labels, {})[set_name] = _cell(runs, metric, summarise(run, metric), link)
     sets = tuple(dict.fromkeys(evaluation_sets))
     rows = tuple(
-        (*map(Cell, labels), *(cell_of_set.get(name, Cell(style="undefined")) for name in sets))
-        for labels, cell_of_set in cells.items()
+        (*map(Cell, labels), *(cell_by_set.get(name, Cell(style="undefined")) for name in sets))
+        for labels, cell_by_set in cells.items()
     )
     headings = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
     columns = (*headings, *(Column(name, name) for name in sets))

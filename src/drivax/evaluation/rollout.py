@@ -30,7 +30,7 @@ from drivax.tasks.task import Task
 
 #: Folded into an episode's key to draw its start.
 _START_STREAM = 1
-#: Units of packed positions (m) and headings (rad), and the largest coordinate that int16 holds.
+#: Units of packed positions (m) and headings (rad), and the bound of coordinates, within the range of int16.
 _POSITION_UNIT_M, _HEADING_UNIT_RAD, _MAX_POSITION_M = 0.02, 1e-4, 650.0
 #: Packed pose of an absent agent.
 _ABSENT = -32768
@@ -42,10 +42,10 @@ class Episodes:
 
     Attributes:
         metrics: Every metric by name.
-        events: Step of the first collision, off-road step and red light, -1 for none.
-        motion: x, y, heading, speed of the driven agent from the start step on; the last value is repeated after a
-            crash and after the end of a short log.
-        actions: Executed actions, after bounds and actuators, repeated in the same way.
+        events: Step of the first collision, off-road position and red-light violation, -1 for none.
+        motion: x, y (m), heading (rad) and speed (m/s) of the driven agent from the start step on; the last value is
+            repeated after a crash and after the end of a short log.
+        actions: Executed actions, within bounds and actuator rates, repeated in the same way.
         others: Packed poses of the other agents at each step (:func:`pack_poses`); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step with a non-finite action, -1 for none; metrics cover the steps before it.
@@ -61,8 +61,8 @@ class Episodes:
 
 
 @record
-class _Loop:
-    """An episode between two steps; ``metric_state`` stays at the last state before a non-finite action."""
+class _LoopState:
+    """Carry of the loop over steps; ``metric_state`` stays at the last state before a non-finite action."""
 
     state: SimState
     metric_state: SimState
@@ -72,7 +72,7 @@ class _Loop:
 
 @record
 class _StepOutput:
-    """What :class:`Episodes` keeps of a step."""
+    """Contribution of one step to :class:`Episodes`."""
 
     motion: Float[Array, "4"]
     action: Float[Array, " D"]
@@ -82,17 +82,17 @@ class _StepOutput:
 
 
 def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
-    """Return a random key for each scenario, derived from the seed and the scenario's identity."""
+    """Return a random key for each scenario ``index``, derived from the seed and the scenario's identity."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
 
 
 def evaluation_task(task: Task) -> Task:
     """Return the task for evaluation: all metrics, fixed conditions, and episodes that last to the end of the log."""
-    own = task.metrics
-    if isinstance(own, str):
-        own = (own,) if is_dotted(own) else ()
+    metrics = task.metrics
+    if isinstance(metrics, str):
+        metrics = (metrics,) if is_dotted(metrics) else ()
     conditions = fix_conditions(task.conditions)
-    return replace(task, to_the_end=True, metrics=("full", *own), conditions=conditions)
+    return replace(task, to_the_end=True, metrics=("full", *metrics), conditions=conditions)
 
 
 def check_actions(planner: Planner, task: Task) -> None:
@@ -113,31 +113,31 @@ def drive(
 ) -> Episodes:  # fmt: skip
     """Run a planner on scenarios ``index`` of a bank; ``slot`` is the driven agent.
 
-    The task's episodes must not end early (:func:`evaluation_task`). Each simulator, planner type, start step, batch
-    and bank size needs one compilation.
+    The task's episodes must not end early (:func:`evaluation_task`). The program is compiled once for each simulator,
+    planner type, start step, batch size and bank size.
     """
     step = partial(_step, simulator, planner, bank)
-    first, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
+    initial, step_keys = jax.vmap(partial(_start, simulator, planner, bank, start_step, slot))(index, keys)
     # Map the step, not the loop: to map a loop, JAX traces its body several times.
-    last, outputs = jax.lax.scan(lambda loop, key: jax.vmap(step)(loop, key), first, step_keys.T)
+    final, outputs = jax.lax.scan(lambda loop, key: jax.vmap(step)(loop, key), initial, step_keys.T)
     outputs = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), outputs)
-    return jax.vmap(partial(_outcome, simulator.traffic, bank, start_step))(first, last, outputs)
+    return jax.vmap(partial(_outcome, simulator.traffic, bank, start_step))(initial, final, outputs)
 
 
 def _start(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, start_step: int, slot: Any, index: Array, key: Array
-) -> tuple[_Loop, Array]:  # fmt: skip
-    """Reset one episode; return also a key for each of its steps."""
+) -> tuple[_LoopState, Array]:  # fmt: skip
+    """Return the initial loop state of one episode, and a key for each of its steps."""
     state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START_STREAM))
     init_key, key = jax.random.split(key)
-    loop = _Loop(state, state, planner.init(bank, state, init_key), jnp.ones((), bool))
+    loop = _LoopState(state, state, planner.init(bank, state, init_key), jnp.ones((), bool))
     return loop, jax.random.split(key, bank.steps - 1 - start_step)
 
 
 def _step(
-    simulator: Simulator, planner: Planner, bank: ScenarioBank, loop: _Loop, key: Array
-) -> tuple[_Loop, _StepOutput]:
-    """Advance one episode; after the last step of its log, its state stays."""
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, loop: _LoopState, key: Array
+) -> tuple[_LoopState, _StepOutput]:
+    """Advance one episode by a step; its state no longer changes after the last step of its log."""
     state, context = loop.state, loop.state.context
     is_over = context.step >= bank.last_step[context.row]
     after, carry, is_finite = advance(simulator, planner, bank, state, loop.carry, key)
@@ -149,7 +149,7 @@ def _step(
     context, offroad = metric_state.context, all_finite & ~is_over & state.facts.offroad
     others = _others(simulator.traffic, bank, state)
     output = _StepOutput(context.history[-1], context.action, offroad, all_finite, others)
-    return _Loop(state, metric_state, carry, all_finite), output
+    return _LoopState(state, metric_state, carry, all_finite), output
 
 
 def _others(traffic: Traffic, bank: ScenarioBank, state: SimState) -> Int16[Array, "A 3"] | None:
@@ -158,20 +158,20 @@ def _others(traffic: Traffic, bank: ScenarioBank, state: SimState) -> Int16[Arra
 
 
 def _outcome(
-    traffic: Traffic, bank: ScenarioBank, start_step: int, first: _Loop, last: _Loop, steps: _StepOutput
-) -> Episodes:
-    """Return the outcome of one episode from its first and last state and the outputs of its steps."""
-    metrics, full_metrics = episode_metrics(bank, last.metric_state), episode_metrics(bank, last.state)
+    traffic: Traffic, bank: ScenarioBank, start_step: int, initial: _LoopState, final: _LoopState, steps: _StepOutput
+) -> Episodes:  # fmt: skip
+    """Return the outcome of one episode from its initial and final state and the outputs of its steps."""
+    metrics, full_metrics = episode_metrics(bank, final.metric_state), episode_metrics(bank, final.state)
     # Whether a metric is defined must not depend on when the planner crashed.
     names = [name for name in FAILED if name in metrics]
     failed_metrics = {name: replace(metrics[name], defined=full_metrics[name].defined) for name in names}
-    others = _others(traffic, bank, first.state)
+    others = _others(traffic, bank, initial.state)
     if others is not None and steps.others is not None:
         others = jnp.concatenate([others[None], steps.others])
     return Episodes(
         metrics=metrics | failed_metrics,
-        events=event_steps(last.metric_state.episode),
-        motion=jnp.concatenate([first.state.context.history[-1][None], steps.motion]),
+        events=event_steps(final.metric_state.episode),
+        motion=jnp.concatenate([initial.state.context.history[-1][None], steps.motion]),
         actions=steps.action,
         others=others,
         offroad_steps=steps.offroad.sum().astype(jnp.int32),
@@ -184,8 +184,8 @@ def advance(
 ) -> tuple[SimState, Any, Bool[Array, ""]]:
     """Return the next state, the next carry, and whether the action was finite.
 
-    A non-finite action is replaced by ``Task.coast``, so that the state stays finite. Planners that replay follow the
-    log.
+    A non-finite action is replaced by ``Task.coast``, so that the state stays finite. Planners with ``replays``
+    follow the log.
     """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.context)
@@ -200,7 +200,7 @@ def advance(
 
 
 def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
-    """Pack positions and headings of bank agents; agents with abs(x) or abs(y) of 650 m or more become absent."""
+    """Pack positions and headings (``AgentColumn``); agents with abs(x) or abs(y) of 650 m or more become absent."""
     xy = agents[..., AgentColumn.XY]
     heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
     poses = jnp.concatenate([xy / _POSITION_UNIT_M, heading[..., None] / _HEADING_UNIT_RAD], axis=-1)
@@ -209,6 +209,6 @@ def pack_poses(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]
 
 
 def unpack_poses(packed: Int16[np.ndarray, "*batch A 3"]) -> Float32[np.ndarray, "*batch A 3"]:
-    """Return positions (m) and headings (rad), NaN for absent agents."""
+    """Return x, y (m) and heading (rad) of packed poses, NaN for absent agents."""
     poses = packed * np.array([_POSITION_UNIT_M, _POSITION_UNIT_M, _HEADING_UNIT_RAD], np.float32)
     return np.where(packed == _ABSENT, np.nan, poses).astype(np.float32)

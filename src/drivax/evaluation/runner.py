@@ -2,8 +2,8 @@
 
 An episode depends only on planner, task, traffic, start, seed and scenario, bit for bit: not on the order of the
 scenarios or the batch size. Random keys derive from the scenario's identity (``bank.identity``). Every program call
-runs a fixed number of scenarios (short batches are padded) in banks of equal sizes. A subset has the bits of the whole
-set if it is evaluated with the ``sizes`` of the whole set, as :func:`run_evaluation` does.
+runs a fixed number of scenarios (short batches are padded) in banks of equal sizes. A subset gives the same bits as the
+whole set if it is evaluated with the ``sizes`` of the whole set, as :func:`run_evaluation` does.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
 from drivax.tracking.run_folder import RunFolder, policy_training_sets
 
-#: Scenarios per program call on a CPU, a compromise between planners whose larger batches exceed the caches and others
-#: (docs/log/2026-11-22-evaluation.md), and on other devices.
+#: Scenarios per program call on a CPU, where larger batches exceed the caches with some planners and are faster with
+#: others (docs/log/2026-11-22-evaluation.md), and on other devices.
 CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
 #: Maximum number of scenarios in an error message, and of crashes in a list.
 _MAX_NAMED = _MAX_LISTED = 5
@@ -112,11 +112,11 @@ def run_evaluation(
     """Evaluate a planner on the scenarios of a set that ``config`` selects, and write the run folder.
 
     The folder appears when all episodes are finished. ``traffic`` defaults to the built-in model ``config.traffic``,
-    ``sizes`` to those that the whole set uses.
+    ``sizes`` to those of the whole set.
     """
     scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
-    # Verification is for the evaluated scenarios; the others only contribute their sizes.
+    # Only evaluated scenarios need verification; the others only contribute their sizes.
     sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
     needed_bytes = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
     check_space(Path(out), needed_bytes)
@@ -200,8 +200,8 @@ class Options(TypedDict, total=False):
 
     ``start_step`` defaults to the current step, and ``seed`` to 0. ``batch`` is the number of stored scenarios loaded
     at a time, by default as many as fit in memory; results do not depend on it. ``sizes`` of the banks default to what
-    the scenarios use; subsets with the sizes of the whole set share its compiled program. A bank has its own size and
-    sizes. ``progress`` is called with (done, total) after every program call.
+    the scenarios use; subsets with the sizes of the whole set share its compiled program. With a bank, ``batch`` and
+    ``sizes`` have no effect. ``progress`` is called with (episodes done, episodes) after every program call.
     """
 
     start_step: int
@@ -220,7 +220,7 @@ def evaluate(
     Args:
         planner: The planner.
         scenarios: A bank, or stored scenarios of one capacity.
-        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank; stored scenarios have them.
         task: Action space and observation of the planner. All metrics are measured, and no episode ends early.
         traffic: Traffic model, log replay by default; its precomputed data is added here.
         start: Start of the episodes, as logged by default. Random starts are the same for every planner.
@@ -254,8 +254,8 @@ def evaluate(
         names = _stored_names(scenarios, start_step)
         identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
         if prepare is not None:
-            rows = {number: row for row, number in enumerate(identity.tolist())}
-            prepare(lambda number: scenarios[rows[number]])
+            index_by_identity = {number: index for index, number in enumerate(identity.tolist())}
+            prepare(lambda number: scenarios[index_by_identity[number]])
         sizes = sizes or Sizes.used(scenarios)
         size = min(batch or _batch_size(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
@@ -274,7 +274,7 @@ def evaluate(
 
 
 def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
-    """Check that a bank has names, and that its episodes can start, and return the names."""
+    """Return the names after checking that every scenario of a bank has one, and that its episode can start."""
     if len(names) != len(bank):
         problem = f"{len(names)} scenario names for a bank of {len(bank)}"
         raise UsageError(problem, cure="name every scenario of the bank")
@@ -285,7 +285,7 @@ def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
 
 
 def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
-    """Check that the episodes of stored scenarios can start, and return the names."""
+    """Return the names of stored scenarios after checking that their episodes can start."""
     names = scenario_names(scenarios)
     steps, present = zip(*((int(s.steps), s.agent_valid[start_step, 0]) for s in scenarios), strict=True)
     _check_starts(names, np.array(steps), np.array(present), start_step)
@@ -294,14 +294,14 @@ def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
 
 def _batch_size(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
     """Return the number of scenarios that fit in memory at a time."""
-    single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
-    return scenarios_at_a_time(single.nbytes, program_width(), free_memory(jax.devices()[0]))
+    bank = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
+    return scenarios_at_a_time(bank.nbytes, program_width(), free_memory(jax.devices()[0]))
 
 
 def _banks(
     scenarios: Sequence[Scenario], identity: UInt32[np.ndarray, " n"], size: int, sizes: Sizes
 ) -> Iterator[ScenarioBank]:
-    """Yield banks of ``size`` scenarios; ``identity`` is that of all scenarios."""
+    """Yield banks of ``size`` scenarios (the last may have fewer); ``identity`` has the identity of every scenario."""
     for first in range(0, len(scenarios), size):
         rows = slice(first, first + size)
         bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
@@ -322,7 +322,7 @@ class _Evaluation:
     def of(
         cls, simulator: Simulator, planner: Planner, start_step: int, seed: int, steps: int
     ) -> _Evaluation:
-        """Check that planner, task and start are compatible."""
+        """Return the evaluation after checking that planner, task and start are compatible."""
         task = simulator.task
         if not isinstance(task, Task):
             raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
@@ -402,7 +402,7 @@ def _crashes(
 def until_crash(
     actions: Float[np.ndarray, "episode step D"], crash_step: Int[np.ndarray, " episode"], start: int
 ) -> Float[np.ndarray, "episode step D"]:
-    """Return actions with NaN from the step on at which the planner crashed (``crash_step``; -1: never).
+    """Return actions with NaN from ``crash_step`` on, the step at which the planner crashed (-1: never).
 
     ``start`` is the step of the log of the first action.
     """
@@ -426,7 +426,7 @@ def action_jerk(actions: Float[np.ndarray, "episode step D"]) -> Float64[np.ndar
 
 @partial(jax.jit, static_argnames="seed")
 def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
-    """Return scenarios of a bank as a bank of their own, and their keys."""
+    """Return the scenarios ``rows`` of a bank as a bank, and their random keys."""
     batch = bank.part(rows)
     return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
@@ -436,17 +436,18 @@ def _check_starts(
 ) -> None:
     """Check that logs are long enough, and contain ego at the start step and an action after it."""
     ids = [row["scenario_id"] for row in names]
-    if (short := np.flatnonzero(steps < LEAST_STEPS)).size:
-        problem = f"{too_short(int(steps[short[0]]))}; {len(short)} of {len(names)} scenarios are too short"
+    if (short_rows := np.flatnonzero(steps < LEAST_STEPS)).size:
+        first = short_rows[0]
+        problem = f"{too_short(int(steps[first]))}; {len(short_rows)} of {len(names)} scenarios are too short"
         cure = "exclude them with --filter flag!=NO_FUTURE"
-        raise DataError(problem, record=ids[short[0]], cure=cure)
+        raise DataError(problem, record=ids[first], cure=cure)
     has_ended = start_step >= steps - 1
-    for unusable, fact in (
+    for is_unusable, reason in (
         (has_ended, "the log has no action after"),
         (~present, "ego is not in the log at"),
     ):
-        if rows := np.flatnonzero(unusable).tolist():
-            problem = f"{fact} step {start_step} in {len(rows)} of {len(names)} scenarios"
+        if rows := np.flatnonzero(is_unusable).tolist():
+            problem = f"{reason} step {start_step} in {len(rows)} of {len(names)} scenarios"
             exclude = f", or exclude them: --filter 'scenario_id!={'|'.join(ids[row] for row in rows)}'"
             cure = "start at another step" + (exclude if len(rows) <= _MAX_NAMED else "")
             raise UsageError(problem, record=ids[rows[0]], cure=cure)
@@ -456,7 +457,7 @@ def _check_finite(episodes: Episodes, names: Names) -> None:
     """Check that ego's motion is finite.
 
     Raises:
-        DrivaxError: It is not, although all executed actions were: the action space or the traffic is defective.
+        DrivaxError: It is not. All executed actions were finite, so the action space or the traffic is defective.
     """
     invalid = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
     if invalid.size:

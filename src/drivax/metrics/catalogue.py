@@ -1,6 +1,6 @@
 """Specification of the episode metrics (unit, direction, operator, definition, requirements), and the scores.
 
-:func:`select_metrics` selects some by name, with the step values and facts that they need.
+:func:`select_metrics` selects metrics by name, with the step values and facts that they need.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _boolean(value: Bool[Array, ""], defined: Any = True) -> Value:
 
 
 def _grade(name: str, good: float, fair: float, end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    """Return 1 for inputs up to ``good``, 0.5 up to ``fair``, else 0."""
+    """Return 1 for an input ``name`` up to ``good``, 0.5 up to ``fair``, else 0."""
     grade = jnp.where(inputs[name].value <= good, 1.0, jnp.where(inputs[name].value <= fair, 0.5, 0.0))
     return Value(grade, inputs[name].defined)
 
@@ -235,9 +235,9 @@ def vmax_score(metrics: Inputs) -> tuple[Value, Value]:
     return score(metrics, VMAX_WEIGHTS, VMAX_GATES)
 
 
-def _score(score: Callable[[Inputs], tuple[Value, Value]], number: int) -> Callable[..., Value]:
-    """Return the ``compute`` function of a score's full (0) or partial (1) value."""
-    return lambda end, value, inputs: score(inputs)[number]
+def _score(function: Callable[[Inputs], tuple[Value, Value]], index: int) -> Callable[..., Value]:
+    """Return ``Metric.compute`` for the full (0) or partial (1) value of a score."""
+    return lambda end, value, inputs: function(inputs)[index]
 
 
 def _step_metric(
@@ -411,30 +411,30 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     catalogue metrics, or user-defined metrics before it in the tuple.
 
     Raises:
-        UsageError: A set, metric or input is unknown, a dotted name is no metric, or two metrics have the same name.
+        UsageError: A set, metric or input is unknown, a dotted name is not that of a metric, or a name occurs twice.
     """
-    requested: list[str] = []
-    own: dict[str, Metric] = {}
+    requested_names: list[str] = []
+    user_metrics: dict[str, Metric] = {}
     for entry in (names,) if isinstance(names, str) else dict.fromkeys(names):
         if is_dotted(entry):
             name = entry.rpartition(":")[2].rpartition(".")[2]
-            own[name] = _own_metric(entry, name, own)
-            requested.append(name)
+            user_metrics[name] = _user_metric(entry, name, user_metrics)
+            requested_names.append(name)
         elif entry in SETS:
-            requested += SETS[entry]
+            requested_names += SETS[entry]
         elif entry in METRICS:
-            requested.append(entry)
+            requested_names.append(entry)
         else:
             raise UsageError(f"unknown metric {entry!r}", cure=did_you_mean(entry, [*SETS, *METRICS]))
-    requested = list(dict.fromkeys(requested))
+    requested_names = list(dict.fromkeys(requested_names))
     metrics: dict[str, Metric] = {}
-    for name in requested:
-        _add_with_inputs(name, METRICS | own, metrics)
+    for name in requested_names:
+        _add_with_inputs(name, METRICS | user_metrics, metrics)
     values = [metric.step_value for metric in metrics.values() if metric.step_value is not None]
     reads = frozenset[str]().union(*(value.reads for value in values))
-    if set(METRICS) <= set(requested):
+    if set(METRICS) <= set(requested_names):
         reads |= FACTS
-    return MetricSelection(tuple(requested), tuple(metrics.items()), reads)
+    return MetricSelection(tuple(requested_names), tuple(metrics.items()), reads)
 
 
 def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
@@ -444,7 +444,7 @@ def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
     return MappingProxyType({name: specs[name] for name in selection.names})
 
 
-def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
+def _user_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     metric = find_named(entry)
     if not isinstance(metric, Metric):
         raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.catalogue.Metric")
@@ -457,8 +457,9 @@ def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     return metric
 
 
-def _add_with_inputs(name: str, known: Mapping[str, Metric], metrics: dict[str, Metric]) -> None:
+def _add_with_inputs(name: str, specs: Mapping[str, Metric], metrics: dict[str, Metric]) -> None:
+    """Add a metric to ``metrics`` after its inputs."""
     if name not in metrics:
-        for input_name in known[name].inputs:
-            _add_with_inputs(input_name, known, metrics)
-        metrics[name] = known[name]
+        for input_name in specs[name].inputs:
+            _add_with_inputs(input_name, specs, metrics)
+        metrics[name] = specs[name]

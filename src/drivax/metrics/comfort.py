@@ -24,7 +24,7 @@ from drivax.scenario.schema import DT_S
 WINDOW, TAIL = 15, 12
 #: Window, order and derivative of smoothed acceleration, jerk, yaw rate and yaw acceleration.
 SMOOTH, JERK, YAW_RATE, YAW_ACCELERATION = (8, 2, 0), (15, 2, 1), (5, 2, 1), (5, 3, 2)
-#: Number of motions that the last steps depend on, and samples of a filter; its first sample with a whole window of 8.
+#: Number of samples that the last twelve steps depend on, and index of the first with a whole window of 8 around it.
 _SAMPLES, _FIRST_FINAL = 23, 4
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
@@ -93,8 +93,8 @@ def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
 def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
     """Evaluate the last twelve steps of a motion history (23 rows of x, y, heading, speed) against the limits.
 
-    The value of the first, eleven steps back, is final. The others are those of an episode that ends at the last row,
-    by SciPy's edge mode.
+    Only the value of the first, eleven steps ago, is final. The others hold for an episode that ends at the last row,
+    as in SciPy's ``interp`` mode.
     """
     speed = history[:, 3]
     heading_change = wrap(history[1:, 2] - history[:-1, 2])
@@ -112,11 +112,11 @@ def check_comfort(history: Float[Array, "history 4"]) -> ComfortSteps:
 
     smooth_longitudinal = apply_filter(longitudinal, SMOOTH)
     lateral_mps2 = jnp.abs(apply_filter(lateral, SMOOTH)[-TAIL:])
-    magnitude = jnp.abs(jerk(apply_filter(jnp.sqrt(longitudinal**2 + lateral**2 + 1e-12), SMOOTH)))
+    jerk_magnitude = jnp.abs(jerk(apply_filter(jnp.sqrt(longitudinal**2 + lateral**2 + 1e-12), SMOOTH)))
     longitudinal_mps2 = smooth_longitudinal[-TAIL:]
     comfortable = (longitudinal_mps2 >= LONGITUDINAL_MPS2[0]) & (longitudinal_mps2 <= LONGITUDINAL_MPS2[1])
-    comfortable &= (lateral_mps2 <= LATERAL_MPS2) & (magnitude <= JERK_MAGNITUDE_MPS3)
+    comfortable &= (lateral_mps2 <= LATERAL_MPS2) & (jerk_magnitude <= JERK_MAGNITUDE_MPS3)
     comfortable &= jnp.abs(jerk(smooth_longitudinal)) <= JERK_MPS3
     comfortable &= jnp.abs(apply_filter(heading, YAW_RATE)[-TAIL:]) <= YAW_RATE_RPS
     comfortable &= jnp.abs(apply_filter(heading, YAW_ACCELERATION)[-TAIL:]) <= YAW_ACCELERATION_RPS2
-    return ComfortSteps(comfortable, magnitude, lateral_mps2)
+    return ComfortSteps(comfortable, jerk_magnitude, lateral_mps2)

@@ -26,8 +26,9 @@ from drivax.scenario.schema import Flag
 from drivax.simulator.ahead import has_route
 from drivax.simulator.types import SimState, Situation
 
+#: ``event_step`` before an event.
 _NEVER = 32767
-#: Steps in a second, the window of ``wrong_way``.
+#: Steps per second, the window of the operator ``worst_second``.
 _SECOND = 10
 
 
@@ -39,7 +40,7 @@ class Episode:
         total, count: Sum of the defined values, and their number.
         low, high, last, first: Minimum, maximum, last value, and first value above zero (the last value until there is
             one); NaN or infinite before the first defined value.
-        event_step: Step of the first collision, off-road step and red light, as far as selected; 32767 before.
+        event_step: Step of the first collision, off-road position and red-light violation, if selected; 32767 before.
         second, worst: The last ten values, and the largest sum over ten consecutive steps.
         selection: The accumulated metrics.
     """
@@ -91,7 +92,7 @@ def episode_start(metrics: MetricNames = "full") -> Episode:
 def episode_add(
     episode: Episode, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
 ) -> Episode:
-    """Return the accumulators after a step of an episode from step ``start`` on; ``final`` marks its last step."""
+    """Return the accumulators after a step of an episode that began at ``start``; ``final`` marks its last step."""
     selection, values = episode.selection, _entries(episode.selection)
     moment = _MomentValues(Moment(situation, start, final))
     total, count = moment.sums(values["total"])
@@ -102,8 +103,8 @@ def episode_add(
     is_first = first_defined & ~(episode.first > 0)
     event_values, _ = moment.extremes(tuple(STEP_VALUES[name] for name in selection.events), jnp.max, 0.0)
     is_event = (event_values > 0) & (episode.event_step == _NEVER)
-    window, _ = moment.sums(values["worst"])
-    second = jnp.concatenate([episode.second[:, 1:], window[:, None]], axis=1)
+    step_sums, _ = moment.sums(values["worst"])
+    second = jnp.concatenate([episode.second[:, 1:], step_sums[:, None]], axis=1)
     return Episode(
         total=episode.total + total,
         count=episode.count + count,
@@ -174,14 +175,14 @@ def _meets(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
 
 
 def _accumulated_value(episode: Episode, metric: Metric) -> Value:
-    """Return an accumulated step value; undefined if no step defined it."""
+    """Return the reduced step value of a metric; undefined if no step defined it."""
     if metric.step_value is None:
         return Value(jnp.zeros(()), jnp.zeros((), bool))
     accumulator = next(name for name, operators in _ACCUMULATORS.items() if metric.operator in operators)
-    row = _entries(episode.selection)[accumulator].index(metric.step_value)
-    value = getattr(episode, accumulator)[row]
+    index = _entries(episode.selection)[accumulator].index(metric.step_value)
+    value = getattr(episode, accumulator)[index]
     if accumulator == "total":
-        count = episode.count[row]
+        count = episode.count[index]
         mean = value / jnp.maximum(count, 1).astype(jnp.float32)
         return Value(mean if metric.operator == "mean" else value, count > 0)
     return Value((value > 0).astype(jnp.float32) if metric.operator == "any" else value, jnp.isfinite(value))
@@ -190,6 +191,6 @@ def _accumulated_value(episode: Episode, metric: Metric) -> Value:
 def event_steps(episode: Episode) -> dict[str, Int[Array, ""]]:
     """Return the first step of each selected event (collision, off-road, red light); -1 for none."""
     return {
-        name: jnp.where(episode.event_step[row] == _NEVER, -1, episode.event_step[row])
-        for row, name in enumerate(episode.selection.events)
+        name: jnp.where(episode.event_step[index] == _NEVER, -1, episode.event_step[index])
+        for index, name in enumerate(episode.selection.events)
     }

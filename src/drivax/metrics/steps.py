@@ -48,13 +48,13 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and which of them count: the oldest, at the end all, if after the start."""
+        """Comfort of the last twelve steps, and a mask of those that count after the start: the oldest, finally all."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
 
 
-#: From a moment to a number, or several along one axis, and whether they are defined.
+#: Function of a moment that returns a number, or several along one axis, and whether they are defined.
 Read = Callable[[Moment], tuple[Array, Any]]
 
 
@@ -65,7 +65,7 @@ class StepValue:
     Attributes:
         name: Name of the quantity.
         unit: Unit, ``-`` for booleans and codes.
-        read: From a moment to the value, and whether it is defined.
+        read: Function of a moment that returns the value, and whether it is defined.
         reads: Names of the facts that ``read`` needs; by default all but those measured on request.
         delayed: Whether the value is computed several steps later, at the end of an episode for several steps at once.
     """

@@ -68,7 +68,7 @@ def drop_undefined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
 
 
 def dense_labels(labels: Any, count: int, kind: str) -> Labels:
-    """Return labels as numbers from 0 on; None labels ``count`` values by their index.
+    """Return labels as integers from 0 on without gaps; None gives each of ``count`` values its own label.
 
     Raises:
         UsageError: The number of labels is not ``count``; the message calls them ``kind``.
@@ -100,9 +100,9 @@ def design_effect(x: Values, labels: Labels) -> float:
         return 1.0
     if clusters == 1 or (x == x[0]).all():
         return n / clusters
-    spread = float(np.square(x - mean).mean())
-    variance = clusters / (clusters - 1) * float(np.square(sums - mean * counts).sum()) / n**2
-    return min(max(1.0, variance / (spread / n)), float(n))
+    value_variance = float(np.square(x - mean).mean())
+    mean_variance = clusters / (clusters - 1) * float(np.square(sums - mean * counts).sum()) / n**2
+    return min(max(1.0, mean_variance / (value_variance / n)), float(n))
 
 
 def cluster_strata(strata: Any, labels: Labels, minimum: int = 2) -> Strata:
@@ -115,14 +115,14 @@ def cluster_strata(strata: Any, labels: Labels, minimum: int = 2) -> Strata:
         UsageError: A cluster lies in two strata.
     """
     value_strata = dense_labels(strata, labels.size, "stratum")
-    _, first = np.unique(labels, return_index=True)
-    stratum = value_strata[first]
+    _, first_index = np.unique(labels, return_index=True)
+    stratum = value_strata[first_index]
     if (stratum[labels] != value_strata).any():
         raise UsageError("a cluster lies in two strata", cure="give all values of a cluster one stratum")
     sizes = np.bincount(stratum)
     stratum = np.where(sizes[stratum] < minimum, sizes.size, stratum)
     sizes = np.bincount(stratum, minlength=sizes.size + 1)
-    others = np.flatnonzero(sizes[:-1])
-    if 0 < sizes[-1] < minimum and others.size:
-        stratum = np.where(stratum == sizes.size - 1, others[sizes[others].argmin()], stratum)
+    candidates = np.flatnonzero(sizes[:-1])
+    if 0 < sizes[-1] < minimum and candidates.size:
+        stratum = np.where(stratum == sizes.size - 1, candidates[sizes[candidates].argmin()], stratum)
     return dense_labels(stratum, stratum.size, "stratum")

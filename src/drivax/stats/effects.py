@@ -87,12 +87,12 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         return 0.0
     noncentrality = abs(effect) * math.sqrt(n if share is None else n * share * (1 - share))
     critical = float(special.stdtrit(dof, (1 + confidence) / 2))
-    below, above = (float(special.nctdtr(dof, noncentrality, t)) for t in (-critical, critical))
-    if noncentrality - critical > 10 or math.isnan(above):
-        # The numerator of T is all but constant, so its denominator decides; SciPy may return NaN.
+    lower_cdf, upper_cdf = (float(special.nctdtr(dof, noncentrality, t)) for t in (-critical, critical))
+    if noncentrality - critical > 10 or math.isnan(upper_cdf):
+        # The numerator of T is almost constant, so use the distribution of its denominator; SciPy may return NaN.
         return float(special.chdtr(dof, dof * (noncentrality / critical) ** 2))
     # SciPy returns NaN for some lower tails that are negligible.
-    return min(1.0, 1.0 - above + (below if math.isfinite(below) else 0.0))
+    return min(1.0, 1.0 - upper_cdf + (lower_cdf if math.isfinite(lower_cdf) else 0.0))
 
 
 def scenarios_needed(
@@ -100,9 +100,8 @@ def scenarios_needed(
 ) -> int:
     """Return the smallest number of independent scenarios that detects an effect with power ``target``.
 
-    It counts pairs, or the scenarios of both arms; about 1e12 means that many or more. Clustered scenarios need
-    ``deff`` times as many.
-    Arguments are those of :func:`power`.
+    The number counts pairs, or the scenarios of both arms; about 1e12 means that many or more. Clustered scenarios need
+    :func:`~drivax.stats.clusters.design_effect` times as many. Other arguments are those of :func:`power`.
     """
     _check_target(target)
     if not abs(effect) > 0:

@@ -37,9 +37,9 @@ _CHUNK = 2_000_000
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate, its interval, and the number of defined episodes or pairs, or of trials, values or events.
+    """An estimate and its interval; ``n`` counts the defined episodes, pairs, trials, values or events.
 
-    ``mean`` is None if there are none; ``low`` and ``high`` are None if the spread cannot be estimated.
+    ``mean`` is None if ``n`` is 0; a bound is None if it cannot be estimated.
     """
 
     mean: float | None
@@ -276,7 +276,7 @@ def normal_quantile(confidence: float) -> float:
 
 
 def percentiles(values: Float64[np.ndarray, " resample"], confidence: float) -> tuple[float, float]:
-    """Return the bounds of the central part of the resamples, without those that are NaN."""
+    """Return the bounds of the central share ``confidence`` of resampled values; NaN values are ignored."""
     low, high = np.nanquantile(values, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 
@@ -284,7 +284,7 @@ def percentiles(values: Float64[np.ndarray, " resample"], confidence: float) -> 
 def _resample_means(
     x: Values, labels: Labels, strata: Strata | None, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, " resample"]:
-    """Return means of resamples of whole clusters, within strata."""
+    """Return means of resamples of whole clusters, within strata if given."""
     sums, counts = cluster_totals(x, labels)
     if strata is None:
         draws = _draw_totals(sums, counts, sums.size, resamples, rng)
@@ -304,8 +304,8 @@ def _draw_totals(
     chunks, equal_counts = [], bool((counts == counts[0]).all())
     for size in chunk_sizes(resamples, draws):
         index = rng.integers(0, sums.size, size=(size, draws), dtype=np.int32)
-        number = np.full(size, counts[0] * draws) if equal_counts else counts[index].sum(axis=1)
-        chunks.append((sums[index].sum(axis=1), number))
+        total_counts = np.full(size, counts[0] * draws) if equal_counts else counts[index].sum(axis=1)
+        chunks.append((sums[index].sum(axis=1), total_counts))
     return np.concatenate(chunks, axis=1)
 
 

@@ -91,12 +91,14 @@ def _weights_by_rank(
 
 
 def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
+    """Return the AUC from the weights of positives and negatives by rank."""
     below = np.cumsum(negative) - negative
     with np.errstate(invalid="ignore"):  # NaN for a resample without negatives
         return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
 
 
 def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
+    """Return the precision at the base rate from the weights of positives and negatives by rank."""
     positive, total = positive[::-1], (positive + negative)[::-1]
     count = positive.sum()
     remaining = count - (np.cumsum(total) - total)
@@ -105,7 +107,7 @@ def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -
 
 
 def rank_correlation(first: Numbers, second: Numbers) -> float:
-    """Return Spearman's correlation of mid-ranks (Am. J. Psychol. 15, 1904); NaN if a list is constant or empty."""
+    """Return Spearman's rank correlation (Am. J. Psychol. 15, 1904); NaN if a list is constant or empty."""
     if len(first) < 2:  # NumPy would warn
         return float("nan")
     with np.errstate(invalid="ignore"):

@@ -27,7 +27,7 @@ Others = Float64[np.ndarray, "other_seed other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
 #: Defaults of a planned comparison.
 _CONFIDENCE, _POWER = 0.95, 0.80
-#: Replaces infinite degrees of freedom.
+#: Upper bound of degrees of freedom, which may be infinite.
 _MAX_FREEDOM = 1e9
 #: Largest number of seeds or clusters to consider, and number of candidates up to it.
 _MAX_NUMBER, _CANDIDATES = 10**6, 400
@@ -104,11 +104,11 @@ class CrossedEffect:
         return self._probability(abs(difference) / self.error - self._critical(confidence))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of seeds per policy above the present one that detects this difference, if any."""
+        """Return the smallest number of seeds per policy above the present one that detects the difference, or None."""
         return self._smallest_number(self._with_seeds, max(self.seed_counts), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of clusters above the present one that detects this difference, if any."""
+        """Return the smallest number of clusters above the present one that detects the difference, or None."""
         return self._smallest_number(self._with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
@@ -162,7 +162,7 @@ class CrossedEffect:
 def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None = None) -> CrossedEffect:
     """Return the mean of one policy with the error of :func:`crossed_difference`; a single seed has no variance.
 
-    Differences between the same seeds of two policies give a paired comparison.
+    For a paired comparison of two policies, pass the differences of their values by seed.
 
     Raises:
         UsageError: There are fewer than two clusters.
@@ -234,10 +234,10 @@ def crossed_difference(
     return CrossedEffect(mean, seeds, scenarios, (len(a), len(b)), cluster_count, interaction)
 
 
-def _seed_variances(policy: Values, share: Weights, labels: Labels, correction: float) -> tuple[float, float]:
+def _seed_variances(values: Values, share: Weights, labels: Labels, correction: float) -> tuple[float, float]:
     """Return the variances from the choice of seeds and of the interaction of one policy."""
-    seed_means, seed_count = policy @ share, len(policy)
-    residuals = (policy - seed_means[:, None] - policy.mean(axis=0) + seed_means.mean()) * share
+    seed_means, seed_count = values @ share, len(values)
+    residuals = (values - seed_means[:, None] - values.mean(axis=0) + seed_means.mean()) * share
     totals = np.stack([np.bincount(labels, residual) for residual in residuals])
     interaction = correction * float(np.square(totals).sum()) / (seed_count * (seed_count - 1))
     return float(seed_means.var(ddof=1)) / seed_count, interaction
@@ -271,7 +271,7 @@ def log_ratio(
     weight, keep = _weights_and_mask(a, b, weights)
     if not keep.any():
         return None
-    means = [float(np.average(policy[:, keep].mean(axis=0), weights=weight[keep])) for policy in (a, b)]
+    means = [float(np.average(values[:, keep].mean(axis=0), weights=weight[keep])) for values in (a, b)]
     if min(means) <= 0.0:
         return None
     relative_effect = crossed_difference(a / means[0], b / means[1], clusters, weights)
@@ -281,5 +281,6 @@ def log_ratio(
 def _weights_and_mask(
     a: Values, b: Others, weights: Weights | None
 ) -> tuple[Float64[np.ndarray, " scenario"], Bool[np.ndarray, " scenario"]]:
+    """Return the weight of each scenario, and the mask of those with a positive weight and only defined values."""
     weight = np.ones(a.shape[1]) if weights is None else np.asarray(weights, np.float64)
     return weight, np.asarray(~np.isnan(np.concatenate([a, b])).any(axis=0) & (weight > 0.0))

@@ -26,9 +26,9 @@ from drivax.stats.clusters import (
 )
 from drivax.stats.intervals import RESAMPLES, check_draws, chunk_sizes
 
-#: Relative difference between resampled and observed statistic below which they are tied.
+#: Relative difference below which a resampled statistic and the observed one are tied.
 _TIE = 1e-9
-#: Standard error relative to the mean below which the differences are equal: their rounding errors are about 1e-8.
+#: Standard error relative to the mean below which all differences count as equal: rounding errors are about 1e-8.
 _ROUNDING_ERROR = 1e-7
 
 
@@ -40,7 +40,7 @@ class SignificanceResult:
         name: Name of the test.
         p: Two-sided p-value; None if no value is defined, an arm is empty, or a bootstrap or t test has one cluster.
         units: Number of units: discordant pairs (McNemar), clusters with a difference (permutation of pairs), or
-            clusters (others; 0 if all their differences are 0); 0 without a p-value.
+            clusters (other tests; 0 if all differences are 0); 0 without a p-value.
         exact: Whether the p-value is exact (binomial, or all permutations), not sampled or by a t distribution.
     """
 
@@ -89,19 +89,19 @@ def paired_permutation(
     if x.size == 0:
         return SignificanceResult("permutation", None, 0, exact=True)
     sums = cluster_totals(x, labels)[0]
-    size = np.abs(sums)
+    magnitude = np.abs(sums)
     # Remove clusters without a difference, which do not change the statistic.
-    sums = sums[size > _TIE * size.max()]
-    threshold = abs(float(sums.sum())) - _TIE * float(size.sum())
+    sums = sums[magnitude > _TIE * magnitude.max()]
+    threshold = abs(float(sums.sum())) - _TIE * float(magnitude.sum())
     if 2**sums.size <= resamples:
         signs = 1.0 - 2.0 * (np.arange(2**sums.size)[:, None] >> np.arange(sums.size) & 1)
         p = float((np.abs(signs @ sums) >= threshold).mean())
         return SignificanceResult("permutation", p, sums.size, exact=True)
-    rng, extreme = np.random.default_rng(seed), 0
+    rng, extreme_count = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
         positive = rng.integers(0, 2, size=(count, sums.size), dtype=np.int8).astype(np.float64)
-        extreme += int((np.abs(2.0 * (positive @ sums) - sums.sum()) >= threshold).sum())
-    return SignificanceResult("permutation", (1 + extreme) / (1 + resamples), sums.size, exact=False)
+        extreme_count += int((np.abs(2.0 * (positive @ sums) - sums.sum()) >= threshold).sum())
+    return SignificanceResult("permutation", (1 + extreme_count) / (1 + resamples), sums.size, exact=False)
 
 
 def paired_bootstrap_test(
@@ -125,14 +125,14 @@ def paired_bootstrap_test(
     mean, error = (float(value[0]) for value in _mean_and_error(moments.sum(axis=0)[None], sums.size))
     if error <= _ROUNDING_ERROR * abs(mean):
         return SignificanceResult("bootstrap", 1.0 / (1 + resamples), sums.size, exact=False)
-    rng, extreme = np.random.default_rng(seed), 0
+    rng, extreme_count = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
         draws = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
         means, errors = _mean_and_error(draws @ moments, sums.size)
         # |t*| >= |t|, multiplied by se*: a resample without variance counts as extreme.
         deviations = np.abs(means - mean)
-        extreme += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
-    return SignificanceResult("bootstrap", (1 + extreme) / (1 + resamples), sums.size, exact=False)
+        extreme_count += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
+    return SignificanceResult("bootstrap", (1 + extreme_count) / (1 + resamples), sums.size, exact=False)
 
 
 def _mean_and_error(
@@ -172,22 +172,22 @@ def split_permutation(
         cluster_stratum = cluster_strata(dense_labels(strata, keep.size, "stratum")[keep], labels, minimum=1)
     tie = _TIE * float(np.abs(x).max())
     threshold = abs(float(_arm_difference(in_first[None], sums, counts)[0])) - tie
-    rng, extreme = np.random.default_rng(seed), 0
+    rng, extreme_count = np.random.default_rng(seed), 0
     for count in chunk_sizes(resamples, sums.size):
         draws = np.empty((count, sums.size), bool)
         for stratum in range(int(cluster_stratum.max()) + 1):
             members = cluster_stratum == stratum
             draws[:, members] = rng.permuted(np.tile(in_first[members], (count, 1)), axis=1)
-        extreme += int((np.abs(_arm_difference(draws, sums, counts)) >= threshold).sum())
-    return SignificanceResult("permutation", (1 + extreme) / (1 + resamples), sums.size, exact=False)
+        extreme_count += int((np.abs(_arm_difference(draws, sums, counts)) >= threshold).sum())
+    return SignificanceResult("permutation", (1 + extreme_count) / (1 + resamples), sums.size, exact=False)
 
 
 def _arm_difference(
     in_first: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
 ) -> Float64[np.ndarray, " draw"]:
-    """Return the difference of the means of two arms."""
-    total, number = (in_first.astype(np.float64) @ values for values in (sums, counts))
-    return total / number - (sums.sum() - total) / (counts.sum() - number)
+    """Return the difference of the means of two arms for each assignment."""
+    total, count = (in_first.astype(np.float64) @ values for values in (sums, counts))
+    return total / count - (sums.sum() - total) / (counts.sum() - count)
 
 
 def holm_adjust(ps: Sequence[float | None]) -> list[float | None]:

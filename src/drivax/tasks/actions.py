@@ -72,7 +72,7 @@ class Physical:
         return self.action(motion, *follow(motion, target, next_target), length_m)
 
     def exceeds_bounds(self, action: Vector) -> Bool[Array, ""]:
-        """Whether an action is outside the bounds."""
+        """Return whether an action is outside the bounds."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
     def actuate(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
@@ -103,7 +103,7 @@ class Physical:
         return self._curvature(jnp.asarray(self.steering), length_m)
 
     def first(self, history: History, length_m: Any) -> Vector:
-        """Return the last action at the start of an episode: zero, or with rates that of the history's last step."""
+        """Return the action before an episode starts: with rate limits that of the history's last step, else zero."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
         command = command_between(history[-2], history[-1])
@@ -195,11 +195,11 @@ class Discrete(Physical):
     def index(self, action: Vector) -> Integer:
         """Return the number of the nearest action."""
         accelerations, curvatures = self.levels()
-        row = jnp.argmin(jnp.abs(accelerations - action[0]))
-        return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
+        acceleration_level = jnp.argmin(jnp.abs(accelerations - action[0]))
+        return acceleration_level * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
 
     def actuate(self, motion: Motion, action: Vector, last: Vector, length_m: Any) -> Vector:
-        """Return the nearest level, limited as in :class:`Physical`."""
+        """Return the nearest discrete action, limited to actuator rates as in :class:`Physical`."""
         return super().actuate(motion, self.of_index(self.index(action)), last, length_m)
 
 
@@ -248,7 +248,7 @@ def _levels(count: int, density: float) -> Float[Array, " count"]:
 
 @dataclass(frozen=True)
 class DeltaLocal:
-    """Displacement in the agent's frame: ahead (never backwards), left, turn; without grip limit.
+    """Displacement in the agent's frame: ahead (never backwards), left, and turn, without a limit of grip.
 
     Attributes:
         ahead_m, left_m: Displacements at 1 of the first two components.
@@ -278,7 +278,7 @@ class DeltaLocal:
         return self._action(*displacement(motion, target))
 
     def exceeds_bounds(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
-        """Whether an action is outside the bounds or moves backwards by more than a millimetre."""
+        """Return whether an action is outside the bounds, or moves backwards by more than a millimetre."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
 
     def actuate(
@@ -467,5 +467,5 @@ def follow_log(
 
 
 def _request(actions: ActionSpace, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:
-    """Return the requested action for an executed one, not clipped: in the space ``route`` an offset."""
+    """Return the action that requests an executed action, not clipped: in the space ``route``, it has an offset."""
     return actions.unsteer(bank, context, action) if isinstance(actions, Route) else action

@@ -79,7 +79,7 @@ def check_conditions(conditions: Conditions, rewards: RewardConfig) -> None:
 
 
 def draw_conditions(conditions: Conditions, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
-    """Draw the values of an agent's episode; without a key they are those of evaluation."""
+    """Return random values for an agent's episode, or those of evaluation if ``key`` is None; () without conditions."""
     if not conditions:
         return ()
     values = jnp.array([condition.value for condition in conditions], jnp.float32)
@@ -98,7 +98,7 @@ def scale_conditions(conditions: Conditions, values: Float[Array, " C"]) -> Floa
 
 
 def _ranges(conditions: Conditions) -> Float[Array, "2 C"]:
-    """Return the lower and upper bounds."""
+    """Return the lower and upper bounds of the draws."""
     return jnp.array([(c.low, c.high) for c in conditions], jnp.float32).T
 
 
@@ -108,7 +108,7 @@ def by_name(conditions: Conditions, values: Any) -> dict[str, Scalar]:
 
 
 def fix_conditions(conditions: Conditions, values: Mapping[str, float] | None = None) -> Conditions:
-    """Return the conditions without draws, at ``values`` by name or else at their own.
+    """Return the conditions fixed at ``values`` by name, or else at their own value.
 
     Raises:
         UsageError: A value is out of range, or there is no condition of its name.

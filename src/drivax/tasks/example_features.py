@@ -1,8 +1,8 @@
 """Ready-made features for custom observation groups.
 
-In YAML ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, from Python
+Select them in YAML by ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, in Python by
 ``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, context and frames; ``frames(k)`` is
-the frame of all agents k steps ago as ego perceives them.
+the frame of all agents k steps ago as ego perceived it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
 
-#: Number of agents with a relative velocity; spacing (m) and number of route points.
+#: Number of agents in ``relative_velocity``; spacing (m) and number of route points in ``recommended_speed``.
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
 #: Lane pieces: maximum distance, m; minimum cosine of the angle to ego; weight of the sine of the angle, m.
 _LANE_M, _LANE_COS, _M_PER_SINE = 2.5, 0.5, 4.0
-#: Half the width of the strip ahead in which a leader drives, m; maximum of time gaps, s.
+#: Half the width of the strip ahead that contains a leader, m; maximum of time gaps, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
 #: Look-ahead of a car-following driver, m.
 _FARTHEST_M = 90.0
@@ -47,8 +47,8 @@ def relative_velocity(
     distance = jnp.where(present, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
-    own_velocity = jnp.stack([ego[MOTION_SPEED], jnp.zeros(())])
-    velocity = (view.vector(now.velocity[order]) - own_velocity) / SPEED_MPS
+    ego_velocity = jnp.stack([ego[MOTION_SPEED], jnp.zeros(())])
+    velocity = (view.vector(now.velocity[order]) - ego_velocity) / SPEED_MPS
     return velocity, present[order] & (rank < len(distance))
 
 
@@ -56,24 +56,26 @@ def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) ->
     """Return the curvature of ego's lane in units of 0.1 1/m (left positive), and whether ego is on a lane.
 
     The lane is the piece within 2.5 m and 60 degrees that fits position and heading best, where 1 m weighs as much as
-    15 degrees. Needs no route. Does not distinguish levels.
+    15 degrees. The feature needs no route, and does not distinguish levels of the road.
     """
     view = View.of(context)
     rows, layer = bank.road[context.index], bank.road_at[context.index, 2]
     middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
-    half = rows[:, RoadColumn.LENGTH] / 2
-    along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
-    distance = norm(middle + along[:, None] * direction)
-    fits = (layer == RoadLayer.LANE) & (distance < _LANE_M) & (direction[:, 0] > _LANE_COS)
-    best = first_smallest(jnp.where(fits, distance**2 + (_M_PER_SINE * direction[:, 1]) ** 2, jnp.inf))
-    curvature = jnp.where(fits[best], features.scale_curvature(bank.road_curvature[context.index, best]), 0.0)
-    return jnp.stack([curvature, fits[best].astype(jnp.float32)])
+    half_length = rows[:, RoadColumn.LENGTH] / 2
+    offset = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half_length, half_length)
+    distance = norm(middle + offset[:, None] * direction)
+    is_candidate = (layer == RoadLayer.LANE) & (distance < _LANE_M) & (direction[:, 0] > _LANE_COS)
+    best = first_smallest(
+        jnp.where(is_candidate, distance**2 + (_M_PER_SINE * direction[:, 1]) ** 2, jnp.inf)
+    )
+    curvature = features.scale_curvature(bank.road_curvature[context.index, best])
+    return jnp.stack([jnp.where(is_candidate[best], curvature, 0.0), is_candidate[best].astype(jnp.float32)])
 
 
 def recommended_speed(
     bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
-    """Return ``clip(30 - 25 |k|, 5, 30)`` m/s at ten route points 5 m apart, in units of 15 m/s."""
+    """Return ``clip(30 - 25 |k|, 5, 30)`` m/s for curvatures k at ten route points 5 m apart, in units of 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
     _, valid = route_ahead(bank, context.row, context.route_m, offsets)
     curvature = features.route_curvature(bank, context.row, context.route_m + offsets)
@@ -84,38 +86,39 @@ def recommended_speed(
 def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the time gap to the leader in units of 10 s, at most 1, and whether there is a leader.
 
-    The time gap is the distance from bumper to bumper divided by ego's speed, of which less than 1 m/s counts as 1 m/s.
-    The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Without a leader the
-    first number is 1.
+    The time gap is the distance from bumper to bumper divided by ego's speed, or by 1 m/s if ego is slower. The leader
+    is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Without a leader the first
+    number is 1.
     """
     now, view = frames(0), View.of(context)
     position = view.point(now.box[:, :2])
     others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
-    leads = others & (position[:, 0] > 0) & (jnp.abs(position[:, 1]) < _STRIPE_M)
-    half = bank.length_m(context.index, context.slot) / 2
+    is_ahead = others & (position[:, 0] > 0) & (jnp.abs(position[:, 1]) < _STRIPE_M)
+    half_length = bank.length_m(context.index, context.slot) / 2
     direction = jnp.abs(view.vector(now.box[:, COS:LENGTH]))
-    # How far boxes extend from their centres along ego's heading.
-    reach = (direction[:, 0] * now.box[:, LENGTH] + direction[:, 1] * now.box[:, WIDTH]) / 2
-    gap = jnp.where(leads, jnp.maximum(position[:, 0] - half - reach, 0.0), jnp.inf)
+    # Half extent of boxes along ego's heading.
+    extent = (direction[:, 0] * now.box[:, LENGTH] + direction[:, 1] * now.box[:, WIDTH]) / 2
+    gap = jnp.where(is_ahead, jnp.maximum(position[:, 0] - half_length - extent, 0.0), jnp.inf)
     time = jnp.min(gap) / jnp.maximum(context.history[-1, MOTION_SPEED], _SLOWEST_MPS)
-    return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), leads.any().astype(jnp.float32)])
+    return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), is_ahead.any().astype(jnp.float32)])
 
 
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:
     """Return the inputs of a car-following driver along the route.
 
-    Gap to the leader or a light that requires a stop, at most 90 m, in units of 50 m; closing speed and speed of the
-    leader (0 without one); whether there is one; speed by the limit and the curves ahead. Speeds in units of 15 m/s.
-    Without a route on lanes nothing leads, and the last is 13.4 m/s, as without a limit.
+    They are the gap to the leader, or to a light that requires a stop, at most 90 m, in units of 50 m; closing speed
+    and speed of the leader (0 without one); whether there is one; and the speed that the limit and the curves ahead
+    allow. Speeds are in units of 15 m/s. Without a route on lanes there is no leader, and the last number stands for
+    13.4 m/s, as without a limit.
     """
     speed = context.history[-1, MOTION_SPEED]
     inputs = ahead(bank, context, frames(0), IdmParameters().min_gap_m)
-    routed = has_route(bank, context)
-    leads = routed & (inputs.gap < _FARTHEST_M)
-    gap = jnp.where(leads, inputs.gap, _FARTHEST_M) / POSITION_M
-    speeds = jnp.stack([speed - inputs.leader, inputs.leader]) * leads / SPEED_MPS
-    desired = jnp.where(routed, inputs.desired, FALLBACK_LIMIT_MPS) / SPEED_MPS
-    return jnp.stack([gap, *speeds, leads.astype(jnp.float32), desired])
+    route_exists = has_route(bank, context)
+    has_leader = route_exists & (inputs.gap < _FARTHEST_M)
+    gap = jnp.where(has_leader, inputs.gap, _FARTHEST_M) / POSITION_M
+    speeds = jnp.stack([speed - inputs.leader, inputs.leader]) * has_leader / SPEED_MPS
+    desired_speed = jnp.where(route_exists, inputs.desired, FALLBACK_LIMIT_MPS) / SPEED_MPS
+    return jnp.stack([gap, *speeds, has_leader.astype(jnp.float32), desired_speed])
 
 
 def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:

@@ -79,8 +79,8 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 
-#: Frame of all agents 0 to 15 steps ago (reactive vehicles: older than 9 steps repeats 9); the number is static. A
-#: second argument selects slots.
+#: Function that returns the frame of all agents 0 to 15 steps ago (for reactive vehicles, more than 9 count as 9). The
+#: number of steps is static; a second argument selects slots.
 Frames = Callable[..., Frame]
 
 
@@ -94,29 +94,29 @@ class View:
 
     @classmethod
     def of(cls, context: AgentContext) -> View:
-        """Return the frame of the driven agent now."""
+        """Return the ego frame of the driven agent at the present step."""
         motion = context.history[-1]
         return cls(motion[:2], jnp.cos(motion[2]), jnp.sin(motion[2]))
 
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """Transform a position, m."""
+        """Transform positions (m) to the ego frame."""
         return rotate(xy - self.xy, self.cos, -self.sin)
 
     def rotate(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Transform the components of a direction, velocity or offset to ahead and left.
+        """Transform the components of directions, velocities or offsets to ahead and left.
 
         The terms are ordered to round like :meth:`point` and :meth:`vector`, where products are fused.
         """
         return x * self.cos + y * self.sin, -(x * self.sin - y * self.cos)
 
     def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """Transform a direction or velocity."""
+        """Transform directions or velocities to the ego frame."""
         return rotate(xy, self.cos, -self.sin)
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of each group; a group without features is omitted. Columns: ``COLUMNS``.
+    """Features of each group, whose columns :data:`COLUMNS` lists; a group without features is omitted.
 
     Attributes:
         ego: Driven agent at each past step.
@@ -192,10 +192,10 @@ def scale_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
 def route_coordinates(
     bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"]
 ) -> list[Float[Array, " K"]]:
-    """Return positions of agents along the route (from ego) and left of it, and sine and cosine of the heading to it.
+    """Return positions of agents along the route (from ego) and left of it, and sine and cosine of the angle to it.
 
     Positions are in units of 50 m and 5 m; left is clipped to +-20 m, and 20 m for an agent that is not alongside the
-    route. Zeros without a route.
+    route. All values are 0 without a route.
     """
     offsets = projection_offsets()
     path, on_route = route_ahead(bank, context.row, context.route_m, offsets)
@@ -206,15 +206,15 @@ def route_coordinates(
 
 
 def projection_offsets() -> Float[Array, " P"]:
-    """Return the places on the route on which agents are projected, relative to ego, m."""
+    """Return the arc lengths, relative to ego, of the route points on which agents are projected, m."""
     return _ROUTE_START_M + _ROUTE_STEP_M * jnp.arange(_ROUTE_POINTS)
 
 
 def ego_on_route(bank: ScenarioBank, context: AgentContext, view: View) -> Float[Array, " 2"]:
-    """Return ego's offset left of its route (m, +-5, unscaled) and the sine of its heading to it; 0 without one."""
-    hit = project_on_route(bank, context.row, view.xy, context.route_m)
-    sine = view.sin * hit.heading[0] - view.cos * hit.heading[1]
-    offset = jnp.clip(hit.lateral_m, -SIZE_M, SIZE_M)
+    """Return ego's offset left of its route (m, clipped to +-5) and the sine of its angle to it; 0 without a route."""
+    projection = project_on_route(bank, context.row, view.xy, context.route_m)
+    sine = view.sin * projection.heading[0] - view.cos * projection.heading[1]
+    offset = jnp.clip(projection.lateral_m, -SIZE_M, SIZE_M)
     return jnp.where(has_route(bank, context), jnp.stack([offset, sine]), 0.0)
 
 
@@ -232,13 +232,13 @@ def overlap_imminence(ego: Float[Array, " 6"], ego_velocity: Float[Array, " 2"],
 def route_curvature(
     bank: ScenarioBank, row: Int[Array, ""], along_m: Float[Array, " K"]
 ) -> Float[Array, " K"]:
-    """Return the curvature of the route of a row, 1/m, left positive, averaged over 4 m around each position.
+    """Return the curvature of route ``row``, 1/m, left positive, averaged over 4 m around each position.
 
     The window is shorter at the ends of the route.
     """
-    last = (bank.route_points[row] - 1).astype(jnp.float32)
-    start_m = jnp.clip(along_m - HALF_WINDOW_M, 0.0, last)
-    end_m, zero = jnp.clip(along_m + HALF_WINDOW_M, 0.0, last), jnp.zeros(())
+    length_m = (bank.route_points[row] - 1).astype(jnp.float32)
+    start_m = jnp.clip(along_m - HALF_WINDOW_M, 0.0, length_m)
+    end_m, zero = jnp.clip(along_m + HALF_WINDOW_M, 0.0, length_m), jnp.zeros(())
     start, _ = route_ahead(bank, row, zero, start_m)
     end, _ = route_ahead(bank, row, zero, end_m)
     (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
@@ -260,7 +260,7 @@ def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
 
 
 def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:
-    """Cut each road piece (position, direction, length, ...) into equal pieces along its chord."""
+    """Cut each road piece (position, direction, length, ...) into ``count`` equal pieces along its chord."""
     offsets = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
     position, direction, length = rows[:, None, :2], rows[:, None, 2:4], rows[:, None, 4:5]
     middle = position + direction * length * (PIECE_M / POSITION_M) * offsets

@@ -43,15 +43,15 @@ from drivax.tasks.perception import (
 MOST_ROAD_ROWS, MOST_ROWS = 8192, 512
 #: Block size of :func:`running_count`.
 _BLOCK = 8
-#: Stop lines that ego is past by more than this, in the direction of their lane, are omitted, m. Added to the distance
-#: of lights off the route, m.
+#: Stop lines that ego has passed by more than this, in the direction of their lane, are omitted, m; addition to the
+#: distance of lights off the route, which sorts them last, m.
 _BEHIND_M, _OFF_ROUTE_M = 5.0, 1e4
 #: Agent kinds in the order of the columns of ``type``, which are all 0 for ``AgentKind.STATIC``.
 _TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
 Observation = dict[str, Array]
 #: Names of the groups of this module.
 GROUPS = tuple(COLUMNS)
-#: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
+#: Function that returns features ``[F]`` or rows ``[..., F]``, or a pair of rows and a mask over them.
 Feature = Callable[[ScenarioBank, AgentContext, Frames], Any]
 
 
@@ -60,8 +60,8 @@ class OwnGroup:
     """A user's observation group.
 
     Attributes:
-        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to these rows and a boolean
-            mask ``[...]`` of the valid ones; ``testing.check_feature`` checks it.
+        feature: Function of bank, context and frames that returns ``[..., F]`` float32 in about [-1, 1], or these rows
+            and a boolean mask ``[...]`` of the valid ones; ``testing.check_feature`` checks it.
         name: Name of the group; by default that of the function.
     """
 
@@ -313,7 +313,7 @@ def _agents_natively(
 
 
 def _native_ego(bank: ScenarioBank, context: AgentContext, view: View) -> Ego:
-    """Return what native kernels read of the driven agent."""
+    """Return the state of the driven agent that native kernels read."""
     direction = jnp.stack([view.cos, view.sin])
     place = context.index, context.row, context.slot, context.route_m, has_route(bank, context)
     return Ego(*place, context.history[-1], direction)
@@ -356,7 +356,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
         return kernels.with_reference(native, partial(_road, config))(bank, context, view)
 
     def rotate(x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the components ahead and left; unlike :meth:`View.rotate`, which rounds differently."""
+        """Return the components ahead and left, rounded differently than by :meth:`View.rotate`."""
         return x * view.cos + y * view.sin, y * view.cos - x * view.sin
 
     x, y, layer = bank.road_at[context.index]
@@ -417,7 +417,7 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     in_block = [positions[0]]
     for row in positions[1:]:
         in_block.append(in_block[-1] + row)
-    # Exact at any precision of matrix products: the factors are at most eight.
+    # The product is exact at any precision of matrix products, because factors are at most eight.
     block_start = in_block[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
     return jnp.stack([row + block_start for row in in_block], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
@@ -427,34 +427,34 @@ def _lights(
 ) -> Observation:
     """Return the group ``lights``: those on the route first, then the others, each by distance.
 
-    Without a route on lanes all are off the route.
+    Without a route on lanes, all lights are off the route.
     """
     line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     relevant = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_BEHIND_M)
     perception = config.perception
     on_route = (line[LightRow.ARC + bank.ego_number(context.row)] < NEVER_M) & has_route(bank, context)
-    rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
-    first = _nearest(jnp.where(relevant, rank, jnp.inf), config.lights)
-    exists = relevant[first] & (jnp.arange(config.lights) < state.shape[0])
+    sort_key = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, _OFF_ROUTE_M)
+    indices = _nearest(jnp.where(relevant, sort_key, jnp.inf), config.lights)
+    exists = relevant[indices] & (jnp.arange(config.lights) < state.shape[0])
 
     def position() -> Float[Array, "K 2"]:
-        xy = view.point(line[LightRow.XY, first].T)
+        xy = view.point(line[LightRow.XY, indices].T)
         if perception.noise_m > 0:
             errors = position_errors(perception, bank, context, LIGHT_NOISE_STREAM, state.shape[0])
-            xy = xy + errors[first]
+            xy = xy + errors[indices]
         return xy / POSITION_M
 
     columns = {
         "position": position,
-        "state": lambda: _colour(state[first]),
-        "on_route": lambda: on_route[first, None].astype(jnp.float32),
+        "state": lambda: _colour(state[indices]),
+        "on_route": lambda: on_route[indices, None].astype(jnp.float32),
     }
     return _masked_group("lights", features.concatenate_features(config.features.lights, columns), exists)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
-    """Return one-hot unknown, green, yellow, red. Flashing lights count as unknown, not red."""
+    """Return one-hot columns: unknown, green, yellow, red. Flashing lights count as unknown, not red."""
     green = (state == LightState.GO) | (state == LightState.ARROW_GO)
     yellow, red = is_yellow(state), is_red(state)
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)

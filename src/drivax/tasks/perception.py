@@ -69,16 +69,16 @@ class Perception:
 
     @property
     def of_lights(self) -> bool:
-        """Whether lights may be missed: out of range or dropped, as agents may be."""
+        """Whether lights and agents may be missed, because they are out of range or dropped."""
         return self.range_m is not None or self.dropout_m is not None
 
 
 def perceive(
     config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[..., Frame]
 ) -> Callable[..., Frame]:
-    """Return the perceived frames: undetected agents are not valid, undetected lights -1, and positions have errors.
+    """Return ``frames`` as ego perceives them: undetected agents are not valid, undetected lights -1, positions noisy.
 
-    Ego itself is exact. ``frames`` returns the true frame of all agents some steps ago.
+    Ego itself is exact. ``frames(back)`` returns the true frame of all agents ``back`` steps ago.
     """
     all_agents = cache(lambda back: _add_errors(config, bank, context, frames(back), back))
     return lambda back, slots=None: all_agents(back) if slots is None else all_agents(back).at(slots)
@@ -115,8 +115,8 @@ def in_view(
 ) -> Bool[Array, " S"]:
     """Return a mask of the agents whose centre or a corner is visible from a point.
 
-    Boxes in ``blocks`` occlude lines of sight through their interior. No box occludes itself, and a box around the eye
-    occludes nothing. All S x S x 5 pairs are tested, about 40 operations each.
+    Boxes in the mask ``blocks`` occlude lines of sight through their interior. No box occludes itself, and a box around
+    the eye occludes nothing. All S x S x 5 combinations are tested, with about 40 operations each.
     """
     dx, dy = eye[0] - box[:, X], eye[1] - box[:, Y]
     along, across = dx * box[:, COS] + dy * box[:, SIN], dy * box[:, COS] - dx * box[:, SIN]
@@ -140,7 +140,7 @@ def detect_lights(
 def position_errors(
     config: Perception, bank: ScenarioBank, context: AgentContext, stream: int, count: int
 ) -> Float[Array, "count 2"]:
-    """Return position errors of lights or road pieces (``stream``) in the ego frame, m."""
+    """Return position errors of lights or road pieces, as ``stream`` selects, in the ego frame, m."""
     return config.noise_m * _normal_per_slot(jax.random.fold_in(_key(config, bank, context), stream), count)
 
 

@@ -27,7 +27,7 @@ Term = Callable[[Facts, Facts, Surroundings], Scalar]
 _PROGRESS_SCALE_M = 12.0 * DT_S
 #: Speeding by more than this is penalised, m/s (5 mph).
 _SPEEDING_MPS = 2.23
-#: Time to collision below which ``ttc_shortfall`` is positive, s (published aggressive driver).
+#: Time to collision below which ``ttc_shortfall`` is positive, s (as for the published aggressive driver).
 _MIN_TTC_S = 1.0
 #: nuPlan's limits of jerk and lateral acceleration; their sum is the unpublished "max" of the published comfort.
 _JERK_MPS3, _LATERAL_MPS2 = 8.37, 4.89
@@ -76,7 +76,8 @@ TERMS: dict[str, RewardTerm] = {}
 def reward_term(*reads: str, option: str | None = None, softened: bool = False) -> Callable[[Any], Any]:
     """Register a function, which reads these facts, as the built-in term of its name.
 
-    For this module only: :class:`RewardConfig` has fields for the terms registered before it. Yours are ``OwnTerm``.
+    Use it only in this module: :class:`RewardConfig` has fields for the terms registered before it. For your own terms,
+    use :class:`OwnTerm`.
     """
 
     def register(function: Any) -> Any:
@@ -102,7 +103,7 @@ def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
-# 1 while a corner is off the road; at a step that runs a red light; while off the corridor of the route.
+# 1 while a corner is off the road, at a step that runs a red light, and while off the corridor of the route.
 _event_term("offroad", "offroad")
 _event_term("red_light", "red_light")
 _event_term("off_route", "off_route")
@@ -118,7 +119,7 @@ def progress(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 def discomfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Largest of acceleration, lateral acceleration and jerk over nuPlan's limits, squared, in [0, 1].
 
-    Causal differences over 0.5 s, so that the reward never depends on future steps.
+    All are causal differences over 0.5 s, so that the reward never depends on future steps.
     """
     acceleration = now.acceleration_mps2
     along = jnp.where(acceleration < 0, acceleration / _BRAKING_MPS2, acceleration / _ACCELERATION_MPS2)
@@ -142,7 +143,7 @@ def any_progress(before: Facts, now: Facts, around: Surroundings) -> Scalar:
 def comfort(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """1 - min(1, (jerk + lateral acceleration) / max), in [0, 1] (published).
 
-    Magnitudes in m/s3 and m/s2, causal over 0.5 s; ``max`` is 8.37 + 4.89, nuPlan's limits of both.
+    The magnitudes, in m/s3 and m/s2, are causal over 0.5 s; ``max`` is 8.37 + 4.89, nuPlan's limits of both.
     """
     magnitude = jnp.abs(now.jerk_mps3) + jnp.abs(now.lateral_acceleration_mps2)
     return 1.0 - jnp.minimum(1.0, magnitude / (_JERK_MPS3 + _LATERAL_MPS2))
@@ -207,8 +208,8 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at a step that enters a neighbouring lane of the same direction; 1 at a step that leaves a lane which, within 100 m,
-# ends or joins the new lane (``scenario.bank.queries.lane_passage``).
+# 1 at a step that enters a neighbouring lane of the same direction, and 1 at a step that leaves a lane which, within
+# 100 m, ends or joins the new lane (``scenario.bank.queries.lane_passage``).
 _event_term("lane_change", "lane_changed")
 _event_term("merge", "merged")
 
@@ -217,8 +218,8 @@ _event_term("merge", "merged")
 def pace(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     """Adherence to the log's schedule along the route, or along the log's path without one, in [0, 1].
 
-    1 between the log's present position and that a second later. Behind, 1 / (1 + late / 2 m), which rewards catching
-    up from any distance; ahead, exp(-early / 8 m) after the first metre.
+    It is 1 between the log's present position and that a second later, 1 / (1 + late / 2 m) behind, which rewards
+    catching up from any distance, and exp(-early / 8 m) ahead, after the first metre.
     """
     late_m, early_m = jnp.maximum(now.late_m, 0.0), jnp.maximum(now.early_m - _EARLY_SLACK_M, 0.0)
     return jnp.exp(-early_m / _EARLY_M) / (1.0 + late_m / _LATE_M)
@@ -284,8 +285,8 @@ class OwnTerm:
     Attributes:
         term: A function like those of this module; ``testing.check_reward`` checks it.
         weight: Factor of the term.
-        name: Name in logs; the function's own by default.
-        reads: Facts of ``simulator.types.ON_REQUEST`` that it reads; all others are measured anyway.
+        name: Name in logs; that of the function by default.
+        reads: Facts of ``simulator.types.ON_REQUEST`` that the function reads; all others are measured anyway.
     """
 
     term: Term
@@ -357,7 +358,7 @@ class RewardConfig(_Weights):
 
     @property
     def reads(self) -> frozenset[str]:
-        """Facts that the terms read; user-defined terms read all of ``FACTS``, and what they name."""
+        """Facts that the terms read; user-defined terms read all of ``FACTS``, and those that they declare."""
         reads = {name: term.reads for name, term in TERMS.items()}
         reads |= {term.name: FACTS.union(term.reads) for term in self.own}
         if self.collision_margin_m:
@@ -371,7 +372,7 @@ class RewardConfig(_Weights):
     ) -> dict[str, Scalar]:
         """Return the weighted and scaled terms by name, and the loss by each soft factor as ``TERM/FACTOR``.
 
-        The reward is the sum of all. ``conditions`` are factors of terms and replacements of options, by name.
+        The reward is the sum of all values. ``conditions`` hold factors of terms and values of options, by name.
         """
         conditions = conditions or {}
         options = {name: getattr(self, name) for name in OPTIONS} | dict(conditions)

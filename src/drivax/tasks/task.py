@@ -97,7 +97,7 @@ class Task:
         return self.actions.first(history, length)
 
     def draw_conditions(self, slot: Any, key: Any) -> tuple[()] | Float[Array, " C"]:
-        """Return the conditions of an agent's episode; without a key those of evaluation."""
+        """Return the conditions of an agent's episode, or those of evaluation if ``key`` is None."""
         return draw_conditions(self.conditions, slot, key)
 
     def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames, frame: Frame) -> Observation:
