@@ -43,7 +43,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing_package(error) or error from error
 
-#: Bound to which observations are clipped (5 km, 1.5 km/s; own groups too), so that spaces have finite bounds.
+#: Bound to which observations are clipped (5 km, 1.5 km/s), user-defined groups too, so that spaces are bounded.
 LIMIT = 100.0
 
 
@@ -92,7 +92,7 @@ def _reset(simulator: Simulator, bank: ScenarioBank, row: Any) -> tuple[SimState
 
 @partial(jax.jit, static_argnums=0)
 def _reset_all(simulator: Simulator, bank: ScenarioBank, rows: Any) -> tuple[SimState, dict[str, Array]]:
-    """Reset a batch."""
+    """Return the initial states of a batch of episodes and their observations."""
     return jax.vmap(partial(_reset, simulator, bank))(rows)
 
 
@@ -456,7 +456,7 @@ def _to_numpy(observation: Mapping[str, Array]) -> Observation:
 
 
 def _ego_path(context: AgentContext, previous: Any = None) -> Any:
-    """Return ego's motion since the first step of the log ``[step + 1, 4]``, NaN where unknown.
+    """Return ego's motions since the first step of the log ``[step + 1, 4]``, NaN where unknown.
 
     ``previous`` is the path one step ago, None at the start of an episode.
     """

@@ -1,4 +1,4 @@
-"""Planners with one interface: expert, rule-based, network, and functions of the user.
+"""Planners with one interface: expert, rule-based, network, and user functions.
 
 ``catalogue.PLANNERS`` has the built-in ones by name. :mod:`drivax.learning.policies` loads trained policies.
 """

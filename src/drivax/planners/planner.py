@@ -78,7 +78,7 @@ class RuleBased(Memoryless, ABC):
         """Return acceleration (m/s2) and curvature (1/m)."""
 
     def choose(self, bank: ScenarioBank, situation: Situation, observation: Any, key: Array) -> Action:
-        """Return the action that exerts the controls in the planner's action space."""
+        """Return the action that applies the controls in the planner's action space."""
         return action_of(self.actions, bank, situation.context, *self.controls(bank, situation))
 
 
@@ -103,7 +103,7 @@ class Held:
         return self.planner.replays
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
-        """Return the planner's carry, and room for a decision."""
+        """Return the planner's carry, and zeros in place of the first decision."""
         return self.planner.init(bank, state, key), jnp.zeros_like(state.context.action)
 
     def act(
@@ -112,11 +112,11 @@ class Held:
     ) -> tuple[Action, Any]:  # fmt: skip
         """Return a new action of the planner at every ``steps``-th step of an episode, and repeat it until the next."""
         decision = self.planner.act(carry[0], bank, state, situation, observation, key)
-        decides = (state.context.step - state.start) % self.steps == 0
-        action, inner = jax.tree.map(
-            lambda new, old: jnp.where(decides, new, old), decision, (carry[1], carry[0])
+        is_decision_step = (state.context.step - state.start) % self.steps == 0
+        action, inner_carry = jax.tree.map(
+            lambda new, old: jnp.where(is_decision_step, new, old), decision, (carry[1], carry[0])
         )
-        return action, (inner, action)
+        return action, (inner_carry, action)
 
 
 def hold(planner: Planner, steps: int) -> Planner:

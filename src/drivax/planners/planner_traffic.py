@@ -63,9 +63,9 @@ class PlannerTraffic:
 
     It drives vehicles that are logged at the start of the episode and travel more than 2 m in the rest of the log. They
     see all agents, hold each decision for ``task.hold`` steps, and follow the task's dynamics to the end of the
-    episode. If the simulator drives several agents, earlier frames have all but the first from ``base``. Only further
-    egos of the set have a route: for other vehicles, use a policy that can follow lanes without one. In the action
-    space ``route``, only egos with a route on lanes are driven.
+    episode. If the simulator drives several agents, earlier frames take those after the first from ``base``. Only
+    vehicles that are egos of the set have a route: for others, use a policy that can follow lanes without one. In the
+    action space ``route``, only egos with a route on lanes are driven.
 
     Attributes:
         task: Observation and action space of the planner.

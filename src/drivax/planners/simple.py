@@ -85,7 +85,7 @@ class ConstantVelocity(RuleBased):
     name: str = static(default="constant_velocity")
 
     def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
-        """Return zeros."""
+        """Return no acceleration and no curvature."""
         return jnp.zeros(()), jnp.zeros(())
 
 
@@ -97,7 +97,7 @@ class ConstantSpeed(RuleBased):
     name: str = static(default="constant_speed")
 
     def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Scalar, Scalar]:
-        """Return no acceleration, and the curvature to the route."""
+        """Return no acceleration, and the curvature of pure pursuit to the route."""
         return jnp.zeros(()), follow_route(bank, situation.context, jnp.zeros(()))
 
 

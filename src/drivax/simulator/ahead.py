@@ -40,7 +40,7 @@ _YELLOW_BRAKING_MPS2 = 3.0
 _LOOKAHEAD_M, _LOOKAHEAD_S, _LOOKAHEAD_BOUNDS_M = 3.0, 0.8, (4.0, 20.0)
 #: Distance before a stop line at which cars stop, m.
 STOP_SHORT_M = 1.0
-#: For the native kernel.
+#: Constants of the native kernel.
 _RULES: dict[str, Any] = {
     "points": _POINTS, "rectangles": _RECTANGLES, "closest": CLOSEST, "slot_bits": SLOT_BITS,
     "red": LightState.STOP, "red_arrow": LightState.ARROW_STOP,
@@ -87,13 +87,13 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
 
 
 def _ahead_natively(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: Scalar) -> Ahead:
-    """Return the values of :func:`ahead`."""
+    """Return the result of :func:`ahead`, computed by the native kernel."""
     maps = (bank.routes, bank.route_points, bank.light_line)
     agents = Agents(frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
     arc = jnp.asarray(LightRow.ARC + bank.ego_number(context.row), jnp.int32)
     speed = context.history[-1, MOTION_SPEED]
-    places = (context.slot, context.index, context.row, arc)
-    return Ahead(*look_ahead(maps, agents, frame.lights, places, context.route_m, speed, min_gap_m, _RULES))
+    numbers = (context.slot, context.index, context.row, arc)
+    return Ahead(*look_ahead(maps, agents, frame.lights, numbers, context.route_m, speed, min_gap_m, _RULES))
 
 
 def leader_gap(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
@@ -115,18 +115,18 @@ def _leader(
 ) -> tuple[Scalar, Scalar]:  # fmt: skip
     """Return the gap to the nearest obstacle on a path (m; infinite without one), and its speed along the path."""
     ego = frame.box[slot]
-    # Only the closest agents near the route are measured against all of its points.
+    # Projecting agents on all points is slow, so select the closest agents near the route first.
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
     half_m = (ego[WIDTH : WIDTH + 1] / 2 + _NEAR_M)[None]
-    near = reaching(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
-    slots, valid = closest(near & others_on_level(frame, slot), ego[None], boxes)
+    is_near = reaching(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
+    slots, valid = closest(is_near & others_on_level(frame, slot), ego[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
     along, lateral, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])
     half_length = jnp.abs(cos) * box[:, LENGTH] / 2 + jnp.abs(sin) * box[:, WIDTH] / 2
     half_width = jnp.abs(sin) * box[:, LENGTH] / 2 + jnp.abs(cos) * box[:, WIDTH] / 2
-    blocks = valid[0] & (jnp.abs(lateral) < half_width + ego[WIDTH] / 2 + _SIDE_M) & (along > 0.0)
-    gaps = jnp.where(blocks, along - half_length - ego[LENGTH] / 2, jnp.inf)
+    is_obstacle = valid[0] & (jnp.abs(lateral) < half_width + ego[WIDTH] / 2 + _SIDE_M) & (along > 0.0)
+    gaps = jnp.where(is_obstacle, along - half_length - ego[LENGTH] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
     return gaps[nearest], speed[nearest]
@@ -135,7 +135,7 @@ def _leader(
 def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Return the distance from the front bumper to the nearest stop line that requires a stop, m.
 
-    Infinite for none within 92 m.
+    Infinite if there is none within 92 m.
     """
     line, state = bank.light_line[context.index], frame.lights
     arc = line[LightRow.ARC + bank.ego_number(context.row)]
@@ -143,8 +143,8 @@ def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scal
     speed = context.history[-1, MOTION_SPEED]
     can_stop = speed * speed / (2.0 * jnp.maximum(distance, 0.1)) < _YELLOW_BRAKING_MPS2
     requires_stop = is_red(state) | (is_yellow(state) & can_stop)
-    counts = requires_stop & (distance > 0.0) & (distance < _POINTS * _STEP_M)
-    return jnp.min(jnp.where(counts, distance, jnp.inf))
+    is_relevant = requires_stop & (distance > 0.0) & (distance < _POINTS * _STEP_M)
+    return jnp.min(jnp.where(is_relevant, distance, jnp.inf))
 
 
 def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
@@ -155,15 +155,15 @@ def desired_speed(path: Array, on_route: Array, offsets: Array) -> Scalar:
     curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M
     curvature = jnp.where(on_route[1:], curvature, 0.0)
     # The square of the speed from which the car brakes to the curve's speed over the distance to it.
-    squared = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
-    return jnp.minimum(limit, jnp.sqrt(jnp.min(squared)))
+    squared_speed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
+    return jnp.minimum(limit, jnp.sqrt(jnp.min(squared_speed)))
 
 
 def project(
     path: Float[Array, "K 7"], on_route: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
     heading: Float[Array, "S 2"],
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Project poses on a path: return arc length, lateral offset, and cosine and sine of the heading to the path.
+    """Project poses on a path: return arc length, lateral offset, cosine and sine of the heading relative to the path.
 
     Beyond either end the path continues along its tangent; the lateral offset is infinite more than 4 m beyond it.
     """
@@ -201,8 +201,8 @@ def follow_route(bank: ScenarioBank, context: AgentContext, offset_m: Scalar) ->
 def offset_to_steer(bank: ScenarioBank, context: AgentContext, curvature: Scalar) -> Scalar:
     """Return the offset for which :func:`follow_route` returns a curvature, m.
 
-    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``. If it does
-    not, or if the car heads across the route, the result is finite but no such offset.
+    The arc of curvature k from the origin meets the line p + d n where ``k |p + d n|^2 = 2 (p + d n)_y``. If they do
+    not meet, or the car heads across the route, the result is finite but not such an offset.
     """
     point, left = _pursuit_point(bank, context)
     linear = 2.0 * (curvature * jnp.sum(point * left) - left[1])

@@ -26,7 +26,7 @@ _TAN_30, _COS_45 = 3.0**-0.5, 0.5**0.5
 _BUMPER_M = 0.02
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
-#: For the native kernel.
+#: Constants of the native kernel.
 RULES: dict[str, Any] = {
     "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST, "level_m": LEVEL_M,
     "horizon_s": TTC_HORIZON_S, "stopped_mps": STOPPED_MPS, "rear_axle": REAR_AXLE, "behind_tan": _TAN_30,
@@ -124,9 +124,9 @@ def classify_contacts(
 ) -> tuple[Bool[Array, " S"], Integer]:  # fmt: skip
     """Return which contacts that begin at this step (mask ``begins``) are at fault, and the type of the nearest one.
 
-    Fault follows nuPlan's order: agent itself stopped: no; the other stopped: yes; the other behind: no; hit with the
-    front: yes; sideways: yes when the agent is ``unlawful``, in several lanes or off the road. Speeds are the larger
-    ones of before and after the step.
+    As in nuPlan, the agent is not at fault if it is stopped. Otherwise it is at fault if the other is stopped, or if
+    the other is not behind and the agent hits it with its front or is ``unlawful``: in several lanes or off the road.
+    Speeds are the larger of those before and after the step.
     """
     ego = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
@@ -144,11 +144,11 @@ def classify_contacts(
         (vulnerable, c.VULNERABLE), (other_stopped & front, c.STOPPED_OBJECT),
         (opposite & (front | ~behind), c.HEAD_ON), (front & parallel, c.REAR_END), (behind, c.REAR_ENDED),
     )  # fmt: skip
-    kind = jnp.full(front.shape, c.SIDE_SWIPE)
+    collision_type = jnp.full(front.shape, c.SIDE_SWIPE)
     for mask, case in reversed(cases):  # jnp.select, an argmax over all cases, is slower
-        kind = jnp.where(mask, case, kind)
+        collision_type = jnp.where(mask, case, collision_type)
     nearest = first_smallest(jnp.where(begins, ahead**2 + left**2, jnp.inf))
-    return begins & fault, jnp.where(begins.any(), kind[nearest], c.NONE).astype(jnp.int8)
+    return begins & fault, jnp.where(begins.any(), collision_type[nearest], c.NONE).astype(jnp.int8)
 
 
 def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
@@ -161,9 +161,9 @@ def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -
     ego = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * ego[LENGTH])
+    is_relevant = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * ego[LENGTH])
     times = time_to_overlap(ego, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
-    return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
+    return jnp.min(jnp.where(is_relevant, times, TTC_HORIZON_S))
 
 
 def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
@@ -171,7 +171,7 @@ def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scal
 
     Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
     """
-    counts = others_on_level(frame, slot) & ~ignored
+    is_relevant = others_on_level(frame, slot) & ~ignored
     # Boxes of empty slots are arbitrary; the agent's own box in their place keeps gradients finite.
-    gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
-    return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))
+    gaps = gap(frame.box[slot], jnp.where(is_relevant[:, None], frame.box, frame.box[slot]))
+    return jnp.min(jnp.where(is_relevant, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

@@ -1,7 +1,7 @@
 """nuPlan's ego controller: an LQR that tracks planned poses, and a kinematic bicycle about the rear axle.
 
 Source: nuplan-devkit, ``LQRTracker`` and ``KinematicBicycleModel``, with their weights. Speeds and curvatures of the
-plan are fitted to its poses; commands are held over the horizon. Unlike there, the car never reverses.
+plan are fitted to its poses; commands are held over the horizon. Unlike in nuPlan, the car never reverses.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Actuators = Float[Array, " 3"]
 ACCELERATION, STEERING, RATE = range(3)
 #: Regularisation of the first curvature, which a plan without motion does not determine.
 _FIRST_CURVATURE = 1e-10
-#: Steps over which initial acceleration and steering are measured; largest distance in them for a steering of 0, m.
+#: Steps over which initial acceleration and steering are measured; distance in them up to which steering is 0, m.
 _RECENT, _STILL_M = 5, 0.5
 #: Settings that cannot be 0: most divide, or keep a divisor away from 0.
 _POSITIVE = (

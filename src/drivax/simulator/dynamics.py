@@ -14,7 +14,7 @@ from drivax.scenario.bank.scenario_bank import Scalar, Vector
 from drivax.scenario.schema import DT_S
 from drivax.simulator.types import Motion
 
-#: Grip limit |curvature| v^2, m/s2.
+#: Grip limit: largest ``|curvature| v^2``, m/s2.
 GRIP_MPS2 = 8.0
 #: Moves shorter than this are straight, m.
 _STILL_M = 0.1
@@ -34,10 +34,9 @@ def bicycle(motion: Motion, acceleration: Scalar, curvature: Scalar) -> Motion:
     curvature = jnp.clip(curvature, -limit, limit)
     distance, next_speed = accelerate(speed, acceleration)
     turn = curvature * distance
-    mean = heading + turn / 2.0
-    return jnp.stack(
-        [x + distance * jnp.cos(mean), y + distance * jnp.sin(mean), wrap(heading + turn), next_speed]
-    )
+    mean_heading = heading + turn / 2.0
+    dx, dy = distance * jnp.cos(mean_heading), distance * jnp.sin(mean_heading)
+    return jnp.stack([x + dx, y + dy, wrap(heading + turn), next_speed])
 
 
 def accelerate(speed: Float[Array, "*R"], acceleration: Float[Array, "*R"]) -> tuple[Array, Array]:
@@ -45,11 +44,11 @@ def accelerate(speed: Float[Array, "*R"], acceleration: Float[Array, "*R"]) -> t
 
     A car that would reach a negative speed stops within the step after ``v^2 / (2 |a|)``: no creep, no reverse.
     """
-    unbounded = speed + acceleration * DT_S
-    stops = unbounded < 0.0
-    next_speed = jnp.where(stops, 0.0, unbounded)
-    braking = jnp.where(stops, -acceleration, 1.0)  # 1 if unused: gradients stay finite.
-    distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + next_speed) / 2.0 * DT_S)
+    unbounded_speed = speed + acceleration * DT_S
+    is_stopping = unbounded_speed < 0.0
+    next_speed = jnp.where(is_stopping, 0.0, unbounded_speed)
+    braking = jnp.where(is_stopping, -acceleration, 1.0)  # 1 where unused, so that gradients stay finite
+    distance = jnp.where(is_stopping, speed * speed / (2.0 * braking), (speed + next_speed) / 2.0 * DT_S)
     return distance, next_speed
 
 
@@ -79,18 +78,18 @@ def command_between(before: Motion, now: Motion) -> tuple[Scalar, Scalar]:
 def follow(motion: Motion, target: Motion, next_target: Motion) -> tuple[Scalar, Scalar]:
     """Return the acceleration and curvature that follow a log, from its motions one and two steps ahead.
 
-    The acceleration closes the speed error in one step, plus 1/s^2 times the along-track error; the curvature is that
-    of the circle through the second position, 0 for moves below 0.1 m.
+    The acceleration is the speed error over one step, plus 1/s^2 times the along-track error; the curvature is that of
+    the circle through the second position, 0 for moves below 0.1 m.
     """
     cos, sin = jnp.cos(motion[2]), jnp.sin(motion[2])
-    # Position of the log relative to that of the car at the mean speed.
-    ahead = target[:2] - motion[:2]
-    along = ahead[0] * cos + ahead[1] * sin - (motion[3] + target[3]) / 2 * DT_S
-    acceleration = (target[3] - motion[3]) / DT_S + _ALONG_GAIN * along
-    offset = next_target[:2] - motion[:2]
-    forward, left = offset[0] * cos + offset[1] * sin, offset[1] * cos - offset[0] * sin
-    squared = forward * forward + left * left
-    curvature = jnp.where(squared > _STILL_M**2, 2.0 * left / jnp.maximum(squared, _STILL_M**2), 0.0)
+    # Along-track error: how far the log is ahead of where the mean speed takes the car.
+    offset = target[:2] - motion[:2]
+    along_error = offset[0] * cos + offset[1] * sin - (motion[3] + target[3]) / 2 * DT_S
+    acceleration = (target[3] - motion[3]) / DT_S + _ALONG_GAIN * along_error
+    next_offset = next_target[:2] - motion[:2]
+    forward, left = next_offset[0] * cos + next_offset[1] * sin, next_offset[1] * cos - next_offset[0] * sin
+    squared_m2 = forward * forward + left * left
+    curvature = jnp.where(squared_m2 > _STILL_M**2, 2.0 * left / jnp.maximum(squared_m2, _STILL_M**2), 0.0)
     return acceleration, curvature
 
 

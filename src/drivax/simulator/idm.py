@@ -39,9 +39,9 @@ def idm_acceleration(
     xp = speed.__array_namespace__()
     p = parameters
     root = 2.0 * (p.acceleration_mps2 * p.comfortable_braking_mps2) ** 0.5
-    dynamic = speed * p.headway_s + speed * (speed - leader_speed) / root
-    desired_gap = p.min_gap_m + xp.maximum(dynamic, 0.0)
-    free = (speed / xp.maximum(desired_speed, 0.1)) ** p.exponent
-    interaction = (desired_gap / xp.maximum(gap, 0.1)) ** 2
-    desired = p.acceleration_mps2 * (1.0 - free - interaction)
-    return xp.maximum(desired, -p.max_braking_mps2)
+    dynamic_gap = speed * p.headway_s + speed * (speed - leader_speed) / root
+    desired_gap = p.min_gap_m + xp.maximum(dynamic_gap, 0.0)
+    free_term = (speed / xp.maximum(desired_speed, 0.1)) ** p.exponent
+    interaction_term = (desired_gap / xp.maximum(gap, 0.1)) ** 2
+    acceleration = p.acceleration_mps2 * (1.0 - free_term - interaction_term)
+    return xp.maximum(acceleration, -p.max_braking_mps2)

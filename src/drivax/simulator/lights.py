@@ -21,10 +21,10 @@ _DECISION_STEPS = 20
 
 
 def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "history 2"]:
-    """Return the front bumper at every step of the context's history."""
-    past = context.history
-    direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
-    return past[:, :2] + direction * length_m / 2
+    """Return the position of the front bumper at every step of the context's history."""
+    history = context.history
+    direction = jnp.stack([jnp.cos(history[:, 2]), jnp.sin(history[:, 2])], axis=-1)
+    return history[:, :2] + direction * length_m / 2
 
 
 def _pauses(speed: Float[Array, ""], distance_m: Float[Array, " L"]) -> Bool[Array, " L"]:
@@ -33,7 +33,7 @@ def _pauses(speed: Float[Array, ""], distance_m: Float[Array, " L"]) -> Bool[Arr
 
 
 def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
-    """Return the stop-line memory of the step before a context, which its recent motion implies.
+    """Reconstruct the stop-line memory of the step before a context from the agent's recent motion.
 
     :func:`check_lights` adds the present step.
     """
@@ -61,29 +61,29 @@ def check_lights(
     """Return whether a red-light violation is established at this step, and the new memory.
 
     On the route only lights of the route count, immediately. Off the route a crossing is decided two seconds later, or
-    at the end of the log; of lines decided together only that whose lane ends closest to the agent's heading counts.
+    at the end of the log; of lines due at once, only the one whose lane ends closest to the agent's heading counts.
     """
     front_before, front = _fronts(context, ego[LENGTH])[-2:]
     crossed, distance_m = light_crossing(bank, context.index, front_before, front, ground)
     last = bank.last_step[context.row]
     state = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
     state_before = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
-    red = is_red(state) & is_red(state_before)
+    at_red = is_red(state) & is_red(state_before)
     # A right turn after a stop shortly before the line is lawful unless the light is a red arrow.
-    arrow = (state == LightState.ARROW_STOP) | (state_before == LightState.ARROW_STOP)
+    is_arrow = (state == LightState.ARROW_STOP) | (state_before == LightState.ARROW_STOP)
     line = bank.light_line[context.index]
-    red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
+    at_red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~is_arrow)
     arc = line[LightRow.ARC + bank.ego_number(context.row)]
-    violation = (crossed & red & (arc < NEVER_M)).any() & on_route
+    violation = (crossed & at_red & (arc < NEVER_M)).any() & on_route
 
     # As in :class:`LightMemory`: 1 at the step of the crossing, negative if that was lawful.
-    age = jnp.where(crossed & ~on_route, jnp.where(red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
+    age = jnp.where(crossed & ~on_route, jnp.where(at_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
     # Crossings that are undecided when the log ends are decided then.
-    due = (jnp.abs(age) > _DECISION_STEPS) | ((age != 0) & (context.step >= last))
-    # Cosine of the angle to the end of the line's lane; -2 is below any cosine.
-    fit = jnp.where(due, line[LightRow.EXIT_COS] * ego[COS] + line[LightRow.EXIT_SIN] * ego[SIN], -2.0)
-    violation |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
-    age = jnp.where(due, 0, age)
+    is_due = (jnp.abs(age) > _DECISION_STEPS) | ((age != 0) & (context.step >= last))
+    # Cosine of the angle between the agent's heading and the line's lane at its end; -2 is below any cosine.
+    cosine = jnp.where(is_due, line[LightRow.EXIT_COS] * ego[COS] + line[LightRow.EXIT_SIN] * ego[SIN], -2.0)
+    violation |= ((age > 0) & is_due & (cosine >= cosine.max() - 1e-6)).any()
+    age = jnp.where(is_due, 0, age)
     pauses = _pauses(context.history[-1, MOTION_SPEED], distance_m)
     pause = jnp.where(pauses, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
     return violation, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))

@@ -1,8 +1,8 @@
 """Smooth surrogates of collision and off-road, for trajectory optimisation.
 
-A potential is positive wherever the metric of the same name holds, zero beyond a margin, and in between
-``max(0, 1 - d / margin)^2`` of a distance d that grows away from the violation. Its gradient is continuous except where
-two road edges are equally far away, or an edge is 3 m away. Optimised trajectories are still evaluated by the metrics.
+A potential is ``max(0, 1 - d / margin)^2`` of a distance d that grows away from the violation: positive wherever the
+metric of the same name holds, and zero beyond the margin. Its gradient is continuous except where two road edges are
+equally far away, or an edge is 3 m away. Optimised trajectories are still evaluated by the metrics.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def offroad_potential(
     if not 0.0 < margin_m <= _EDGES_M:
         raise UsageError(f"margin_m is {margin_m:g}", cure=f"use more than 0, at most {_EDGES_M:g}")
     points = corners(box)
-    near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
-    offroad_m = offroad_distance(bank, index, box[:2], points, near, ground)
+    points_near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
+    offroad_m = offroad_distance(bank, index, box[:2], points, points_near, ground)
     has_map = is_mapped(bank, index)
     return jnp.where(has_map, _squared_hinge(OFFROAD_TOLERANCE_M - offroad_m, margin_m).sum(), 0.0)
 

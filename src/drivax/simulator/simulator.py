@@ -91,7 +91,7 @@ class Simulator:
     def new_episode(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> EpisodeStart:
-        """Return the :meth:`context` of a new episode, and what its recent motion implies."""
+        """Return the :meth:`context` of a new episode, with the stop-line memory and strand before its first step."""
         context = self.context(bank, index, step, slot, key)
         strand = entry_strand(bank, context) if self.task.reads & PASSAGES else None
         return EpisodeStart(context, remember_lights(bank, context), strand)
@@ -129,7 +129,7 @@ class Simulator:
     ) -> SimState:  # fmt: skip
         """Return the stacked states of K agents of one scenario, at slots from :func:`slots_of`.
 
-        ``start`` must be :class:`LogStart`: a noisy start knows no other driven agents.
+        ``start`` must be :class:`LogStart`: a noisy start does not avoid the other driven agents.
         """
         contexts = jax.vmap(partial(self.context, bank, index, step))(slots, keys)
         return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)
@@ -155,15 +155,15 @@ class Simulator:
             states = jax.vmap(_clear_memory, (0, 0, None))(states, starts, done.all())
         finish = jax.vmap(lambda s, c, a: self._finish_step(bank, s, c, contexts, frame, a))
         after, transition = finish(states, contexts, actions)
-        counts = is_driven(bank, after) & ~done
+        is_active = is_driven(bank, after) & ~done
         select = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
-        after = replace(after, episode=select(counts, after.episode, states.episode))
+        after = replace(after, episode=select(is_active, after.episode, states.episode))
         if starts is not None:
             after = jax.vmap(self._start_metrics, (0, None))(after, done.all())
-        terms = {name: jnp.where(counts, term, 0.0) for name, term in transition.reward_terms.items()}
-        ends = {name: getattr(transition, name) & counts for name in ("terminated", "truncated")}
-        reward = jnp.where(counts, transition.reward, 0.0)
-        return after, replace(transition, after=after, reward=reward, reward_terms=terms, **ends)
+        terms = {name: jnp.where(is_active, term, 0.0) for name, term in transition.reward_terms.items()}
+        flags = {name: getattr(transition, name) & is_active for name in ("terminated", "truncated")}
+        reward = jnp.where(is_active, transition.reward, 0.0)
+        return after, replace(transition, after=after, reward=reward, reward_terms=terms, **flags)
 
     def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
         """Return the stacked observations of K agents of one scenario."""
@@ -194,7 +194,7 @@ class Simulator:
 
         For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
         exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
-        ``start`` (:meth:`new_episode`) is read only where ``done``, so :func:`map_where` need not compute the others.
+        ``start`` (:meth:`new_episode`) is read only where ``done``; :func:`map_where` computes it only there.
         ``frame`` is ``now(bank, state.context)``, if already computed.
         """
         frame = self.now(bank, state.context) if frame is None else frame
@@ -209,8 +209,8 @@ class Simulator:
 
     def _start_metrics(self, after: SimState, done: Bool[Array, ""]) -> SimState:
         """Clear the metrics and the crossed stop lines where the previous episode is ``done``."""
-        first = self.task.episode_start()
-        episode = jax.tree.map(partial(jnp.where, done), first, after.episode)
+        empty_episode = self.task.episode_start()
+        episode = jax.tree.map(partial(jnp.where, done), empty_episode, after.episode)
         lights = jax.tree.map(partial(jnp.where, done), forget_crossings(after.lights), after.lights)
         return replace(after, episode=episode, lights=lights)
 
@@ -264,7 +264,7 @@ class Simulator:
 def _first(driven: AgentContext) -> AgentContext:
     """Return the context of the first driven agent.
 
-    All share its frame, which is then independent of the agent: ``vmap`` over agents computes it once.
+    The frame is the same for all of them: if it depends on the first only, ``vmap`` over agents computes it once.
     """
     return jax.tree.map(lambda leaf: leaf[0], driven)
 

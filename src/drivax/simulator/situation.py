@@ -41,7 +41,7 @@ _ON_ROUTE_M = 2.0
 _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
-#: Steps in a second; distance below which a log stands still, m, for ``progress_ratio``.
+#: Steps in a second; distance below which a log stands still, m, as in ``progress_ratio``.
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that compare with the log's schedule.
 _SCHEDULE = frozenset({"late_m", "early_m", "completed"})
@@ -74,27 +74,27 @@ def measure(
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
     unlawful = lanes.leaving_lane | offroad
-    codes, fault, kind, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
+    codes, fault, collision_type, ttc = _measure_contacts(context, frame, previous, contacts, unlawful, reads)
     routed = has_route(bank, context)
-    red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
+    red_light, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
-        red, lights = check_lights(bank, context, ego, ground, on_route, lights)
-    now, logged = context.history[-1], bank.agents[context.index, context.step, context.slot]
+        red_light, lights = check_lights(bank, context, ego, ground, on_route, lights)
+    motion, log_row = context.history[-1], bank.agents[context.index, context.step, context.slot]
     acceleration, jerk, lateral = _rates(context.history)
     facts = Facts(
         collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
         at_fault=fault,
-        collision_type=kind,
+        collision_type=collision_type,
         offroad=offroad,
         offroad_m=offroad_m,
         left_map=left_map,
-        red_light=red,
+        red_light=red_light,
         ttc_s=ttc,
-        ttc_defined=now[MOTION_SPEED] >= STOPPED_MPS,
-        speed_mps=now[MOTION_SPEED],
+        ttc_defined=motion[MOTION_SPEED] >= STOPPED_MPS,
+        speed_mps=motion[MOTION_SPEED],
         limit_mps=lanes.limit,
         routed=routed,
-        logged=logged[AgentColumn.VALID] > 0,
+        logged=log_row[AgentColumn.VALID] > 0,
         ignored=contact.ignored_overlaps(codes).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
@@ -102,8 +102,8 @@ def measure(
         progress_m=context.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
-        log_divergence_m=norm(now[:2] - logged[AgentColumn.XY]),
-        goal_distance_m=norm(now[:2] - bank.goal[context.row]),
+        log_divergence_m=norm(motion[:2] - log_row[AgentColumn.XY]),
+        goal_distance_m=norm(motion[:2] - bank.goal[context.row]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
@@ -115,7 +115,7 @@ def measure(
 def entry_strand(bank: ScenarioBank, context: AgentContext) -> Integer:
     """Return the strand from which an episode's first lane passage starts.
 
-    An agent that changes lanes at the start comes from its pose 15 steps ago.
+    It is that of the pose 15 steps ago, so that a lane change under way at the start counts.
     """
     x, y, psi = context.history[-_ENTRY_STEPS, : MOTION_HEADING + 1]
     xy, heading = jnp.stack([x, y]), jnp.stack([jnp.cos(psi), jnp.sin(psi)])
@@ -162,9 +162,9 @@ def _measure_contacts(
 
     Values that ``reads`` does not need are zero; if it needs no contacts, the codes stay unchanged.
     """
-    fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
+    fault, collision_type, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
-        return contacts, fault.any(), kind, ttc
+        return contacts, fault.any(), collision_type, ttc
     if "ttc_s" in reads and kernels.in_use():
         reference = partial(_measure_contacts, reads=reads)
         native = kernels.with_reference(_measure_contacts_natively, reference)
@@ -173,28 +173,29 @@ def _measure_contacts(
     if reads & _FAULTS:
         begins = contact.first_contacts(contacts, touching)
         speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
-        others_speed = jnp.where(previous.valid, _speeds(previous), 0.0)
-        others_speed = jnp.maximum(_speeds(frame), others_speed)
-        fault, kind = contact.classify_contacts(frame, context.slot, begins, speed, others_speed, unlawful)
+        others_speed = jnp.maximum(_speeds(frame), jnp.where(previous.valid, _speeds(previous), 0.0))
+        fault, collision_type = contact.classify_contacts(
+            frame, context.slot, begins, speed, others_speed, unlawful
+        )
     codes = contact.next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
         ignored = contact.ignored_overlaps(codes) | (codes == Contact.HIT)
         ttc = contact.time_to_collision(frame, context.slot, ignored)
-    return codes, fault.any(), kind, ttc
+    return codes, fault.any(), collision_type, ttc
 
 
 def _measure_contacts_natively(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
-    """Return the values of :func:`_measure_contacts`, with all of them read."""
+    """Return the result of :func:`_measure_contacts` for all ``reads``, computed by the native kernel."""
     speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
     agents = Agents(frame.box, frame.velocity, frame.z, frame.valid, frame.kind)
-    before = (previous.velocity, previous.valid)
-    return measure_contacts(agents, before, context.slot, speed, unlawful, contacts, contact.RULES)
+    previous_agents = (previous.velocity, previous.valid)
+    return measure_contacts(agents, previous_agents, context.slot, speed, unlawful, contacts, contact.RULES)
 
 
 def _speeds(frame: Frame) -> Float[Array, " S"]:
-    """Return the speed of every slot, by coordinate: XLA sums slowly over an axis of two."""
+    """Return the speed of every slot, summing by coordinate: XLA sums slowly over an axis of two."""
     return root(frame.velocity[:, 0] ** 2 + frame.velocity[:, 1] ** 2)
 
 
@@ -231,13 +232,13 @@ def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, stra
 def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
     """Return the facts that compare the progress on the route with that of the log."""
     log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
-    step = jnp.minimum(context.step + _SECOND, last)
+    later_step = jnp.minimum(context.step + _SECOND, last)
     velocity = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]
     # After its end the log continues at its last speed.
-    later_m = log_m[step] + norm(velocity) * (context.step + _SECOND - step) * DT_S
+    later_m = log_m[later_step] + norm(velocity) * (context.step + _SECOND - later_step) * DT_S
     log_gain, gain = log_m[last] - log_m[CURRENT_STEP], context.route_m - log_m[CURRENT_STEP]
-    moves = log_gain >= _STANDS_M
-    completed = jnp.where(moves, jnp.clip(gain / jnp.where(moves, log_gain, 1.0), 0.0, 1.0), 1.0)
+    log_moves = log_gain >= _STANDS_M
+    completed = jnp.where(log_moves, jnp.clip(gain / jnp.where(log_moves, log_gain, 1.0), 0.0, 1.0), 1.0)
     late_m, early_m = log_m[context.step] - context.route_m, context.route_m - later_m
     return {"late_m": late_m, "early_m": early_m, "completed": completed}
 
@@ -271,6 +272,6 @@ def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
     speed, heading = history[:, MOTION_SPEED], history[:, MOTION_HEADING]
     n, span_s = _RATE_STEPS, _RATE_STEPS * DT_S
     acceleration = (speed[-1] - speed[-1 - n]) / span_s
-    previous = (speed[-1 - n] - speed[-1 - 2 * n]) / span_s
+    previous_acceleration = (speed[-1 - n] - speed[-1 - 2 * n]) / span_s
     yaw_rate = wrap(heading[-1] - heading[-1 - n]) / span_s
-    return acceleration, (acceleration - previous) / span_s, yaw_rate * speed[-1]
+    return acceleration, (acceleration - previous_acceleration) / span_s, yaw_rate * speed[-1]

@@ -101,35 +101,35 @@ class NoisyStart:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
         # Only steps at which the log has the agent are replaced.
         back = jnp.arange(1, self.steps + 1)
-        in_log = bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0
-        in_log &= back <= step
-        count = jnp.cumprod(in_log.astype(jnp.int32)).sum()
-        base = logged_history(bank, index, step - count, slot)
+        is_logged = bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0
+        is_logged &= back <= step
+        count = jnp.cumprod(is_logged.astype(jnp.int32)).sum()
+        base_history = logged_history(bank, index, step - count, slot)
 
         def draw_history(key: Array) -> tuple[History, Bool[Array, ""]]:
             """Draw a history, and return whether it is acceptable."""
-            history = self._unroll(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
+            history = self._unroll(base_history, count, *self.draw(key, base_history[-1, MOTION_SPEED]))
             return history, _is_acceptable(bank, index, step, slot, agents, history)
 
-        histories, acceptable = jax.vmap(draw_history)(jax.random.split(key, self.tries))
+        histories, is_acceptable = jax.vmap(draw_history)(jax.random.split(key, self.tries))
         log_history, log_route_m = LogStart().begin(bank, index, step, slot)
-        history = jnp.where(acceptable.any(), histories[jnp.argmax(acceptable)], log_history)
+        history = jnp.where(is_acceptable.any(), histories[jnp.argmax(is_acceptable)], log_history)
         row = bank.row_of(index, slot)
         base_m = bank.log_progress[row, step - count]
         along_m = project_on_route(bank, row, history[-1, :2], base_m).along_m
-        return history, jnp.where(acceptable.any(), jnp.maximum(along_m, base_m), log_route_m)
+        return history, jnp.where(is_acceptable.any(), jnp.maximum(along_m, base_m), log_route_m)
 
     def draw(self, key: Array, speed: Scalar) -> tuple[Scalar, Scalar]:
         """Draw an acceleration (m/s2) and a curvature (1/m) for a speed."""
         keys = jax.random.split(key, 4)
-        strong = jax.random.bernoulli(keys[0], self.strong)
+        is_strong = jax.random.bernoulli(keys[0], self.strong)
         side = jnp.where(jax.random.bernoulli(keys[1]), 1.0, -1.0)
-        low = jnp.where(strong, _STRONG_ACCELERATION[0], 0.0)
-        share = jax.random.uniform(keys[2], minval=low, maxval=_STRONG_ACCELERATION[1])
-        low = jnp.where(strong, _STRONG_CURVATURE[0], 0.0)
-        turn = side * jax.random.uniform(keys[3], minval=low, maxval=_STRONG_CURVATURE[1])
+        low = jnp.where(is_strong, _STRONG_ACCELERATION[0], 0.0)
+        acceleration = jax.random.uniform(keys[2], minval=low, maxval=_STRONG_ACCELERATION[1])
+        low = jnp.where(is_strong, _STRONG_CURVATURE[0], 0.0)
+        curvature = side * jax.random.uniform(keys[3], minval=low, maxval=_STRONG_CURVATURE[1])
         bound = _BOUND[0] + (_BOUND[1] - _BOUND[0]) * jnp.minimum(speed / _BOUND_MPS, 1.0)
-        return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
+        return self.scale * _ACCELERATION * acceleration, self.scale * _CURVATURE * bound * curvature
 
     def _unroll(self, history: History, count: Integer, acceleration: Scalar, curvature: Scalar) -> History:
         """Return the history after ``count`` steps of one action."""

@@ -89,7 +89,7 @@ class Frame:
 class Facts:
     """Scalar measurements of an agent at one step, kept in the state. Names carry units; the semantics define them.
 
-    Facts outside ``Task.reads`` are None and not computed, except that ``lane_changed`` and ``merged`` need ``strand``.
+    Facts outside ``Task.reads`` are None and not computed, except ``strand`` if ``lane_changed`` or ``merged`` is read.
     ``ttc_defined`` is false at standstill; ``limit_mps`` is -1 if unknown; ``routed``: the agent has a route on lanes,
     without which facts of progress, route and goal are undefined; ``logged``: the log has the agent at this step;
     ``ignored`` counts ignored overlaps.
@@ -206,7 +206,7 @@ class SimState:
 
 @record
 class Transition:
-    """One step; ``after`` is the resulting state, a reset one only where a collector begins the next episode.
+    """One step; where a collector begins the next episode, ``after`` is the state after the reset.
 
     Attributes:
         before, after: States before and after the step.

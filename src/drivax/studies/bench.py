@@ -94,7 +94,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     parts = _parts(simulator)
     times_us = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
     no_grid = without_grid(bank)
-    brute_force = sum(_time_part(config, parts[name], no_grid, states) for name in ("edges", "lanes"))
+    brute_force_us = sum(_time_part(config, parts[name], no_grid, states) for name in ("edges", "lanes"))
     return {
         "environment_steps_per_second": round(steps_per_second([program], config.repeats)[0]),
         "batch": config.batch,
@@ -104,7 +104,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
         "state_bytes": program.state_bytes,
         "bank_bytes_per_scenario": bank.nbytes // len(bank),
         "compile_seconds": round(program.compile_seconds, 2),
-        "brute_force_ratio": round(brute_force / (times_us["edges"] + times_us["lanes"]), 2),
+        "brute_force_ratio": round(brute_force_us / (times_us["edges"] + times_us["lanes"]), 2),
         "by_part": {name: round(value, 3) for name, value in times_us.items()},
         "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
         "kernels": kernels.state(),
@@ -205,7 +205,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
-    """Return the simulator, and the bank on every device."""
+    """Return the simulator, and the bank with its traffic data on every device."""
     if config.batch % jax.device_count():
         raise UsageError(
             f"batch size {config.batch} is not a multiple of the {jax.device_count()} devices",
@@ -251,7 +251,7 @@ def _jit_sharded(function: Callable[..., Any]) -> Any:
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
-    """Step the share of a device. Return all results, so that the compiler removes none, and the number of steps."""
+    """Step one device's environments; return all results, so that the compiler keeps them, and the number of steps."""
     key, batch = keys[0], carry[1].shape[0]
     step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 

@@ -99,12 +99,12 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
     for name, encoder in (ENCODERS | VARIANTS).items():
         if config.only and name not in config.only:
             continue
-        dtypes = {"float32": encoder}
+        encoders = {"float32": encoder}
         if name in ENCODERS and not isinstance(encoder, MlpConfig):
-            dtypes["bfloat16"] = replace(encoder, dtype="bfloat16")
-        for dtype, network in dtypes.items():
-            row = {"encoder": name, "dtype": dtype} | encoder_sizes(network, spec)
-            rows.append(row | (_times(network, spec, config) if times else {}))
+            encoders["bfloat16"] = replace(encoder, dtype="bfloat16")
+        for dtype, encoder_config in encoders.items():
+            row = {"encoder": name, "dtype": dtype} | encoder_sizes(encoder_config, spec)
+            rows.append(row | (_times(encoder_config, spec, config) if times else {}))
     return {
         "observation": {group: list(shape) for group, shape in spec.items()},
         "device": jax.devices()[0].device_kind,

@@ -149,8 +149,8 @@ class StudyDefinition:
             for name in names:
                 if name not in available:
                     raise ValueError(f"unknown {kind} {name!r}; {did_you_mean(name, list(available))}")
-        if shared := [name for name in self.planners if name in self.arms]:
-            raise ValueError(f"{shared[0]!r} is a planner and an arm; rename the arm")
+        if shared_names := [name for name in self.planners if name in self.arms]:
+            raise ValueError(f"{shared_names[0]!r} is a planner and an arm; rename the arm")
         for claim in self.claims:
             claim_choices = (
                 (claim.arm, self.arms), (claim.reference, self.arms), (claim.group, self.groups),
@@ -209,13 +209,13 @@ class StudyConfig:
     rare: float = 0.2
 
     def __post_init__(self) -> None:
-        for name, least in (("seeds", 2), ("validations", 4)):
-            if getattr(self, name) < least:
-                raise UsageError(f"{name} is {getattr(self, name)}", cure=f"use {least} or more")
+        for name, minimum in (("seeds", 2), ("validations", 4)):
+            if getattr(self, name) < minimum:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure=f"use {minimum} or more")
         if not 0 < self.rare < 1:
             raise UsageError(f"rare is {self.rare}", cure="use a number between 0 and 1")
-        if repeated := [name for row, name in enumerate(self.arms) if name in self.arms[:row]]:
-            raise UsageError(f"arm {repeated[0]!r} is named twice", cure="name each arm once")
+        if duplicates := [name for row, name in enumerate(self.arms) if name in self.arms[:row]]:
+            raise UsageError(f"arm {duplicates[0]!r} is named twice", cure="name each arm once")
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class _Stages:
         self._starts_s: dict[str, float] = {}
 
     def start(self, name: str, line: str) -> None:
-        """End the stage before, and log the line of this one."""
+        """Start a stage, which ends the one before, and log its line."""
         self._starts_s[name] = time.monotonic()
         self._log(f"{len(self._starts_s)}/4  {line}")
 

@@ -73,16 +73,16 @@ def _lead(definition: StudyDefinition, results: Results) -> str:
     """Return the first paragraph: counts of verdicts, sizes, and a warning if a baseline is not good enough."""
     verdicts = [claim["verdict"] for claim in results["claims"]]
     counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _VERDICT_TEXTS)
-    about, caution = results["about"], ""
+    about, warning = results["about"], ""
     if not all(arm["met"] for arm in results["conditions"] if arm["arm"] in definition.baselines):
-        caution = (
+        warning = (
             "<p><b>The conditions of the comparison are not met</b>: read its verdicts as those of arms that do not "
             "drive well.</p>"
         )
     return (
         f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['draws'])} arms, {about['seeds']} seeds, "
         f"{about['train']:,} training and {about['test']:,} test scenarios ({about['rare']:,} of them rare, "
-        f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{caution}"
+        f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{warning}"
     )
 
 
@@ -160,7 +160,7 @@ def _rate(rate: Mapping[str, float]) -> str:
 
 
 def draws_table(results: Results) -> Table:
-    """Return the distribution of the sampling weights of every arm (permuted ones: of seed 0)."""
+    """Return the distribution of the sampling weights of every arm (permuted arms: with seed 0)."""
     names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
     headings = ("arm", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
     rows = [(arm, *(f"{draws[name]:.2f}" for name in names)) for arm, draws in results["draws"].items()]
@@ -215,12 +215,12 @@ def validations_table(results: Results, rule: str) -> Table:
 
 def _conditions(definition: StudyDefinition, results: Results) -> str:
     baselines = escape(" and ".join(definition.baselines))
-    smallest = ", ".join(f"{_label(name)} {value:.3f}" for name, value in results["detectable"].items())
+    differences = ", ".join(f"{_label(name)} {value:.3f}" for name, value in results["detectable"].items())
     return conditions_table(results).html() + (
         "<p>Progress is relative to the expert's, at the best checkpoint. The change of the score is from the third to "
         "the last quarter of the validations. Smallest differences in ordinary traffic that this study detects with a "
         "power of 80 %, at the strictest level of the first group of claims, if all seeds vary like the baseline's: "
-        f"{escape(smallest)}. {baselines} had to be good enough before the other arms were trained, unless --anyway "
+        f"{escape(differences)}. {baselines} had to be good enough before the other arms were trained, unless --anyway "
         "was passed.</p>"
     )
 

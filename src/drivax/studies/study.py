@@ -117,11 +117,11 @@ def run_study(
     jobs = [Job(study, arm, seed, usable, edited) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
     strata = _strata(study, test)
-    smallest = _check_baselines(study, strata, anyway, log)
+    differences = _check_baselines(study, strata, anyway, log)
     _train_and_evaluate(jobs, cores, log)
     results = _results(study, test, strata, tables, usable) | {
         "conditions": [asdict(check) for check in _validation_checks(study, config.arms)],
-        "detectable": smallest,
+        "detectable": differences,
         "edited": edited_files(),
     }
     write_json(study.results, results)
@@ -137,17 +137,17 @@ def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> di
     first_group = next(iter(definition.groups), None)
     claim_count = sum(claim.group == first_group for claim in study.claims)
     first, second = (_episodes(study, name) for name in definition.baselines[:2])
-    smallest = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
+    differences = detectable_differences(first, second, strata, definition.metrics, max(claim_count, 1))
     for check in checks:
         log(str(check))
-    log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in smallest.items()))
+    log("smallest detectable difference: " + ", ".join(f"{name} {x:.3f}" for name, x in differences.items()))
     if not all(check.met for check in checks) and not anyway:
         raise UsageError(
             "a baseline does not drive well enough for a comparison",
             file=study.folder,
             cure="train longer or with other settings in another --out, or pass --anyway",
         )
-    return smallest
+    return differences
 
 
 def _write_pages(
@@ -155,7 +155,7 @@ def _write_pages(
 ) -> None:
     """Write the report, and the player of the most critical scenarios by :data:`PLAYER_METHODS`, if any scored them.
 
-    A scenario of several methods has the scores of the last.
+    A scenario that several methods select has the scores of the last of them.
     """
     expert = score_steps(data, ExpertActions())
     actions = expert["action"][expert["known"]]
@@ -333,7 +333,7 @@ def _train_and_evaluate_arm(job: Job) -> float:
     steps = Checkpoints(inside(run, "checkpoints")).steps()
     _check_not_evaluated(job, steps)
     validation = ScenarioSet.open(study.sets.validation)
-    # Of a finished training, this only deletes what an interruption left.
+    # If training is finished, this only deletes what an interruption left.
     train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])

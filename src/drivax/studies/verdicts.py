@@ -131,7 +131,7 @@ class ClaimResult:
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
-        needed: Number of seeds or recordings that would decide an undecided claim, if the estimated effect is true.
+        needed: What would decide an undecided claim if the estimated effect is true, or why it cannot be tested.
     """
 
     claim: Claim
@@ -200,8 +200,8 @@ def _decide(result: ClaimResult, tests: int) -> ClaimResult:
     if result.adjusted_p >= _LEVEL:
         return replace(result, needed=describe_sample_size(result.effect, tests))
     lower_is_better = METRICS[result.claim.metric].better == "low"
-    better = (result.effect.difference < 0) == lower_is_better
-    return replace(result, verdict="supported" if better else "contradicted")
+    is_better = (result.effect.difference < 0) == lower_is_better
+    return replace(result, verdict="supported" if is_better else "contradicted")
 
 
 def describe_sample_size(effect: CrossedEffect, claims: int) -> str:
@@ -217,7 +217,7 @@ def describe_sample_size(effect: CrossedEffect, claims: int) -> str:
 
 
 def confidence_level(claims: int) -> float:
-    """Return the confidence of Holm's first and strictest test among a number of claims."""
+    """Return the confidence level of Holm's first and strictest test among a number of claims."""
     return 1.0 - _LEVEL / claims
 
 
@@ -229,14 +229,14 @@ def detectable_differences(
     Assumes that the seeds of every arm vary like those of the ``first`` baseline, and that arms differ by scenario like
     the two baselines. ``claims`` claims are adjusted together. Metrics that are undefined in the test are skipped.
     """
-    weights, smallest = strata.weights("ordinary"), {}
+    weights, differences = strata.weights("ordinary"), {}
     for name in metrics:
         if strata.is_comparable(np.concatenate([first[name], second[name]]), weights):
             effect = crossed_difference(first[name], second[name], strata.recordings, weights)
             (seeds, _), (interaction, _) = effect.seeds, effect.interaction
             equal_arms = replace(effect, seeds=(seeds, seeds), interaction=(interaction, interaction))
-            smallest[name] = equal_arms.detectable(confidence=confidence_level(claims))
-    return smallest
+            differences[name] = equal_arms.detectable(confidence=confidence_level(claims))
+    return differences
 
 
 def rates(
@@ -255,9 +255,9 @@ def rates(
     return means
 
 
-def _rate(values: Values, strata: Strata, weights: Weights, share: bool) -> dict[str, float | int | None]:
-    """Return mean and interval; ``share`` keeps the interval in [0, 1]."""
-    interval = seeds_interval(values, strata.recordings, weights, share=share).as_dict()
+def _rate(values: Values, strata: Strata, weights: Weights, is_share: bool) -> dict[str, float | int | None]:
+    """Return mean and interval; ``is_share`` keeps the interval in [0, 1]."""
+    interval = seeds_interval(values, strata.recordings, weights, share=is_share).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in interval.items()}
 
 

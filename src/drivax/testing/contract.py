@@ -93,7 +93,7 @@ def result_shapes(what: str, function: Callable[..., Any], *arguments: Any) -> A
 
 
 class Program:
-    """A compiled batch of a function, with ``in_axes`` of ``jax.vmap``; messages call the function ``what``."""
+    """A compiled and batched function, called ``what`` in messages; ``in_axes`` as in ``jax.vmap``."""
 
     def __init__(
         self, what: str, function: Callable[..., Any], in_axes: tuple[int | None, ...] = (0,)
@@ -109,20 +109,20 @@ class Program:
     def check_pure(self, *arguments: Any) -> Any:
         """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
-        repeated = program(what, self._batched)(*arguments)
+        repeated_results = program(what, self._batched)(*arguments)
         cure = "use no random numbers but those of a fixed key, and keep no state between calls"
-        expect(same(results, repeated, 0.0), f"{what} is not deterministic", cure)
+        expect(same(results, repeated_results, 0.0), f"{what} is not deterministic", cure)
         first_row = [
             argument if axis is None else jax.tree.map(lambda leaf: leaf[0], argument)
             for argument, axis in zip(arguments, self.in_axes, strict=True)
         ]
         first_result = jax.tree.map(lambda leaf: leaf[0], results)
-        single = program(what, self.function)(*first_row)
+        single_result = program(what, self.function)(*first_row)
         cure = "write it for one agent in one scenario; vmap adds the batch"
-        expect(same(first_result, single, TOLERANCE), f"{what} differs in a batch", cure)
-        eager = jax.device_get(self.function(*first_row))
+        expect(same(first_result, single_result, TOLERANCE), f"{what} differs in a batch", cure)
+        eager_result = jax.device_get(self.function(*first_row))
         cure = "let the result depend on the arguments only"
-        expect(same(first_result, eager, TOLERANCE), f"{what} differs when compiled", cure)
+        expect(same(first_result, eager_result, TOLERANCE), f"{what} differs when compiled", cure)
         return results
 
 

@@ -96,8 +96,8 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
         "keep nnx.Param only: no dropout, no running means",
     )
     rebuilt = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
-    repeated = same(jax.device_get(parameters), jax.device_get(rebuilt), 0.0)
-    expect(repeated, f"{what} has other initial parameters every time", "draw them from rngs")
+    is_repeatable = same(jax.device_get(parameters), jax.device_get(rebuilt), 0.0)
+    expect(is_repeatable, f"{what} has other initial parameters every time", "draw them from rngs")
 
 
 def _check_batches(
@@ -121,9 +121,9 @@ def _check_masks(what: str, run: Any, batch: Any, embedding: Any, tolerance: flo
         for name, rows in batch.items()
         if f"{name}_mask" in batch
     }
-    unchanged = same(embedding, run(batch | garbage), tolerance)
+    is_unchanged = same(embedding, run(batch | garbage), tolerance)
     cure = "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias"
-    expect(unchanged, f"{what} changes with masked rows", cure)
+    expect(is_unchanged, f"{what} changes with masked rows", cure)
     check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
 
 
@@ -140,8 +140,8 @@ def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
     run = program(what, jax.grad(loss))
     for groups in (batch, _without_rows(batch)):
         gradient = run(parameters, groups)
-        finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-        expect(finite, f"{what} has non-finite gradients", "guard roots and divisions on their input")
+        is_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        expect(is_finite, f"{what} has non-finite gradients", "guard roots and divisions on their input")
 
 
 def _check_effects(what: str, run: Any, batch: Any, embedding: Any, others: Any) -> None:
@@ -149,8 +149,8 @@ def _check_effects(what: str, run: Any, batch: Any, embedding: Any, others: Any)
     for name, rows in batch.items():
         if rows.size and not name.endswith("_mask"):
             mask = batch.get(f"{name}_mask", jnp.ones(rows.shape[:-1], bool))
-            changed = run(batch | {name: jnp.where(mask[..., None], others[name], rows)})
-            expect(not same(embedding, changed, 0.0), f"{what} ignores the group {name!r}", "read all groups")
+            result = run(batch | {name: jnp.where(mask[..., None], others[name], rows)})
+            expect(not same(embedding, result, 0.0), f"{what} ignores the group {name!r}", "read all groups")
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:
@@ -182,16 +182,16 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     valid = isinstance(first, LearnerState)
     expect(valid, f"{what} has a state without parameters or iteration", "add these fields")
     _check_state_layout(what, learner, data, first)
-    stored = jax.tree.map(jnp.copy, first)  # survives the donation of the state
+    stored_state = jax.tree.map(jnp.copy, first)  # survives the donation of the state
     second, logs = iterate(data, first)
-    before, after = int(stored.iteration), int(second.iteration)
+    before, after = int(stored_state.iteration), int(second.iteration)
     expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
-    unchanged = same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0)
+    is_unchanged = same(jax.device_get(second.parameters), jax.device_get(stored_state.parameters), 0.0)
     cure = "return the new parameters, and set any warm-up to 0 for the check"
-    expect(not unchanged, f"{what} learns nothing in an iteration", cure)
+    expect(not is_unchanged, f"{what} learns nothing in an iteration", cure)
     _check_logs(what, logs)
-    repeated, _ = iterate(data, jax.tree.map(jnp.copy, stored))
-    valid = same(_host_arrays(repeated), _host_arrays(second), 0.0)
+    repeated_state, _ = iterate(data, jax.tree.map(jnp.copy, stored_state))
+    valid = same(_host_arrays(repeated_state), _host_arrays(second), 0.0)
     cure = "keep keys and all other inputs of an iteration in the state"
     expect(valid, f"{what} does not repeat an iteration bit for bit", cure)
     third, logs = iterate(data, second)

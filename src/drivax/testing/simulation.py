@@ -78,16 +78,16 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     actions = run(bank, index, step)
     check_numbers(what, actions)
     check_numbers(what, run(worlds.without_others(bank), index, step))
-    single = program(what, act)(bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
+    result = program(what, act)(bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
     cure = "write it for one agent in one scenario, take randomness from the key, and keep no state between calls"
-    expect(same(actions[0], single, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure)
+    expect(same(actions[0], result, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure)
     check_variants(what, actions, worlds.BANK_VARIANTS, lambda change: run(change(bank), index, step))
     check_rotated(what, actions, run(worlds.worlds(ANGLE), index, step))
     if not privileged:
-        start, changed = np.full_like(step, _CHANGE_START), worlds.change_future(bank, _CHANGE_START + 1)
+        start, changed_bank = np.full_like(step, _CHANGE_START), worlds.change_future(bank, _CHANGE_START + 1)
         cure = "read nothing later than context.step, or pass privileged=True"
         cause = "the log's future changes"
-        check_same(what, run(bank, index, start), run(changed, index, start), cause, cure)
+        check_same(what, run(bank, index, start), run(changed_bank, index, start), cause, cure)
 
 
 def _two_actions(simulator: Simulator, planner: Planner) -> Callable[..., Array]:

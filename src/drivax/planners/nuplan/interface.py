@@ -278,7 +278,7 @@ class EgoState(DevkitObject):
 
 @dataclass(frozen=True)
 class TrackedObject(DevkitObject):
-    """Another road user or object, with its velocity in the source's frame; also its own ``metadata``."""
+    """Another road user or object, with its velocity in the source's frame. ``metadata`` is the object itself."""
 
     tracked_object_type: TrackedObjectType
     box: OrientedBox
@@ -343,7 +343,7 @@ class TrackedObjects(DevkitObject):
 
 @dataclass(frozen=True)
 class DetectionsTracks(DevkitObject):
-    """The observation."""
+    """Observation of a planner: the tracked objects."""
 
     tracked_objects: TrackedObjects
 
@@ -363,7 +363,7 @@ class TrafficLightStatusData(DevkitObject):
 
 @dataclass(frozen=True)
 class SimulationIteration(DevkitObject):
-    """Number of the simulated step, from 0, and its time."""
+    """Index of the simulated step, from 0, and its time."""
 
     time_point: TimePoint
     index: int

@@ -90,7 +90,7 @@ class Polyline(DevkitObject):
 
 
 class _Edge(DevkitObject):
-    """What the devkit calls an edge of the graph: a lane, a connector or a roadblock."""
+    """An edge of the devkit's lane graph: a lane, a connector or a roadblock."""
 
     _interface = ""
 
@@ -306,7 +306,7 @@ class MapApi(DevkitObject):
         return [layer for layer in SemanticMapLayer if self._objects(layer)]
 
     def get_all_map_objects(self, point: Any, layer: Any) -> list[Any]:
-        """Return the objects of a layer that contain a point, the one whose border is farthest from it first."""
+        """Return the objects of a layer that contain a point, those with the most distant border first."""
         distances = [(item.distance_m(point), item) for item in self._objects(layer)]
         inside = [pair for pair in distances if pair[0] <= 0.0]
         return [item for _, item in sorted(inside, key=lambda pair: pair[0])]
@@ -346,7 +346,7 @@ class MapApi(DevkitObject):
         return object_id, distance_m
 
     def __getattr__(self, name: str) -> Any:
-        """Refuse what the devkit's maps have and this map lacks, with the nearest name."""
+        """Raise NotImplementedError for what this map lacks of the devkit's, with the most similar name."""
         if name.startswith("_") or name in ("lanes", "blocks", "block_of", "scenario"):
             raise AttributeError(name)
         methods = [method for method in dir(MapApi) if method.startswith(("get_", "is_"))]
@@ -386,12 +386,12 @@ def _xy(point: Any) -> Float[np.ndarray, "1 2"]:
 
 
 def lane_count(scenario: Scenario) -> int:
-    """Number of lanes of the lane graph."""
+    """Return the number of lanes of the lane graph."""
     return int((scenario.lane_length > 0).sum())
 
 
 def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:
-    """Centre line of every lane of the lane graph in the local frame.
+    """Return the centre line of every lane of the lane graph in the local frame, m.
 
     Bike lanes, and lanes of which no segment is stored, have no points.
     """
@@ -406,9 +406,9 @@ def lane_lines(scenario: Scenario) -> list[Float[np.ndarray, "point 2"]]:
 
 
 def roadblocks(scenario: Scenario) -> list[int]:
-    """Roadblock of every lane, by the number of its first lane.
+    """Return the roadblock of every lane, given as the index of the roadblock's first lane.
 
-    Parallel lanes share a roadblock, and so do connectors between the same two blocks, by their first links.
+    Neighbours share a roadblock; so do connectors whose first predecessors share one and whose first successors do.
     """
     count = lane_count(scenario)
     blocks = list(range(count))

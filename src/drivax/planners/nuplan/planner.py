@@ -1,4 +1,4 @@
-"""Drive by a planner with nuPlan's interface (``AbstractPlanner``), called outside the compiled program.
+"""Run planners with nuPlan's interface (``AbstractPlanner``) outside the compiled program.
 
 Each episode gets its own instance. The controller of the action space ``trajectory`` tracks the planned poses.
 """
@@ -37,12 +37,12 @@ _STILL_MPS = 0.5
 _STILL_M = 0.02
 #: Tolerance for a plan that starts after the present time, s.
 _LATE_S = 1e-3
-_PLANS = "compute_planner_trajectory"
+_PLAN_METHOD = "compute_planner_trajectory"
 
 
 def is_nuplan(candidate: Any) -> bool:
     """Return whether a class or object has nuPlan's interface of planners."""
-    return callable(getattr(candidate, _PLANS, None))
+    return callable(getattr(candidate, _PLAN_METHOD, None))
 
 
 @record
@@ -120,13 +120,13 @@ class Host:
         try:
             planner = self._make()
             self.name = str(planner.name())
-            observed = getattr(planner, "observation_type", lambda: None)()
+            observation_type = getattr(planner, "observation_type", lambda: None)()
         except Exception as error:
             raise UsageError(f"planner {name!r}: {error_text(error)}", cure="fix the planner") from error
-        observation = getattr(observed, "__name__", "")
-        if observation not in ("", "DetectionsTracks"):
+        observation_name = getattr(observation_type, "__name__", "")
+        if observation_name not in ("", "DetectionsTracks"):
             cure = "only DetectionsTracks are known"
-            raise UsageError(f"planner {name!r} observes {observation}", cure=cure)
+            raise UsageError(f"planner {name!r} observes {observation_name}", cure=cure)
         self.scenario_of: Callable[[int], Scenario] | None = None
         self._episodes: dict[int, _Episode] = {}
         self._failures: dict[int, PlannerError] = {}
@@ -165,7 +165,7 @@ class Host:
     def _start_episode(self, identity: int, step: int, history: Any) -> _Episode:
         """Make and initialise an instance with the logged history.
 
-        Episodes of a batch advance together, so those of later steps are over and forgotten.
+        Episodes of a batch advance together, so those at later steps are over: forget them.
         """
         if self.scenario_of is None:
             raise UsageError(
@@ -193,7 +193,7 @@ class Host:
         iteration = nuplan.SimulationIteration(nuplan.TimePoint.of_step(step), step - start)
         buffer = nuplan.SimulationHistoryBuffer(list(episode.egos), list(episode.observations))
         planner_input = nuplan.PlannerInput(iteration, buffer, view.lights(step, frame.lights))
-        return view.poses(_call(getattr(episode.planner, _PLANS), planner_input), step, steps)
+        return view.poses(_call(getattr(episode.planner, _PLAN_METHOD), planner_input), step, steps)
 
 
 class View:
@@ -330,23 +330,23 @@ class View:
         states = _call(_read_states, trajectory)
         if len(states) < 2:
             raise PlannerError(f"a trajectory of {len(states)} states; return two or more")
-        time, x, y, heading = np.array(states).T
+        times, x, y, heading = np.array(states).T
         now = nuplan.TimePoint.of_step(step).time_s
-        if time[0] > now + _LATE_S or time[-1] <= now:
+        if times[0] > now + _LATE_S or times[-1] <= now:
             raise PlannerError(
-                f"the trajectory from {time[0]:g} to {time[-1]:g} s does not go on from now, {now:g} s"
+                f"the trajectory from {times[0]:g} to {times[-1]:g} s does not go on from now, {now:g} s"
             )
-        if (np.diff(time) <= 0).any():
+        if (np.diff(times) <= 0).any():
             raise PlannerError("the times of the trajectory do not increase")
-        times, heading = now + np.arange(steps + 1) * DT_S, np.unwrap(heading)
-        x, y, heading = (_interpolate(times, time, values) for values in (x, y, heading))
+        new_times, heading = now + np.arange(steps + 1) * DT_S, np.unwrap(heading)
+        x, y, heading = (_interpolate(new_times, times, values) for values in (x, y, heading))
         ahead = self.vehicle.rear_axle_to_center
         centre = np.stack([x + ahead * np.cos(heading), y + ahead * np.sin(heading)], axis=-1) - self.origin
         return np.column_stack([centre, wrap(heading)]).astype(np.float32)
 
 
 def _call(function: Callable[[Any], Any], argument: Any) -> Any:
-    """Call a planner, and turn its errors into one line with their location in its code."""
+    """Call a planner; raise its errors as :class:`PlannerError`, one line with the location in its code."""
     try:
         return function(argument)
     except Exception as error:
@@ -361,20 +361,20 @@ def _read_states(trajectory: Any) -> list[tuple[float, float, float, float]]:
     return [(time_s, float(pose.x), float(pose.y), float(pose.heading)) for time_s, pose in poses]
 
 
-def _axle_speed(last: Any, now: Any) -> float:
+def _axle_speed(before: Any, now: Any) -> float:
     """Return the speed of the rear axle after a step: the component of the centre's speed along the heading."""
-    dx, dy = now[:2] - last[:2]
+    dx, dy = now[:2] - before[:2]
     if math.hypot(dx, dy) < _STILL_M:
         return float(now[MOTION_SPEED])
     # The centre moves along the mean heading of the step plus the slip angle.
-    slip = math.atan2(dy, dx) - last[2] - float(wrap(now[2] - last[2])) / 2
+    slip = math.atan2(dy, dx) - before[2] - float(wrap(now[2] - before[2])) / 2
     return float(now[MOTION_SPEED]) * math.cos(slip)
 
 
-def _interpolate(at: Any, time: Any, values: Any) -> Any:
+def _interpolate(new_times: Any, times: Any, values: Any) -> Any:
     """Interpolate linearly; after the last time, extrapolate with the last slope."""
-    slope = (values[-1] - values[-2]) / (time[-1] - time[-2])
-    return np.interp(at, time, values) + np.maximum(at - time[-1], 0.0) * slope
+    slope = (values[-1] - values[-2]) / (times[-1] - times[-2])
+    return np.interp(new_times, times, values) + np.maximum(new_times - times[-1], 0.0) * slope
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -78,7 +78,7 @@ class Point2D(DevkitObject):
 
     @property
     def array(self) -> np.ndarray[Any, Any]:
-        """Both numbers."""
+        """Coordinates x and y as an array."""
         return np.array([self.x, self.y])
 
     def __iter__(self) -> Iterator[float]:
@@ -122,7 +122,7 @@ class StateSE2(Point2D):
 
     @staticmethod
     def from_matrix(matrix: Any) -> StateSE2:
-        """Return the pose of a matrix of :meth:`as_matrix`."""
+        """Return the pose whose :meth:`as_matrix` is ``matrix``."""
         x, y = matrix[:2, 2].tolist()
         return StateSE2(x, y, math.atan2(matrix[1, 0], matrix[0, 0]))
 
@@ -142,7 +142,7 @@ class StateSE2(Point2D):
 @total_ordering
 @dataclass(frozen=True, eq=False)
 class TimePoint(DevkitObject):
-    """Time since 2 s before the log; compares with and adds any object with ``time_us``."""
+    """Time since 2 s before the log; can be compared with, and added to, any object with ``time_us``."""
 
     time_us: int
 
@@ -189,13 +189,13 @@ def _microseconds(time: Any) -> int:
     return int(getattr(time, "time_us", time))
 
 
-#: Share of half the length ahead and of half the width to the left: front, rear, front left, front right, rear left,
+#: Points of a box, in half lengths ahead and half widths to the left: front, rear, front left, front right, rear left,
 #: rear right, centre, left, right.
 _POINTS = dict(enumerate(((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0), (0, 1), (0, -1)), 1))
 
 
 class HalfExtents(DevkitObject):
-    """Half length and half width of an object with length and width."""
+    """Mixin with the half length and half width of an object."""
 
     length: float
     width: float

@@ -41,7 +41,7 @@ class BrakeConfig:
         within_s: Largest time to an at-fault collision that triggers the brake.
         up_to_mps: Largest speed at which the brake triggers.
         least_mps2, most_mps2: Bounds of the acceleration (nuPlan's comfort limits).
-        gains, slow_gains: On the speed (1/s) and on the acceleration; the second pair below ``slow_mps``.
+        gains, slow_gains: Gains on the speed (1/s) and on the acceleration; ``slow_gains`` up to ``slow_mps``.
         slow_mps: Speed at which the gains change.
     """
 
@@ -63,7 +63,7 @@ class BrakeConfig:
 
 def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
     """Return whether to brake at a time to an at-fault collision (infinite for none) and a speed (m/s)."""
-    # Times are multiples of a step in float32.
+    # Tolerate rounding: times are multiples of a step in float32.
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 
 
@@ -78,7 +78,7 @@ def stop(
     actions: ActionSpace, motion: Motion, acceleration: Scalar, length_m: Scalar,
     config: BrakeConfig = BrakeConfig(),
 ) -> Float[Array, " D"]:  # fmt: skip
-    """Return the action that brakes straight ahead; that of :class:`Physical` for the space ``route``.
+    """Return the action that brakes straight ahead; for the space ``route``, an action of :class:`Physical`.
 
     In the action space ``trajectory``, the plan has a constant speed, as published: ``1.1 (v + a)`` m/s if ego drives
     faster than ``slow_mps``, else ``a``. A negative speed leads backwards; the car, which cannot reverse, then stops.
@@ -96,7 +96,7 @@ class EmergencyBrake:
     """Wrap a planner: brake if its action leads to an at-fault collision.
 
     The forecast holds the action constant, in the space ``route`` its curvature; in the space ``trajectory``, it
-    follows the plan exactly. In ``direct_state``, where an action is a single motion, it stands there. Other agents
+    follows the plan exactly. In ``direct_state``, where an action is a single motion, ego stays at it. Other agents
     keep their velocities; agents that already touch ego are ignored.
 
     Attributes:
@@ -133,7 +133,7 @@ class EmergencyBrake:
         context, frame = situation.context, situation.surroundings.frame
         motion, box = context.history[-1], frame.box[context.slot]
 
-        # In the space ``route`` an action is an offset: the forecast holds the curvature to it, the brake none.
+        # In the space ``route`` an action is an offset: forecast its curvature, and brake at the offset of curvature 0.
         space = self.actions if isinstance(self.actions, Route) else None
         steered_action = space.steer(bank, context, action) if space else action
         path = self._forecast(motion, steered_action, context.action, box[LENGTH])

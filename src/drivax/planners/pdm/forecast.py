@@ -26,7 +26,7 @@ _DISTANCE_WEIGHT = 0.02
 class Forecast:
     """Agents that keep their velocity and heading."""
 
-    box: Float[Array, "K 6"]  # Their boxes now
+    box: Float[Array, "K 6"]  # Boxes at the present step
     velocity: Float[Array, "K 2"]  # m/s
     kind: Int[Array, " K"]  # ``scenario.schema.AgentKind``
     valid: Bool[Array, " K"]  # Mask of present agents
@@ -38,16 +38,16 @@ class Forecast:
     ) -> Forecast:  # fmt: skip
         """Select up to ``count`` agents within ``radius_m`` of ego that come nearest to its path in five seconds.
 
-        Of agents as near to the path, those near ego now come first; missing ones are not ``valid``.
+        Of agents equally near to the path, those nearer to ego come first. Rows without an agent are not ``valid``.
         """
         distance = norm(frame.box[:, :2] - frame.box[slot, :2])
         is_eligible = others_on_level(frame, slot) & ~is_ignored & (distance <= radius_m)
         times = jnp.arange(_SAMPLES)[:, None] * _SAMPLE_S
         x = frame.box[:, X] + times * frame.velocity[:, 0]
         y = frame.box[:, Y] + times * frame.velocity[:, 1]
-        squared = (x - path[:, 0, None, None]) ** 2 + (y - path[:, 1, None, None]) ** 2
+        squared_distance = (x - path[:, 0, None, None]) ** 2 + (y - path[:, 1, None, None]) ** 2
         radius = norm(frame.box[:, LENGTH : WIDTH + 1]) / 2
-        clearance = jnp.maximum(jnp.sqrt(jnp.min(squared, axis=(0, 1))) - radius, 0.0)
+        clearance = jnp.maximum(jnp.sqrt(jnp.min(squared_distance, axis=(0, 1))) - radius, 0.0)
         rank = jnp.where(is_eligible, clearance + _DISTANCE_WEIGHT * distance, jnp.inf)
         _, rows = jax.lax.top_k(-rank, min(count, distance.shape[0]))
         return cls(frame.box[rows], frame.velocity[rows], frame.kind[rows], is_eligible[rows])
@@ -83,7 +83,7 @@ class Contacts:
     """First contact of ego's motion with each agent, and whose fault it is."""
 
     touches: Bool[Array, "*batch K"]  # Mask of the agents that ego touches
-    step: Int[Array, "*batch K"]  # Of the motion; 0 without a contact
+    step: Int[Array, "*batch K"]  # Step of the motion; 0 without a contact
     lawful_fault: Bool[Array, "*batch K"]  # Ego's fault if it is in a single lane and on the road
     unlawful_fault: Bool[Array, "*batch K"]  # Ego's fault otherwise
 

@@ -1,6 +1,6 @@
 """Position relative to lanes and road along proposals.
 
-The queries of the grid read padded cells, many times as many segments as are near. Along proposals, which share a path,
+Queries of the grid read padded cells, with many more segments than are near. Along proposals, which share a path,
 the segments near the path are selected once and sorted along it; groups of neighbouring poses read short runs of them.
 Native kernels read no padding and look up every pose in the grid.
 """
@@ -46,7 +46,7 @@ _FAR_M = 1e6
 class Ground:
     """Position relative to lanes and road at each step of a motion."""
 
-    is_in_several_lanes: Bool[Array, "*T"]  # A lane is driven, but none holds all corners
+    is_in_several_lanes: Bool[Array, "*T"]  # On a lane, but no single lane contains all corners
     is_offroad: Bool[Array, "*T"]  # Some corner is off the road
     is_astray: Bool[Array, "*T"]  # Outside the corridor; where there is no route: wrong-way driving
 
@@ -90,9 +90,9 @@ def ground_along(
     needs_lanes = jnp.concatenate([needs_lanes[:, :1], any_needs_lanes], axis=1).reshape(-1)
     ground, is_exact = _look_up_sorted(bank, row, box, z, count)
     needs_query = ~is_exact | ~(bank.on_lanes[row] & on_route) | needs_lanes
-    exact = map_where(needs_query, partial(ground_at, bank, row), box, z, on_route)
+    exact_ground = map_where(needs_query, partial(ground_at, bank, row), box, z, on_route)
 
-    ground = jax.tree.map(partial(jnp.where, needs_query), exact, ground)
+    ground = jax.tree.map(partial(jnp.where, needs_query), exact_ground, ground)
     return jax.tree.map(each_step, ground)
 
 

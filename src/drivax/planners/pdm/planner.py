@@ -98,7 +98,7 @@ class PdmConfig:
 
 @record
 class Lines:
-    """P lines along the route, each with points 1 m apart along itself, of which the first is abreast of ego."""
+    """P lines along the route, each with points 1 m apart; the first point of every line is abreast of ego."""
 
     # x, y, cosine and sine of the heading, curvature (1/m), distance along the route from ego (m), and height above
     # the route at ego (m)
@@ -120,7 +120,7 @@ class Lines:
         has_route = bank.route_points[row] > 1
         remaining_m = jnp.where(has_route, bank.route_points[row] - 1.0 - along_m, -1.0)
 
-        def rows(distance_m: Float[Array, " M"]) -> Float[Array, "M 7"]:
+        def route_at(distance_m: Float[Array, " M"]) -> Float[Array, "M 7"]:
             """Return rows of the route at distances from ego."""
             on_route_m = jnp.clip(distance_m, 0.0, jnp.maximum(remaining_m, 0.0))
             points, _ = route_ahead(bank, row, along_m, on_route_m)
@@ -132,8 +132,8 @@ class Lines:
             return points.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(heading)
 
         distance_m = jnp.arange(_POINTS, dtype=jnp.float32)
-        centre = rows(distance_m)
-        points = jnp.stack([_line(rows, centre, distance_m, offset) for offset in offsets_m])
+        centre = route_at(distance_m)
+        points = jnp.stack([_line(route_at, centre, distance_m, offset) for offset in offsets_m])
         limit = jnp.where(has_route, centre[0, RouteColumn.LIMIT], 0.0)
         return cls(points, centre[::_STRIDE], remaining_m, limit)
 
@@ -161,26 +161,26 @@ class Lines:
 
 
 def _line(
-    rows: Callable[[Array], Array], centre: Float[Array, "M 7"], distance_m: Float[Array, " M"], offset: float
-) -> Float[Array, "M 7"]:
-    """Return one line with evenly spaced points, from the rows of the route at ``distance_m``."""
+    route_at: Callable[[Array], Array], centre: Float[Array, "M 7"], distance_m: Float[Array, " M"], offset: float
+) -> Float[Array, "M 7"]:  # fmt: skip
+    """Return one line with evenly spaced points; ``centre`` has the rows of the route at ``distance_m``."""
 
-    def offset_xy(row: Float[Array, "M 7"]) -> Float[Array, "M 2"]:
-        normal = jnp.stack([-row[:, RouteColumn.SIN], row[:, RouteColumn.COS]], axis=-1)
-        return row[:, RouteColumn.XY] + offset * normal
+    def offset_xy(rows: Float[Array, "M 7"]) -> Float[Array, "M 2"]:
+        normal = jnp.stack([-rows[:, RouteColumn.SIN], rows[:, RouteColumn.COS]], axis=-1)
+        return rows[:, RouteColumn.XY] + offset * normal
 
-    along_m, row = distance_m, centre
+    along_m, rows = distance_m, centre
     if offset:
         steps = norm(jnp.diff(offset_xy(centre), axis=0))
         arc_m = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
         along_m = jnp.interp(distance_m, arc_m, distance_m) + jnp.maximum(distance_m - arc_m[-1], 0.0)
-        row = rows(along_m)
-    cos, sin = row[:, RouteColumn.COS], row[:, RouteColumn.SIN]
+        rows = route_at(along_m)
+    cos, sin = rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]
     c0, s0, c1, s1 = cos[: -2 * _REACH], sin[: -2 * _REACH], cos[2 * _REACH :], sin[2 * _REACH :]
     curvature = jnp.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) / (2.0 * _REACH)
-    height = row[:, RouteColumn.Z] - centre[0, RouteColumn.Z]
+    height = rows[:, RouteColumn.Z] - centre[0, RouteColumn.Z]
     curvature = jnp.pad(curvature, _REACH, mode="edge")
-    return jnp.stack([*offset_xy(row).T, cos, sin, curvature, along_m, height], axis=1)
+    return jnp.stack([*offset_xy(rows).T, cos, sin, curvature, along_m, height], axis=1)
 
 
 @record
@@ -191,7 +191,7 @@ class Proposals:
     speed: Float[Array, "P F T"]  # m/s
 
     def reference(self, lines: Lines) -> Reference:
-        """Return the flattened proposals: target speeds of one line after each other."""
+        """Return the flattened proposals, ordered by line, then by target speed."""
         rows = lines.at(self.arc_m)
         flat = rows.reshape(-1, *rows.shape[2:])
         speed = self.speed.reshape(-1, self.speed.shape[-1])
@@ -245,12 +245,12 @@ def unroll_idm(
     forecasts = (boxes, distances, jnp.moveaxis(is_inside, 1, 0))
     _, states = jax.lax.scan(follow_leader, start, forecasts)
 
-    def in_time(first: Array, rest: Array) -> Array:
+    def join_steps(first: Array, rest: Array) -> Array:
         """Return the values at all steps along the last axis."""
         rest = jnp.moveaxis(rest.reshape(-1, *count), 0, -1)
         return jnp.concatenate([first[..., None], rest], axis=-1)
 
-    return Proposals(*(in_time(first, rest) for first, rest in zip(start, states, strict=True)))
+    return Proposals(*(join_steps(first, rest) for first, rest in zip(start, states, strict=True)))
 
 
 def _on_corridor(corridors: Float[Array, "P C 6"], boxes: Float[Array, "U K 6"]) -> Bool[Array, "P U K"]:
@@ -269,7 +269,7 @@ class Memory:
 
 @record
 class ScoredProposals:
-    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order."""
+    """Simulated and scored proposals of a step, ordered by line, then by target speed."""
 
     plans: Float[Array, "N T 3"]  # Poses along the lines, which cars track
     cars: Car  # Simulated motion, step by step

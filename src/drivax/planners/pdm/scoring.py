@@ -70,7 +70,7 @@ class ProposalMetrics:
     road: Float[Array, "*batch"]
     direction: Float[Array, "*batch"]
     progress_m: Float[Array, "*batch"]  # Along the route
-    # 1 within limits, 0 not
+    # 1 within limits, else 0
     ttc: Float[Array, "*batch"]
     comfort: Float[Array, "*batch"]
     fault_s: Float[Array, "*batch"]  # Time of the first at-fault collision, infinite for none

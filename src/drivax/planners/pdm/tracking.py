@@ -52,9 +52,9 @@ class Reference:
 
     @classmethod
     def fitted(cls, plan: Poses, steps: int, wheelbase: Scalar, config: TrackingConfig) -> Reference:
-        """Return the first ``steps`` steps of planned poses of the box centre as ``simulator.controller`` reads them.
+        """Return the reference of the rear axle for planned poses of the box centre; its poses end after ``steps``.
 
-        The reference is that of the rear axle. The controller fits again at every step; this is its first fit.
+        Speeds and curvatures are those that ``simulator.controller`` fits at the present step; it fits again later.
         """
         x, y, heading = plan.T
         cos, sin, axle_m = jnp.cos(heading), jnp.sin(heading), _axle_m(wheelbase, config)

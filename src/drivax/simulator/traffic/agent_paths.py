@@ -33,7 +33,7 @@ EXTENSION_M, _EXTENSION_STEP_M = 60.0, 4.0
 TRAVELS_M = 2.0
 #: Overlapping agents stored per step.
 OVERLAPS = 2
-#: Minimum distance between key positions, m. Others do not shape a path: the boxes of a standing car jitter.
+#: Minimum distance between key positions, m. Only these shape a path, because the boxes of a standing car jitter.
 _KEY_M = 1.0
 #: A vehicle whose log moves backwards by this much or more reverses, m.
 _BACKWARDS_M = 1.5
@@ -43,7 +43,7 @@ _LAST_POSE_M = 0.2
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
 #: Half the length over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
 _CURVE_M, _CURVE_S = 2.5, 0.25
-#: Stop lines stored per path, the first ones.
+#: Number of stop lines stored per path: the first ones.
 STOPS = 4
 #: Stop lines that a path crosses within this distance are one stop, m.
 _ONE_STOP_M = 3.0
@@ -60,7 +60,7 @@ class AgentPaths(TrafficData):
 
     slot: Int[Array, "N R"]  # Agent slot of each path
     points: Float[Array, "N R M 4"]  # x, y, cos, sin, evenly spaced
-    # Height of the box centre, and speed limit from peak and curves (m/s), at the same points
+    # Height of the box centre (m), and speed limit from peak speed and curves (m/s), at the same points
     profile: Float[Array, "N R M 2"]
     spacing: Float[Array, "N R"]  # Arc length between two points, m
     # Arc length of the logged agent at each step, m; never decreases, holds while unobserved
@@ -106,12 +106,12 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     lines, log_arc = _lines(bank, logs)
     count = np.bincount(logs.scenario, minlength=len(bank))
     # An even number, or the capacity: a bank that keeps its padding shares programs with others of its capacity.
-    rows = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
+    row_count = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
     row = np.arange(len(logs.slot)) - np.concatenate(([0], np.cumsum(count)))[logs.scenario]
 
     def spread(values: Numbers, fill: float, dtype: Any) -> Array:
         """Arrange values of all agents ``[V, ...]`` by scenario and row ``[N, R, ...]``."""
-        result = np.full((len(bank), rows, *values.shape[1:]), fill, dtype)
+        result = np.full((len(bank), row_count, *values.shape[1:]), fill, dtype)
         result[logs.scenario, row] = values
         return jnp.asarray(result)
 
@@ -129,7 +129,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
         appears=jnp.swapaxes(spread(_next_step(logs.valid), bank.steps, np.int16), 1, 2),
         stop_arc=spread(stop_arc, NEVER_M, np.float32),
         stop_light=spread(stop_light, 0, np.int16),
-        overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, rows)),
+        overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, row_count)),
         kinds=kinds,
     )
     return with_data(bank, paths)
@@ -141,17 +141,17 @@ def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
     kind = np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND])
     has_agent = (agents[..., AgentColumn.VALID] > 0).any(axis=1)
     scenario, slot = np.argwhere(np.isin(kind, kinds) & has_agent).T
-    rows = agents[scenario, :, slot]
-    speed = rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
-    speed += rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
+    tracks = agents[scenario, :, slot]
+    speed = tracks[..., AgentColumn.VX] * tracks[..., AgentColumn.COS]
+    speed += tracks[..., AgentColumn.VY] * tracks[..., AgentColumn.SIN]
     logs = _Logs(
         scenario,
         slot,
-        xy=rows[..., AgentColumn.XY],
-        z=rows[..., AgentColumn.Z],
-        heading=np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS]),
+        xy=tracks[..., AgentColumn.XY],
+        z=tracks[..., AgentColumn.Z],
+        heading=np.arctan2(tracks[..., AgentColumn.SIN], tracks[..., AgentColumn.COS]),
         speed=speed,
-        valid=rows[..., AgentColumn.VALID] > 0,
+        valid=tracks[..., AgentColumn.VALID] > 0,
         extension=np.asarray(bank.extension, np.float64)[scenario, slot],
     )
     return logs.part(_travels_forward(logs))
@@ -164,11 +164,11 @@ def _travels_forward(logs: _Logs) -> Bool[np.ndarray, " V"]:
     last = _last_key(key)
     xy, heading = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
     move = np.diff(xy, axis=1) * key[:, 1:, None] * (np.cumsum(key, axis=1)[:, 1:, None] > 1)
-    distance = np.hypot(move[..., 0], move[..., 1])
-    ahead = move[..., 0] * np.cos(heading[:, :-1, 0]) + move[..., 1] * np.sin(heading[:, :-1, 0])
+    distance_m = np.hypot(move[..., 0], move[..., 1])
+    forward_m = move[..., 0] * np.cos(heading[:, :-1, 0]) + move[..., 1] * np.sin(heading[:, :-1, 0])
     flips = np.abs(wrap(np.diff(heading[..., 0], axis=1))) > np.pi / 2
-    reverses = (np.where(ahead < 0, distance, 0.0).sum(1) >= _BACKWARDS_M) | flips.any(1)
-    return (distance.sum(1) > TRAVELS_M) & ~reverses
+    reverses = (np.where(forward_m < 0, distance_m, 0.0).sum(1) >= _BACKWARDS_M) | flips.any(1)
+    return (distance_m.sum(1) > TRAVELS_M) & ~reverses
 
 
 def _key_steps(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -> Bool[np.ndarray, "V T"]:
@@ -182,7 +182,7 @@ def _key_steps(xy: Float[np.ndarray, "V T 2"], valid: Bool[np.ndarray, "V T"]) -
 
 
 def _last_key(key: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
-    """Return the last key step at or before each step; for steps before the first one, that one."""
+    """Return the last key step at or before each step, or the first key step if there is none before it."""
     last = np.maximum.accumulate(np.where(key, np.arange(key.shape[1]), -1), axis=1)
     return np.where(last < 0, np.argmax(key, axis=1)[:, None], last)
 
@@ -200,15 +200,15 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
     key = _key_steps(logs.xy, logs.valid)
     agent = np.arange(count)
     end = steps - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
-    final, final_heading = logs.xy[agent, end], logs.heading[agent, end]
-    offset = final - logs.xy[agent, _last_key(key)[:, -1]]
+    final_xy, final_heading = logs.xy[agent, end], logs.heading[agent, end]
+    offset = final_xy - logs.xy[agent, _last_key(key)[:, -1]]
     # The last pose shapes the path, too, unless it is behind, by the jitter of a standing car.
     is_ahead = offset[:, 0] * np.cos(final_heading) + offset[:, 1] * np.sin(final_heading) > _LAST_POSE_M
     points = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
     extension = logs.extension[:, :points]
-    xy = np.concatenate([logs.xy, final[:, None], extension], axis=1)
+    xy = np.concatenate([logs.xy, final_xy[:, None], extension], axis=1)
     # The tangent at a point of the extension is the sum of the pieces before and after it.
-    tangent = np.diff(np.concatenate([final[:, None], extension, extension[:, -1:]], axis=1), axis=1)
+    tangent = np.diff(np.concatenate([final_xy[:, None], extension, extension[:, -1:]], axis=1), axis=1)
     tangent = tangent[:, :-1] + tangent[:, 1:]
     heading = np.arctan2(tangent[..., 1], tangent[..., 0])
     heading = np.concatenate([logs.heading, final_heading[:, None], heading], axis=1)
@@ -239,19 +239,19 @@ def _log_arcs(logs: _Logs, lines: Polylines, key: Numbers) -> Float[np.ndarray, 
 def _heights(bank: ScenarioBank, logs: _Logs, extension: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
     """Return heights of the box centre beyond the log, from the nearest lane on the level of the point before.
 
-    ``end`` is the last valid step of each log. In scenarios without elevation its height continues.
+    ``end`` is the last valid step of each log. In scenarios without elevation the height at this step is kept.
     """
     flags, lanes = np.asarray(bank.flags), np.asarray(bank.lanes)
-    half = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
+    half_height = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
     height = np.repeat(logs.z[np.arange(len(end)), end][:, None], extension.shape[1], axis=1)
     segment_count = np.asarray(bank.grid_lane[:, -1])
     for scenario in np.unique(logs.scenario[(flags[logs.scenario] & int(Flag.ELEVATION)) != 0]):
         agents = np.flatnonzero(logs.scenario == scenario)
         segments = lanes[scenario, : LaneRow.HALF_WIDTH, : int(segment_count[scenario])].astype(np.float64)
-        ground = height[agents, 0] - half[agents]
+        ground = height[agents, 0] - half_height[agents]
         for point in range(extension.shape[1]):
             ground = _ground(segments, extension[agents, point], ground)
-            height[agents, point] = ground + half[agents]
+            height[agents, point] = ground + half_height[agents]
     return height
 
 
@@ -260,10 +260,10 @@ def _ground(segments: Numbers, xy: Numbers, ground: Numbers) -> Float[np.ndarray
     low, high = xy.min(axis=0) - LANE_CUTOFF_M, xy.max(axis=0) + LANE_CUTOFF_M
     middle = (segments[0:2] + segments[2:4]) / 2
     # Segments are at most 4 m long.
-    near = ((middle > low[:, None] - 2.0) & (middle < high[:, None] + 2.0)).all(axis=0)
-    if not near.any():
+    is_near = ((middle > low[:, None] - 2.0) & (middle < high[:, None] + 2.0)).all(axis=0)
+    if not is_near.any():
         return ground
-    ax, ay, bx, by, z = segments[:, near]
+    ax, ay, bx, by, z = segments[:, is_near]
     distance, _ = point_to_segment(xy[:, None], np.stack([ax, ay], -1)[None], np.stack([bx, by], -1)[None])
     distance = np.where(np.abs(z - ground[:, None]) <= LEVEL_M, distance, np.inf)
     return np.where(distance.min(axis=1) <= LANE_CUTOFF_M, z[distance.argmin(axis=1)], ground)
@@ -278,11 +278,11 @@ def _sample_paths(
     if not lines.count:
         return np.zeros((0, PATH_POINTS, 4)), np.zeros((0, PATH_POINTS, 2)), spacing
     points = lines.at(row, arc)
-    half = np.maximum(_CURVE_M, _CURVE_S * peak)[:, None]
-    ahead = np.minimum(arc + half, lines.length[:, None])
-    behind = np.maximum(arc - half, 0.0)
-    turn = lines.at(row, ahead)[..., 3] - lines.at(row, behind)[..., 3]
-    curvature = np.abs(turn) / (ahead - behind)
+    half_m = np.maximum(_CURVE_M, _CURVE_S * peak)[:, None]
+    ahead_m = np.minimum(arc + half_m, lines.length[:, None])
+    behind_m = np.maximum(arc - half_m, 0.0)
+    turn = lines.at(row, ahead_m)[..., 3] - lines.at(row, behind_m)[..., 3]
+    curvature = np.abs(turn) / (ahead_m - behind_m)
     speed = np.minimum(peak[:, None], np.sqrt(CURVE_MPS2 / np.maximum(curvature, 1e-6)))
     # Backwards, so that every point allows braking to the limits of all later ones.
     for point in range(PATH_POINTS - 2, -1, -1):
@@ -293,28 +293,28 @@ def _sample_paths(
     return poses, np.stack([points[..., 2], speed], axis=-1), spacing
 
 
-def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -> Numbers:
+def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, row_count: int) -> Numbers:
     """Return the first two frame slots that each agent overlaps at each step of the log, -1 for none."""
-    overlaps = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
+    overlaps = np.full((len(bank), bank.steps, row_count, OVERLAPS), -1, np.int16)
     tables = [np.asarray(table) for table in (bank.agents, bank.agent_box, bank.parked, bank.parked_when)]
     for scenario in np.unique(logs.scenario):
         agents = np.flatnonzero(logs.scenario == scenario)
         boxes, z, valid = _logged_boxes(*(table[scenario] for table in tables))
-        own, slots = boxes[:, logs.slot[agents]], logs.slot[agents]
+        agent_boxes, slots = boxes[:, logs.slot[agents]], logs.slot[agents]
         radius = np.hypot(boxes[0, :, LENGTH], boxes[0, :, WIDTH]) / 2
-        dx, dy = (own[:, :, None, i] - boxes[:, None, :, i] for i in (0, 1))
-        near = dx * dx + dy * dy < (radius[slots][:, None] + radius) ** 2
-        near &= valid[:, None] & valid[:, slots][..., None] & (slots[:, None] != np.arange(boxes.shape[1]))
-        near &= np.abs(z[:, slots][..., None] - z[:, None]) <= LEVEL_M
-        candidates = np.argwhere(near)
+        dx, dy = (agent_boxes[:, :, None, i] - boxes[:, None, :, i] for i in (0, 1))
+        is_near = dx * dx + dy * dy < (radius[slots][:, None] + radius) ** 2
+        is_near &= valid[:, None] & valid[:, slots][..., None] & (slots[:, None] != np.arange(boxes.shape[1]))
+        is_near &= np.abs(z[:, slots][..., None] - z[:, None]) <= LEVEL_M
+        candidates = np.argwhere(is_near)
         step, agent, other = candidates.T
-        step, agent, other = candidates[overlap(own[step, agent], boxes[step, other])].T
+        step, agent, other = candidates[overlap(agent_boxes[step, agent], boxes[step, other])].T
         # Overlaps are sorted by step and agent: the rank of one is its distance from the first of its agent and step.
         key = step * len(agents) + agent
         rank = np.arange(len(key)) - np.searchsorted(key, key)
         is_first = rank < OVERLAPS
-        target = scenario, step[is_first], row[agents[agent[is_first]]], rank[is_first]
-        overlaps[target] = other[is_first]
+        position = scenario, step[is_first], row[agents[agent[is_first]]], rank[is_first]
+        overlaps[position] = other[is_first]
     return overlaps
 
 
@@ -332,12 +332,12 @@ def _logged_boxes(
 
 
 def _light_arcs(
-    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
+    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], columns: Float[np.ndarray, "V M 6"],
     spacing: Float[np.ndarray, " V"],
 ) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
     """Return arc lengths of the first four stops of each path, and the slots of their lights.
 
-    ``points`` has the columns of points and profile. Lights that are never observed do not count.
+    ``columns`` are those of the points and profiles of paths. Lights that are never observed do not count.
     """
     arcs = np.full((len(scenario), STOPS), NEVER_M)
     lights = np.zeros((len(scenario), STOPS), np.int64)
@@ -348,26 +348,26 @@ def _light_arcs(
         agents = np.flatnonzero(scenario == index)
         if not len(observed):
             continue
-        crossings = _crossings(line[index][:, observed], points[agents], spacing[agents])
+        crossings = _crossings(line[index][:, observed], columns[agents], spacing[agents])
         for path, arc in zip(agents, crossings, strict=True):
-            heading = np.arctan2(points[path, :, PATH_SIN], points[path, :, PATH_COS])
+            heading = np.arctan2(columns[path, :, PATH_SIN], columns[path, :, PATH_COS])
             stops = _stops(arc, heading, spacing[path], exits[index, observed])
             for number, (stop_m, light) in enumerate(stops[:STOPS]):
                 arcs[path, number], lights[path, number] = stop_m, observed[light]
     return arcs, lights
 
 
-def _crossings(line: Numbers, points: Numbers, spacing: Numbers) -> Float[np.ndarray, "V L"]:
+def _crossings(line: Numbers, columns: Numbers, spacing: Numbers) -> Float[np.ndarray, "V L"]:
     """Return the arc length at which each path first crosses each stop line forwards; infinite where it does not."""
     cos, sin = line[LightRow.COS], line[LightRow.SIN]
-    dx, dy = points[:, :, None, PATH_X] - line[LightRow.X], points[:, :, None, PATH_Y] - line[LightRow.Y]
+    dx, dy = columns[:, :, None, PATH_X] - line[LightRow.X], columns[:, :, None, PATH_Y] - line[LightRow.Y]
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     before, after = ahead[:, :-1], ahead[:, 1:]
     fraction = -before / np.where(after > before, after - before, 1.0)
-    within = np.abs(left[:, :-1] + fraction * np.diff(left, axis=1)) <= line[LightRow.HALF]
-    parallel = points[:, :-1, None, PATH_COS] * cos + points[:, :-1, None, PATH_SIN] * sin > _MIN_COS
-    level = np.abs(points[:, :-1, None, PATH_SIN + 1 + PROFILE_Z] - line[LightRow.Z]) <= LEVEL_M
-    crosses = (before < 0.0) & (after >= 0.0) & within & parallel & level
+    is_within = np.abs(left[:, :-1] + fraction * np.diff(left, axis=1)) <= line[LightRow.HALF]
+    is_parallel = columns[:, :-1, None, PATH_COS] * cos + columns[:, :-1, None, PATH_SIN] * sin > _MIN_COS
+    is_level = np.abs(columns[:, :-1, None, PATH_SIN + 1 + PROFILE_Z] - line[LightRow.Z]) <= LEVEL_M
+    crosses = (before < 0.0) & (after >= 0.0) & is_within & is_parallel & is_level
     first = np.argmax(crosses, axis=1)
     arc = (first + np.take_along_axis(fraction, first[:, None], axis=1)[:, 0]) * spacing[:, None]
     return np.where(crosses.any(axis=1), arc, np.inf)

@@ -98,20 +98,20 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     vehicle's, and it is on the same level.
     """
     look_m = _look_ahead(movers.speed)
-    rows, arcs = _path_ahead(paths, index, movers, look_m)
-    nodes = rows[..., :2]
+    poses, arcs = _path_ahead(paths, index, movers, look_m)
+    nodes = poses[..., :2]
     slots, valid = _closest(movers, frame, nodes)
     box, velocity = frame.box[slots], frame.velocity[slots]
     piece = _nearest_piece(nodes, box)
-    x0, y0, cos0, sin0, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, piece), -1, 0)
+    x0, y0, cos0, sin0, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(poses, piece), -1, 0)
     tangents = cos0, sin0, cos1, sin1
     arc, end = (jnp.take_along_axis(arcs, piece + offset, axis=1) for offset in (0, 1))
-    fraction, squared = _project_on_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
+    fraction, squared_distance = _project_on_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
     length = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
     ux, uy = (x1 - x0) / length, (y1 - y0) / length
     bulge = _bulge(fraction, (ux, uy), tangents) * length
     lateral = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - bulge
-    squared = jnp.where((fraction > 0.0) & (fraction < 1.0), lateral * lateral, squared)
+    squared_distance = jnp.where((fraction > 0.0) & (fraction < 1.0), lateral * lateral, squared_distance)
     along = arc + fraction * (end - arc) - movers.arc[:, None]
     cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
     sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
@@ -119,8 +119,8 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
     reach = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
     is_past = (along >= look_m[:, None]) | ((piece == PIECES - 1) & (fraction >= 1.0))
-    inside = valid & (squared < reach * reach) & (along > 0.0) & ~is_past
-    gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
+    is_inside = valid & (squared_distance < reach * reach) & (along > 0.0) & ~is_past
+    gap = jnp.where(is_inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
     is_leader = first_smallest(gap, least=LEAST_GAP_M)[:, None] == jnp.arange(CLOSEST)
     speed = jnp.sum(jnp.where(is_leader, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
     return Leaders(gap=jnp.min(gap, axis=1), speed=speed, slots=slots, valid=valid)
@@ -133,20 +133,20 @@ def _nearest_piece(nodes: Float[Array, "R K 2"], box: Float[Array, "R C 6"]) -> 
     keys = []
     for piece in range(PIECES):
         ends = x[:, piece], y[:, piece], x[:, piece + 1], y[:, piece + 1]
-        _, squared = _project_on_piece(*ends, box[..., X], box[..., Y])
-        keys.append(embed_number(1.0 + squared, piece, _PIECE_BITS))
+        _, squared_distance = _project_on_piece(*ends, box[..., X], box[..., Y])
+        keys.append(embed_number(1.0 + squared_distance, piece, _PIECE_BITS))
     nearest = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
     # Stored to memory: XLA would otherwise compute it again for each of the columns that are read.
     return jnp.zeros_like(nearest).at[jnp.arange(len(nearest))].set(nearest)
 
 
-def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
-    """Return the rows of two consecutive points of each path, ``first`` and the next, by one contiguous read."""
+def _both_ends(poses: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
+    """Return the poses at two consecutive points of each path, ``first`` and the next, by one contiguous read."""
 
     def read(path: Float[Array, "K 4"], first: Array) -> Float[Array, " 8"]:
         return jax.lax.dynamic_slice(path, (first, jnp.int32(0)), (2, 4)).reshape(8)
 
-    return jax.vmap(jax.vmap(read, in_axes=(None, 0)))(rows, first)
+    return jax.vmap(jax.vmap(read, in_axes=(None, 0)))(poses, first)
 
 
 def _project_on_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
@@ -158,7 +158,7 @@ def _project_on_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tup
 
 
 def _bulge(fraction: Any, direction: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
-    """Return the offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
+    """Return the path's offset to the left of a straight piece, relative to its length: a cubic with both tangents.
 
     ``tangents`` are cosine and sine at the start of the piece, then at its end.
     """
@@ -176,14 +176,14 @@ def _look_ahead(speed: Float[Array, " R"]) -> Float[Array, " R"]:
 def _path_ahead(
     paths: AgentPaths, index: Int[Array, ""], movers: Movers, look_m: Float[Array, " R"]
 ) -> tuple[Float[Array, "R K 4"], Float[Array, "R K"]]:
-    """Return rows of the path from behind the vehicle to its look-ahead distance, and their arc lengths."""
+    """Return poses on the path from behind the vehicle to its look-ahead distance, and their arc lengths."""
     spacing = paths.spacing[index]
     # PIECES - 1 pieces cover the look-ahead distance, since the first one begins behind the vehicle.
     stride = jnp.ceil(look_m / ((PIECES - 1) * spacing)).astype(jnp.int32)
     first = (movers.arc / spacing).astype(jnp.int32)
     point = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
-    rows = paths.points[index, jnp.arange(point.shape[0])[:, None], point]
-    return rows, point * spacing[:, None]
+    poses = paths.points[index, jnp.arange(point.shape[0])[:, None], point]
+    return poses, point * spacing[:, None]
 
 
 def _closest(
@@ -193,12 +193,12 @@ def _closest(
     mover = movers.box[:, None]
     behind_m = mover[..., LENGTH] / 2 + BEHIND_M
     box = columns(frame.box)
-    near = reaching(box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind_m, 0.0, RECTANGLES)
+    is_near = reaching(box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind_m, 0.0, RECTANGLES)
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
-    near &= frame.valid & (slot != movers.slot[:, None])
-    near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
-    near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
-    return closest(near, movers.box, box)
+    is_near &= frame.valid & (slot != movers.slot[:, None])
+    is_near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
+    is_near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    return closest(is_near, movers.box, box)
 
 
 def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
@@ -264,10 +264,10 @@ def _rectangles(
     ahead = dx * cos[..., None] + dy * sin[..., None]
     left = dy * cos[..., None] - dx * sin[..., None]
     number = jnp.arange(count)
-    near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind_m, 0.0)
-    far = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, ahead_m, 0.0)
+    begin = ahead.min(axis=-1) - half - jnp.where(number == 0, behind_m, 0.0)
+    end = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, ahead_m, 0.0)
     right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
-    along, across = (near + far) / 2, (right + left) / 2
+    along, across = (begin + end) / 2, (right + left) / 2
     centre_x, centre_y = x[..., 0] + along * cos - across * sin, y[..., 0] + along * sin + across * cos
     # Without the barrier XLA computes the rectangles again for every box.
-    return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (far - near) / 2, (left - right) / 2))
+    return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (end - begin) / 2, (left - right) / 2))

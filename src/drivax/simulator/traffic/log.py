@@ -44,15 +44,15 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
     steps = step - jnp.arange(HISTORY - 1, -1, -1)
     rows = bank.agents[index, jnp.clip(steps, 0, bank.steps - 1), slot]
     valid = (rows[:, AgentColumn.VALID] > 0) & (steps >= 0)
-    # Rows that are valid, as are all later ones; and the earliest of them.
-    connected = jnp.flip(jnp.cumprod(jnp.flip(valid.astype(jnp.int32)))) > 0
-    first = jnp.minimum(HISTORY - jnp.sum(connected), HISTORY - 1)
+    # The rows that are valid without a gap up to ``step``, and the earliest of them.
+    is_connected = jnp.flip(jnp.cumprod(jnp.flip(valid.astype(jnp.int32)))) > 0
+    first = jnp.minimum(HISTORY - jnp.sum(is_connected), HISTORY - 1)
     missing_s = (first - jnp.arange(HISTORY))[:, None] * DT_S
     heading = jnp.arctan2(rows[:, AgentColumn.SIN], rows[:, AgentColumn.COS])
     speed = jnp.maximum(jnp.sum(rows[:, AgentColumn.VELOCITY] * rows[:, AgentColumn.HEADING], axis=-1), 0.0)
     logged = jnp.stack([rows[:, AgentColumn.X], rows[:, AgentColumn.Y], heading, speed], axis=-1)
     extension = logged[first] - missing_s * jnp.pad(rows[first, AgentColumn.VELOCITY], (0, 2))
-    return jnp.where(connected[:, None], logged, extension)
+    return jnp.where(is_connected[:, None], logged, extension)
 
 
 def agent_rows(
@@ -74,25 +74,25 @@ def frame_of(
     empty. ``back`` is less than ``HISTORY``; reactive traffic remembers 9 steps. ``slots`` selects agents; by default
     all.
     """
-    motion, present = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
-    rows = agent_rows(motion, jnp.zeros_like(present), present)
+    motion, valid = driven.history[:, HISTORY - 1 - back], jnp.ones_like(driven.z)
+    rows = agent_rows(motion, jnp.zeros_like(valid), valid)
     log_step = jnp.clip(step - back, 0, bank.steps - 1)
     box, parked, words = bank.agent_box[index], bank.parked[index], bank.parked_when[index, log_step // WORD]
-    moving, target = len(agents), driven.slot
+    moving_count, driven_row = len(agents), driven.slot
     if slots is None:
-        padding = len(box) - moving
+        padding = len(box) - moving_count
     else:
         agents = agents.at[slots].get(mode="fill", fill_value=0.0)
         box, parked, words, padding = box[slots], parked[slots], words[slots], 0
         # Row of each driven agent in the selection; the index past the end, which is dropped, if it has none.
-        match = (slots[:, None] == driven.slot) & (slots[:, None] < moving)
+        match = (slots[:, None] == driven.slot) & (slots[:, None] < moving_count)
         row = jnp.where(match, jnp.arange(len(slots))[:, None], 0).sum(axis=0)
-        target = jnp.where(match.any(axis=0), row, len(slots))
+        driven_row = jnp.where(match.any(axis=0), row, len(slots))
     # No other agent is valid before the recording.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     # Heights in their own array: measuring changes only them, so that XLA computes the rest once per step.
-    z = agents[:, AgentColumn.Z].at[target].set(driven.z, mode="drop")
-    agents = agents.at[target].set(rows, mode="drop")
+    z = agents[:, AgentColumn.Z].at[driven_row].set(driven.z, mode="drop")
+    agents = agents.at[driven_row].set(rows, mode="drop")
     is_parked = ((words >> (log_step % WORD).astype(jnp.uint32)) & 1 > 0) & (step >= back)
     z = jnp.where(is_parked, parked[:, AgentColumn.Z], jnp.pad(z, (0, padding)))
     agents = jnp.where(is_parked[:, None], parked, jnp.pad(agents, ((0, padding), (0, 0))))
@@ -108,7 +108,7 @@ def frame_of(
 
 
 def present_frame(bank: ScenarioBank, context: AgentContext, driven: AgentContext) -> Frame:
-    """Return the present frame of a single driven agent natively; other agents replay the log."""
+    """Return the present frame with a single driven agent, by the native kernel; all others replay the log."""
     logs = (bank.agents, bank.agent_box, bank.parked, bank.parked_when, bank.light_state)
     motion, slot = driven.history[0, -1], driven.slot[0]
     heading = motion[MOTION_HEADING]

@@ -68,8 +68,8 @@ class OverrideTraffic:
         rows, override = self.base.agents(bank, context, back), data_of(bank, OverrideMotions, _CURE)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
         key, slot = (context.index, step), override.slot[context.index]
-        own_rows = agent_rows(override.motion[key], override.z[key], override.valid[key].astype(jnp.float32))
-        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(own_rows, mode="drop")
+        new_rows = agent_rows(override.motion[key], override.z[key], override.valid[key].astype(jnp.float32))
+        return rows.at[jnp.where(slot >= 0, slot, rows.shape[0])].set(new_rows, mode="drop")
 
 
 def with_override(
@@ -94,17 +94,17 @@ def with_override(
     def heights(index: Array, slot: Array, motion: Float[Array, "T 4"]) -> Float[Array, " T"]:
         """Return the heights of one agent's box centre along its trajectory."""
         slot = jnp.maximum(slot, 0)
-        first = jnp.argmax(bank.agents[index, :, slot, AgentColumn.VALID] > 0)
-        half = bank.height_m(index, slot) / 2
+        first_step = jnp.argmax(bank.agents[index, :, slot, AgentColumn.VALID] > 0)
+        half_height = bank.height_m(index, slot) / 2
 
         def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
-            """Return the height of the ground at a pose, on the level of the last one, and of the box centre."""
+            """Return the heights of the ground at a pose, on the level of the last one, and of the box centre."""
             heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
             ground = around_lanes(bank, index, pose[:2], heading, pose[None, :2], ground).z
-            return ground, ground + half
+            return ground, ground + half_height
 
-        motion = jax.lax.stop_gradient(motion)
-        return jax.lax.scan(climb, bank.agents[index, first, slot, AgentColumn.Z] - half, motion)[1]
+        ground = bank.agents[index, first_step, slot, AgentColumn.Z] - half_height
+        return jax.lax.scan(climb, ground, jax.lax.stop_gradient(motion))[1]
 
     z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
     return with_data(bank, OverrideMotions(slots, motion, z, valid))
@@ -118,8 +118,8 @@ def motions_of_actions(
 
     Differentiable with respect to ``actions``: one per step, the last one is repeated. ``move`` is the dynamics of the
     action space, such as ``Task().motion``. ``slots`` are moving agents of each scenario, -1 for none. An agent that
-    the log lacks at ``begin`` starts where it was last valid, or first. Until ``begin`` it has the 22 steps before its
-    start as logged; before them the earliest motion is repeated.
+    the log lacks at ``begin`` starts at its last valid step before, or else at its first. Until ``begin`` it has the 22
+    steps before its start as logged; before them the earliest motion is repeated.
 
     Raises:
         UsageError: ``begin`` is not a step of the log, or there are no actions.
@@ -135,13 +135,13 @@ def motions_of_actions(
         slot = jnp.maximum(slot, 0)
         # Rows that are not valid are zero: start from the last valid step until ``begin``, or from the first one.
         valid, log_steps = bank.agents[index, :, slot, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
-        last = jnp.max(jnp.where(valid & (log_steps <= begin), log_steps, -1))
-        past = logged_history(bank, index, jnp.where(last >= 0, last, jnp.argmax(valid)), slot)
+        last_valid = jnp.max(jnp.where(valid & (log_steps <= begin), log_steps, -1))
+        past = logged_history(bank, index, jnp.where(last_valid >= 0, last_valid, jnp.argmax(valid)), slot)
         length_m = bank.length_m(index, slot)
 
         def advance(motion: Array, action: Array) -> tuple[Array, Array]:
-            after = move(motion, action, length_m)
-            return after, after
+            next_motion = move(motion, action, length_m)
+            return next_motion, next_motion
 
         future = jax.lax.scan(advance, past[-1], actions[action_index])[1]
         before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]

@@ -86,9 +86,9 @@ class IdmTraffic:
         travels = paths.log_arc[index, -1] - paths.log_arc[index, step] > agent_paths.TRAVELS_M
         reacts = (slot >= 0) & travels & (entry < bank.steps) & (self._driver_index(bank, index, slot) >= 0)
         drives = reacts & (entry <= step)
-        now = (paths.log_arc[index, log_step, row], paths.log_speed[index, log_step, row], drives)
+        present_values = (paths.log_arc[index, log_step, row], paths.log_speed[index, log_step, row], drives)
         phase = jnp.where(reacts, jnp.where(drives, DRIVES, WAITS), REPLAYS).astype(jnp.int8)
-        arc, speed, there = (jnp.broadcast_to(values, (PAST, *values.shape)) for values in now)
+        arc, speed, there = (jnp.broadcast_to(values, (PAST, *values.shape)) for values in present_values)
         ignored = paths.overlaps[index, log_step, row]
         return Reactive(step, phase, entry.astype(jnp.int16), arc, speed, there, ignored)
 
@@ -122,8 +122,8 @@ class IdmTraffic:
         phase = jnp.where(enters, DRIVES, jnp.where(drives & arrives, LEFT, state.phase))
         arc = jnp.where(drives, arc, movers.arc)
         speed = jnp.where(drives, speed, jnp.where(enters, _entry_speed(movers, ahead, driver), movers.speed))
-        steps = ((state.arc, arc), (state.speed, speed), (state.there, phase == DRIVES))
-        arc, speed, there = (jnp.concatenate([rows[1:], row[None]]) for rows, row in steps)
+        histories = ((state.arc, arc), (state.speed, speed), (state.there, phase == DRIVES))
+        arc, speed, there = (jnp.concatenate([past[1:], new[None]]) for past, new in histories)
         ignored = movers.ignored.astype(jnp.int16)
         return Reactive(state.begin, phase.astype(jnp.int8), state.entry, arc, speed, there, ignored)
 
@@ -165,8 +165,8 @@ def _movers(
 def _keep_ignored(movers: Movers, frame: Frame, waits: Bool[Array, " R"]) -> Int[Array, "R 2"]:
     """Return the slots that stay ignored: those that the vehicle still overlaps, and all while it waits."""
     other = jnp.maximum(movers.ignored, 0)
-    level = jnp.abs(frame.z[other] - movers.z[:, None]) <= LEVEL_M
-    overlaps = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & level
+    is_level = jnp.abs(frame.z[other] - movers.z[:, None]) <= LEVEL_M
+    overlaps = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & is_level
     return jnp.where((movers.ignored >= 0) & (overlaps | waits[:, None]), movers.ignored, -1)
 
 
@@ -192,17 +192,17 @@ def _stop_gap(
     paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
     state = bank.light_state[context.index, jnp.clip(context.step, 0, bank.steps - 1)][light]
-    line = paths.stop_arc[context.index] - movers.arc[:, None]
-    front = line - movers.box[:, LENGTH, None] / 2
-    squared = (movers.speed * movers.speed)[:, None]
-    hard = jnp.reshape(driver.max_braking_mps2, (-1, 1))
-    soft = jnp.reshape(driver.comfortable_braking_mps2, (-1, 1))
+    line_m = paths.stop_arc[context.index] - movers.arc[:, None]
+    front_m = line_m - movers.box[:, LENGTH, None] / 2
+    squared_speed = (movers.speed * movers.speed)[:, None]
+    max_braking = jnp.reshape(driver.max_braking_mps2, (-1, 1))
+    comfortable_braking = jnp.reshape(driver.comfortable_braking_mps2, (-1, 1))
     red, yellow = is_red(state), is_yellow(state)
-    on_line = (front <= 0.0) & (line > 0.0) & (movers.speed < _STANDS_MPS)[:, None]
-    brakes = (front > 0.0) & (
-        (red & (squared <= 2 * hard * front)) | (yellow & (squared <= 2 * soft * front))
-    )
-    return jnp.min(jnp.where(brakes | (red & on_line), jnp.maximum(front, 0.0), FREE_M), axis=1)
+    on_line = (front_m <= 0.0) & (line_m > 0.0) & (movers.speed < _STANDS_MPS)[:, None]
+    can_stop = squared_speed <= 2 * max_braking * front_m
+    can_stop_gently = squared_speed <= 2 * comfortable_braking * front_m
+    brakes = (front_m > 0.0) & ((red & can_stop) | (yellow & can_stop_gently))
+    return jnp.min(jnp.where(brakes | (red & on_line), jnp.maximum(front_m, 0.0), FREE_M), axis=1)
 
 
 def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Frame) -> Bool[Array, " R"]:
@@ -215,20 +215,20 @@ def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Fra
     margin = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
     box, velocity = frame.box[ahead.slots], frame.velocity[ahead.slots]
     next_box = box.at[..., :2].add(velocity * DT_S)
-    blocked = (overlap((movers.box + margin)[:, None], next_box) & ahead.valid).any(axis=1)
+    is_blocked = (overlap((movers.box + margin)[:, None], next_box) & ahead.valid).any(axis=1)
     entry = state.entry.astype(jnp.int32)
-    ready = (state.phase == WAITS) & (context.step + 1 >= entry) & ~blocked
-    late = context.step + 1 > entry
+    is_ready = (state.phase == WAITS) & (context.step + 1 >= entry) & ~is_blocked
+    is_late = context.step + 1 > entry
     # By entry step, then by row; as floats, whose minima vectorise.
     order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
     radius = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     x, y = columns(movers.box)[:2]
     dx, dy = x[:, None] - x, y[:, None] - y
-    near = dx * dx + dy * dy < (radius[:, None] + radius + 2 * _ENTRY_END_M) ** 2
+    is_near = dx * dx + dy * dy < (radius[:, None] + radius + 2 * _ENTRY_END_M) ** 2
     # Vehicles that are not ready come last.
-    order = jnp.where(ready, order, jnp.inf)
-    first = jnp.min(jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf), axis=1)
-    return ready & (first >= order)
+    order = jnp.where(is_ready, order, jnp.inf)
+    first = jnp.min(jnp.where(is_near & (is_late[None] | is_late[:, None]), order[None], jnp.inf), axis=1)
+    return is_ready & (first >= order)
 
 
 def _entry_speed(movers: Movers, ahead: Leaders, driver: IdmParameters) -> Float[Array, " R"]:
@@ -248,7 +248,7 @@ def make_traffic(name: str) -> Traffic:
     The latter is a model, its class, or a function that makes one without arguments.
 
     Raises:
-        UsageError: There is no such traffic, or the name leads to something else, which is not called.
+        UsageError: Unknown name, or the dotted name leads to something else, which is not called.
     """
     if name in TRAFFIC:
         return TRAFFIC[name]()
