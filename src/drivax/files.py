@@ -50,7 +50,7 @@ _OTHER_FILES = 128
 
 
 class FullDiskError(DataError):
-    """The disk is full; ``size`` is that of the output in bytes, 0 if unknown."""
+    """The disk is full; ``size`` is the size of the output in bytes, 0 if unknown."""
 
     size = 0
 

@@ -50,7 +50,7 @@ class Generate:  # noqa: D101
     out: tyro.conf.Positional[Path]
     """Scenario set to write (a folder); with --benchmark the folder of the four sets."""
     scenarios: int | None = None
-    """Number of scenarios, 256 by default; with --benchmark that of train, 4,096 by default, others in proportion."""
+    """Number of scenarios, 256 by default; with --benchmark those of train, 4,096 by default, others in proportion."""
     seed: int | None = None
     """Seed of the set, 0 by default; scenario i of a seed does not depend on the number of scenarios."""
     config: Path | None = None

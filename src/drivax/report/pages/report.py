@@ -376,7 +376,7 @@ def _round_significant(value: float) -> float:
 
 
 def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-    """Return each selectable tag: its values, and the indices of those of each scenario."""
+    """Return each selectable tag: its words, and the indices of each scenario's words."""
     columns = []
     for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
         values = [tags.get(name, result_tables.UNKNOWN).split("|") for tags in scenario_tags]
