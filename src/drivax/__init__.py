@@ -17,13 +17,13 @@ _XLA_FLAG, _XLA_SERIES = "--xla_cpu_enable_concurrency_optimized_scheduler", "0.
 
 
 def _disable_concurrency_scheduler() -> None:
-    """Set the flag, unless the user has, before JAX starts its backend."""
+    """Disable the scheduler before JAX starts its backend, unless the user has set the flag."""
     flags = os.environ.get("XLA_FLAGS", "")
     try:
-        known = metadata.version("jaxlib").startswith(_XLA_SERIES)
+        has_flag = metadata.version("jaxlib").startswith(_XLA_SERIES)
     except metadata.PackageNotFoundError:
         return
-    if known and _XLA_FLAG not in flags:
+    if has_flag and _XLA_FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_XLA_FLAG}=false".strip()
 
 

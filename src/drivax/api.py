@@ -124,7 +124,7 @@ def evaluate(
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
-        # A path is no name of a planner.
+        # A Path never means a built-in planner of the same name.
         name = planner if isinstance(planner, str) else str(planner.absolute())
         planner, task = find_planner(name, loaded.bank, sample, task, trust)
     elif sample:
@@ -156,7 +156,7 @@ def find_planner(
     Raises:
         UsageError: Unknown planner, folder or policy, a task for a trained policy, ``sample`` for another planner, or
             code that is not trusted.
-        DataError: The folder is no run, or is damaged.
+        DataError: The folder is not a run, or is damaged.
     """
     if name in PLANNERS or is_dotted(name):
         if sample:

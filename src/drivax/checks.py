@@ -1,6 +1,6 @@
 """Checks of numeric settings; NaN fails all of them, and None (a setting that is off) passes.
 
-A run of a stranger states its own sizes. Upper bounds, far beyond use, keep it from taking all memory or time.
+An untrusted run states its own sizes. Upper bounds far beyond practical values keep it from taking all memory or time.
 """
 
 from __future__ import annotations

@@ -18,12 +18,12 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
-#: Compilation of one program takes this long before it is reported (s).
+#: Duration after which the compilation of a program is reported (s).
 _PATIENCE_S = 2.0
 #: Programs that compile faster are not stored (s): reading them takes as long.
 _LEAST_COMPILE_S = 0.1
-#: Total size to which the cache is cut, and the time since its last use from which a file may be deleted (s): another
-#: process may still write it.
+#: Size to which the cache is cut (bytes), and time since its last use after which a file may be deleted (s): another
+#: process may still be writing a newer one.
 _MAX_BYTES, _SETTLED_S = 2 << 30, 600.0
 
 
@@ -48,15 +48,15 @@ def use_compilation_cache(folder: str | Path | None = None, *, max_bytes: int = 
     try:
         top = _default_folder() if folder is None else Path(folder)
         programs = top / f"jax-{metadata.version('jaxlib')}-{_processor()}"
-        for private in (top, programs):
-            private.mkdir(0o700, parents=True, exist_ok=True)
-            if private.stat().st_uid != os.getuid():
+        for path in (top, programs):
+            path.mkdir(0o700, parents=True, exist_ok=True)
+            if path.stat().st_uid != os.getuid():
                 return None
-            private.chmod(0o700)
+            path.chmod(0o700)
         _prune(top, max_bytes, keep=programs)
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return None
-    # JAX may not have been imported yet: the environment reaches it, and the processes that this one starts.
+    # Environment variables reach JAX if it is imported later, and the processes that this one starts.
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(programs)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_LEAST_COMPILE_S))
     if jax := sys.modules.get("jax"):
@@ -70,17 +70,17 @@ def report_compilation(report: Callable[[str], None]) -> None:
     import jax
 
     reported = threading.Event()
-    waiting: list[threading.Timer] = []
+    timers: list[threading.Timer] = []
 
     def start(event: str, **_: object) -> None:
         if event == "/jax/compilation_cache/compile_requests_use_cache":
-            waiting.append(threading.Timer(_PATIENCE_S, report_once))
-            waiting[-1].daemon = True
-            waiting[-1].start()
+            timers.append(threading.Timer(_PATIENCE_S, report_once))
+            timers[-1].daemon = True
+            timers[-1].start()
 
     def stop(event: str, duration_secs: float, **_: object) -> None:
-        if event == "/jax/core/compile/backend_compile_duration" and waiting:
-            waiting.pop().cancel()
+        if event == "/jax/core/compile/backend_compile_duration" and timers:
+            timers.pop().cancel()
 
     def report_once() -> None:
         if not reported.is_set():
@@ -97,7 +97,7 @@ def _default_folder() -> Path:
 
 
 def _processor() -> str:
-    """Return eight hexadecimal digits of the processor's kind: XLA compiles for the instructions that it has."""
+    """Return eight hexadecimal digits that identify the kind of processor: XLA compiles for its instruction set."""
     kind = f"{platform.machine()} {platform.processor()}"
     with suppress(OSError):
         lines = set(Path("/proc/cpuinfo").read_text(errors="replace").splitlines())
@@ -107,13 +107,13 @@ def _processor() -> str:
 
 
 def _prune(top: Path, max_bytes: int, keep: Path) -> None:
-    """Delete the least recently used files of all versions until the rest fits, and empty folders but ``keep``.
+    """Delete the least recently used files of all versions until the rest fits, and empty folders except ``keep``.
 
     Files that were used in the last ten minutes stay.
     """
     files = []
     for path in top.glob("jax*/*"):
-        with suppress(OSError):  # another process deletes as well
+        with suppress(OSError):  # another process has deleted it
             status = path.stat()
             files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     total = sum(size for _, size, _ in files)

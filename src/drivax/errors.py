@@ -19,8 +19,7 @@ _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
 }  # fmt: skip
-#: Characters of the longest problem, record and cure that are kept in full; of others, which quote a value, only the
-#: ends.
+#: Maximum length of a problem, record or cure, in characters; of longer ones, which quote a value, both ends are kept.
 _LONGEST = 1000
 #: Cure of a full disk.
 MAKE_ROOM = "make room, or choose another disk"
@@ -39,7 +38,7 @@ _DISK_CURES = {
     **dict.fromkeys(_UNREACHABLE, "mount the disk again or check it, then repeat the command"),
 }
 _LESS_MEMORY = "use fewer --workers or a smaller --batch, or raise the limit: ulimit -v unlimited"
-#: Limits of a process (name, resource) and their cures, with a place for twice the limit.
+#: Limits of a process by error number: name, resource, and cure with a placeholder for twice the limit.
 _LIMITS = {
     errno.EMFILE: ("open files", resource.RLIMIT_NOFILE, "raise the limit: ulimit -n {}, or use fewer --workers"),
     errno.ENOMEM: ("memory in kB", resource.RLIMIT_AS, _LESS_MEMORY),
@@ -128,7 +127,7 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
 def explain_library(error: BaseException) -> DrivaxError | None:
     """Return what :func:`explain_system` returns for the system error that TensorStore or XLA quotes; None without one.
 
-    Only for errors that end a command: those of damaged files may quote text of a stranger.
+    Use it only for errors that end a command: an error about a damaged file may quote untrusted text.
     """
     if quoted := _QUOTED_NUMBER.search(str(error)):
         return explain_system(OSError(int(quoted[1]), quoted[0]))
@@ -137,7 +136,7 @@ def explain_library(error: BaseException) -> DrivaxError | None:
 
 
 def check_memory_limit() -> None:
-    """Raise a UsageError if this process may take so little memory that JAX would abort it."""
+    """Raise a UsageError if the memory limit of this process is so low that JAX would abort it."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
         least, limit = _LEAST_MEMORY // 1024, limit // 1024
@@ -146,7 +145,7 @@ def check_memory_limit() -> None:
 
 
 def missing_package(error: ImportError) -> UsageError | None:
-    """Return the error for an optional package that is not installed; None if it is damaged, or if no extra has it."""
+    """Return the error for an optional package that is not installed; None if it is broken, or belongs to no extra."""
     package = (error.name or str(error)).split(".")[0]
     if package not in _EXTRAS or not isinstance(error, ModuleNotFoundError):
         return None

@@ -1,4 +1,4 @@
-"""Text from files made inert: cells that a spreadsheet would compute, and characters that a terminal would obey."""
+"""Escape text from files: CSV cells that a spreadsheet would compute, and control characters of terminals."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-#: What begins a formula in spreadsheets, in full width, too, and blanks before it, which some remove.
+#: Characters that begin a formula in spreadsheets, full-width ones included, and blanks before them, which some strip.
 _BEGIN, _BLANKS = r"[=+\-@\uff1d\uff0b\uff0d\uff20]", r"[ \xa0]*"
-#: Begins a formula, or hides the character that does; numbers are safe.
+#: Matches before a formula, or before a tab or line break that may hide one, but not before a number.
 _FORMULA = rf"(?=[\t\r\n]|{_BLANKS}{_BEGIN})(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
-#: Where a spreadsheet may begin a cell: at the beginning, and after what separates cells in some country or program.
+#: A separator of cells in some locale or program, and the beginning of a formula after it.
 _AFTER, _SEPARATED = r"(?<=[;,|\t\r\n])", rf"[\" \xa0]*{_BEGIN}"
+#: Where :func:`csv_text` inserts apostrophes, and the inserted apostrophes.
 _ACTIVE = rf"\A(?='*{_FORMULA})|{_AFTER}(?='*{_SEPARATED})"
 _NEUTRAL = rf"\A'(?='*{_FORMULA})|{_AFTER}'(?='*{_SEPARATED})"
 _QUOTED = re.compile(r'[,"\r\n]')
@@ -26,7 +27,7 @@ def escape_controls(text: Any) -> str:
 
 
 def show(text: object = "", file: Any = None) -> None:
-    """Print lines with :func:`escape_controls`, and flush."""
+    """Print lines of text, each escaped by :func:`escape_controls`, and flush."""
     print("\n".join(map(escape_controls, str(text).split("\n"))), file=file, flush=True)
 
 
@@ -40,7 +41,7 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
 
 
 def csv_rows(lines: Iterable[str]) -> Iterator[list[str]]:
-    """Yield the rows of :func:`csv_text` from its lines, with the cells as they were."""
+    """Parse lines of CSV, and remove the apostrophes that :func:`csv_text` added."""
     neutral = re.compile(_NEUTRAL)
     for row in csv.reader(lines):
         yield [neutral.sub("", cell) if "'" in cell else cell for cell in row]

@@ -9,9 +9,9 @@ While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
     old/           the replaced ``sets/a``, on disks that cannot exchange two folders
     spool*/        temporary files of the writer
 
-The next writer of ``sets/a`` takes over what a killed process left. If a note is damaged, too large or no regular file,
-its part is written again; whatever else drivax does not create under a hidden name is removed. Symbolic links to
-outputs, which the user names, are followed; links inside them, which a stranger may have made, are replaced or refused.
+The next writer of ``sets/a`` takes over what a killed process left. If a note is damaged, too large or not a regular
+file, its part is written again; other entries that drivax does not create there are removed. Symbolic links that the
+user names as outputs are followed; links inside outputs, which may be hostile, are replaced or refused.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from drivax.errors import MAKE_ROOM, DataError, UsageError
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 #: Errors of disks without locks or without exchange.
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
-#: Files of a partial folder; all else are folders.
+#: Files of a partial folder; its other entries are folders.
 _FILES = ("identity.json", "lock")
 #: What a later process needs to resume a partial folder.
 _RESUMABLE = ("content", "progress", *_FILES)
 #: Largest identity and largest note that are read, in bytes.
 _MOST_IDENTITY, _MOST_NOTE = 1 << 20, 64 << 20
-#: Most values of a JSON text: each takes up to 200 bytes of memory. In recordings, maps and manifests each has 10 to
-#: 30 bytes of text; texts of more than 48 MiB, such as the manifests of large sets, may have one for 12 bytes.
+#: Maximum number of values in a JSON text: each takes up to 200 bytes of memory. In recordings, maps and manifests a
+#: value has 10 to 30 bytes; texts above 48 MiB, such as the manifests of large sets, may have a value per 12 bytes.
 MOST_VALUES, _LEAST_VALUE_BYTES = 4 << 20, 12
 #: Files that a process opens besides those of its data.
 _OTHER_FILES = 128
 
 
 class FullDiskError(DataError):
-    """The disk is full; ``size`` is that of the output in bytes, 0 if unknown."""
+    """The disk is full; ``size`` is the size of the output in bytes, 0 if unknown."""
 
     size = 0
 
@@ -88,7 +88,7 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
 
 
 def path_end(path: Path, others: Iterable[Path]) -> str:
-    """Return the shortest end of a path that no other path has, or all of it."""
+    """Return the shortest trailing part of a path in which no path of ``others`` ends, or the whole path."""
     parts, other_parts = path.parts, [other.parts for other in others]
     lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in other_parts))
     return str(Path(*parts[-next(lengths, len(parts)) :]))
@@ -126,7 +126,7 @@ def check_space(path: Path, size: int, cure: str = MAKE_ROOM) -> None:
         DataError: The disk has less space left.
     """
     disk = _disk(path)
-    if disk.total and size > disk.free:  # A file system like /proc has no bytes; writing to it says why.
+    if disk.total and size > disk.free:  # The total of /proc is 0: let the write fail.
         problem = f"no space: needs about {format_bytes(size)}, the disk has {format_bytes(disk.free)} left"
         raise DataError(problem, file=path, cure=cure)
 
@@ -136,7 +136,7 @@ def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
     """Raise a FullDiskError that names ``path``, and the ``size`` of the output, when the block fills the disk.
 
     The operating system's error for a write names no file. Of nested blocks, the outermost names the output; the size
-    is that of the outermost block that has one. Other system errors get the name ``path`` if they name no file, or a
+    is that of the outermost block that has one. Other system errors get ``path`` as filename if they name no file, or a
     hidden one.
     """
     try:
@@ -170,7 +170,7 @@ def atomic_write(path: Path, size: int = 0, follow: bool = True) -> Iterator[IO[
     """
     target = _follow(path) if follow else path
     partial = _hidden_path(target)
-    if _has_kind(partial, folder=True):  # of a folder of this name, which another process may write or resume
+    if _has_kind(partial, folder=True):  # of an output folder: refuse if it is in use, else remove it
         folder = PartialFolder(target)
         folder.open()
         folder.close()
@@ -203,7 +203,7 @@ def inside(folder: Path, *names: str) -> Path:
     """Return ``folder/names[0]/names[1]/...``, to write there; ``folder`` itself may be a symbolic link.
 
     Raises:
-        DataError: One of the names is a symbolic link, by which a stranger's folder could lead anywhere.
+        DataError: One of the names is a symbolic link, which in an untrusted folder could lead anywhere.
     """
     path = folder
     for name in names:
@@ -281,7 +281,7 @@ class PartialFolder:
         return notes
 
     def note(self, number: int, value: Mapping[str, Any]) -> None:
-        """Record that part ``number`` (from 0) is finished and on disk."""
+        """Record that part ``number`` (from 0) is on disk; :meth:`open` of a later process returns ``value``."""
         if self.identity is not None:
             sync_folder(self.content)
             write_json(self.root / "progress" / _note_name(number), _sealed_note(number, value))
@@ -314,7 +314,7 @@ class PartialFolder:
     def restore(self) -> None:
         """Give a folder its name back if a process was killed while it replaced the folder."""
         if not self._target.exists() and self._old.is_dir():
-            # The process still runs, or the disk cannot be written.
+            # The process is still running, or the disk is read-only.
             with contextlib.suppress(UsageError, OSError):
                 self._take_lock()
                 self.close()
@@ -327,8 +327,8 @@ class PartialFolder:
     def _read_notes(self, restart: bool) -> list[dict[str, Any]]:
         identity = _read_json(self.root / "identity.json", _MOST_IDENTITY)
         if isinstance(identity, dict) and identity != self.identity and not restart and can_resume(self.path):
-            own = self.identity or {}
-            names = ", ".join(name for name in own if identity.get(name) != own[name]) or "command"
+            expected = self.identity or {}
+            names = ", ".join(name for name in expected if identity.get(name) != expected[name]) or "command"
             problem = f"an unfinished output was started with other data or other options ({names})"
             cure = "finish it with the same options, or pass --overwrite to start again"
             raise UsageError(problem, file=self.path, cure=cure)
@@ -402,7 +402,7 @@ def remove(path: Path) -> None:
 
 
 def _has_kind(path: Path, folder: bool) -> bool:
-    """Return whether a path is a folder or regular file itself, not a pipe or a link, which may lead anywhere."""
+    """Return whether a path itself is a folder or, without ``folder``, a regular file; a link or pipe is neither."""
     try:
         mode = path.lstat().st_mode
     except OSError:
@@ -411,7 +411,7 @@ def _has_kind(path: Path, folder: bool) -> bool:
 
 
 def _remove_foreign(path: Path, folder: bool) -> None:
-    """Remove what has a hidden name but is not of the kind, folder or file, that drivax creates there."""
+    """Remove an entry that is not of the kind, folder or regular file, that drivax creates under its name."""
     if not _has_kind(path, folder):
         remove(path)
 
@@ -432,7 +432,7 @@ def _hidden_path(path: Path) -> Path:
 
 
 def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
-    """Open or create a file, and lock it; while another process has it, ``wait`` or raise BlockingIOError."""
+    """Open or create a file, and lock it; if another process holds the lock, ``wait`` or raise BlockingIOError."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as cleanup:
@@ -444,15 +444,15 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
             except OSError as error:
                 if error.errno not in _UNSUPPORTED:
                     raise
-            # Its last owner may have renamed or removed it in between.
+            # The previous owner of the lock may have renamed or removed the file in the meantime.
             if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                 cleanup.pop_all()
                 return file
 
 
 def _exchange(first: Path, second: Path) -> bool:
-    """Exchange the names of two folders in one step; return whether the disk can."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # of Linux
+    """Exchange the names of two folders in one step; return False if system or disk cannot."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # Linux only
     if rename is None:
         return False
     if rename(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), _RENAME_EXCHANGE) == 0:
@@ -464,17 +464,17 @@ def _exchange(first: Path, second: Path) -> bool:
 
 
 def _sealed_note(number: int, value: Any) -> dict[str, Any]:
-    """Return a note with the SHA-256 (hex) of its number and its JSON value, whatever its form in a file."""
+    """Return a note: a value, and the SHA-256 (hex) of number and value as JSON with sorted keys."""
     digest = hashlib.sha256(json.dumps([number, value], sort_keys=True).encode()).hexdigest()
     return {"sha256": digest, "value": value}
 
 
 def parse_json(data: bytes) -> Any:
-    """Return the content of JSON text, whose values are counted first: ``[0],`` takes 30 times its bytes in memory.
+    """Parse JSON text after counting its values: text such as ``[0],`` takes 30 times its bytes in memory.
 
     Raises:
-        ValueError: It is not JSON, or has too many values.
-        RecursionError: It is nested too deeply.
+        ValueError: The text is not JSON, or has too many values.
+        RecursionError: The text is nested too deeply.
     """
     # An upper bound: texts may contain these characters, too.
     count, most = sum(map(data.count, (b",", b"[", b"{"))), max(MOST_VALUES, len(data) // _LEAST_VALUE_BYTES)
@@ -484,7 +484,7 @@ def parse_json(data: bytes) -> Any:
 
 
 def _read_json(path: Path, most: int) -> Any:
-    """Return the JSON value of a note of at most ``most`` bytes; None if drivax did not write it."""
+    """Return the content of a JSON file; None if it is invalid, larger than ``most`` bytes, or not a regular file."""
     try:
         if _has_kind(path, folder=False) and path.stat().st_size <= most:
             return parse_json(path.read_bytes())

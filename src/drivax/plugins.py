@@ -51,7 +51,7 @@ def find_named(name: str, trust: Collection[str] | None = None) -> Any:
 
     Raises:
         UsageError: The name is not dotted or not trusted, its module cannot be imported or lacks the object, or the
-            object is none that data may name.
+            object may not be named by data.
     """
     if not is_dotted(name):
         raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")
@@ -78,10 +78,10 @@ def trust_cure(names: Collection[str]) -> str:
 
 
 def _may_be_named(thing: Any, name: str) -> bool:
-    """Return whether data may lead to an object by its name: what its package defines, or a component of drivax.
+    """Return whether data may name an object: one that the package in the name defines, or a component of drivax.
 
-    A component is a dataclass, an instance of one, or a reward term or feature of ``drivax.tasks``, which is pure; its
-    name has no underscore in front.
+    A component is a dataclass, an instance of one, or a reward term or feature of ``drivax.tasks`` (a pure function),
+    without a leading underscore in its name.
     """
     if (package := _package_of(thing)) != "drivax":
         return package == name.partition(":")[0].partition(".")[0]
@@ -150,10 +150,10 @@ def dotted_name(thing: Any) -> str:
 
 
 def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
-    """Check that a callable accepts as many positional arguments; a term of drivax must annotate them with these types.
+    """Check that a callable accepts a positional argument of each type; a term of drivax must annotate these types.
 
     Raises:
-        ValueError: The signature differs or, as of some builtins, is unknown.
+        ValueError: The signature differs or is unknown, as for some builtins.
     """
     hints = typing.get_type_hints(function) if _is_term(function) else {}
     if not _accepts(function, arguments) or (hints and tuple(hints.values())[: len(arguments)] != arguments):
@@ -214,11 +214,11 @@ def check_protocol(thing: Any, name: str, protocol: Any) -> None:
 
 
 def _check_method(thing: Any, name: str, member: str, expected: Any) -> None:
-    """Check the arguments of a method by their number, and those of drivax also by their names."""
+    """Check the number of a method's arguments, and for objects of drivax also their names."""
     method = getattr(thing, member, None)
     if not inspect.isfunction(expected) or not callable(method):
         return
-    # A method of an object has its `self` already.
+    # The signature of a bound method lacks `self`.
     arguments = tuple(inspect.signature(expected).parameters)[not isinstance(thing, type) :]
     signature = _signature(method)
     has_names = signature is not None and tuple(signature.parameters)[: len(arguments)] == arguments
@@ -237,7 +237,7 @@ def protocol_members(protocol: Any) -> list[str]:
 
 
 def name_of(function: Any, name: str = "") -> str:
-    """Return ``name``, or that of the function, or that of its class in snake_case."""
+    """Return ``name``, else the name of the function, else that of its class in snake_case."""
     name = name or getattr(function, "__name__", None) or ""
     if not name:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(function).__name__).lower()
@@ -247,7 +247,7 @@ def name_of(function: Any, name: str = "") -> str:
 
 
 def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
-    """Check that names are distinct and not taken."""
+    """Raise a ValueError if a name occurs twice or is in ``taken``."""
     used = set(taken)
     for name in names:
         if name in used:

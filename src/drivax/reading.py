@@ -1,4 +1,4 @@
-"""Read files of a stranger: sizes are bounded before memory is taken, and damage is one line."""
+"""Read untrusted files: sizes are checked before memory is allocated, and damage is reported in one line."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ DAMAGE = (
 )  # fmt: skip
 #: Largest text file, in bytes: recordings and maps in JSON have 0.1 to 40 MB.
 MOST_TEXT = 64 << 20
-#: Longest line of a text, and longest row of a table, in characters: those of drivax have up to 5,000. Cells of a table
-#: end at ``csv.field_size_limit`` (131,072).
+#: Longest line of a text, and longest row of a table, in characters: those of drivax have up to 5,000. A cell has at
+#: most ``csv.field_size_limit`` (131,072).
 MOST_LINE = 1 << 20
 _HEADER_LIMIT = 100_000
-#: Threads take turns to parse headers: ``ast`` of Python 3.11 raises SystemError in several at a time.
+#: One thread at a time parses headers: ``ast`` of Python 3.11 raises SystemError in concurrent threads.
 _HEADER_LOCK = threading.Lock()
 
 
 @contextlib.contextmanager
 def explain_damage(file: Path, cure: str, problem: str = "is damaged") -> Iterator[None]:
-    """Raise a DataError with file, cause and cure when the block, which reads ``file``, cannot use its bytes.
+    """Raise a DataError with file, cause and cure if the block fails to read or parse ``file``.
 
     Failures of the disk and limits of the process have their own cures (:func:`drivax.errors.explain_system`).
     """
@@ -90,7 +90,7 @@ def read_bytes(file: Path, cure: str, most: int = MOST_TEXT) -> bytes:
     """Return the content of a file.
 
     Raises:
-        DataError: It is missing, larger than ``most`` bytes, or no regular file, which might never end.
+        DataError: The file is missing, larger than ``most`` bytes, or not a regular file (a pipe might never end).
     """
     check_regular(file, cure)
     with explain_damage(file, cure):
@@ -102,7 +102,7 @@ def read_text(file: Path, cure: str, most: int = MOST_TEXT) -> str:
     """Return the content of a UTF-8 file.
 
     Raises:
-        DataError: It is missing, larger than ``most`` bytes, or not text.
+        DataError: The file is missing, larger than ``most`` bytes, or not text.
     """
     data = read_bytes(file, cure, most)
     with explain_damage(file, cure, "is not text"):
@@ -113,7 +113,7 @@ def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        DataError: It is missing, larger than ``most`` bytes, nested too deeply, not JSON, or has too many values.
+        DataError: The file is missing, larger than ``most`` bytes, not JSON, nested too deeply, or has too many values.
     """
     data = read_bytes(file, cure, most)
     with explain_damage(file, cure, "is not valid JSON"):
@@ -121,7 +121,7 @@ def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
 
 
 def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
-    """Yield the lines of a UTF-8 file with their ends, of which one at a time is in memory.
+    """Yield the lines of a UTF-8 file with their line ends, reading one at a time.
 
     Raises:
         DataError: The file is missing, larger than ``most`` bytes, or not text, or has a line of more than
@@ -137,10 +137,10 @@ def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
 
 
 def read_csv(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[list[str]]:
-    """Yield the rows of a CSV file, of which one at a time is in memory.
+    """Yield the rows of a CSV file, reading one at a time.
 
     Raises:
-        DataError: As of :func:`read_lines`, which holds for rows of several lines, too, or a cell is too long.
+        DataError: As for :func:`read_lines`, whose limit also holds for rows of several lines; or a cell is too long.
     """
     length = 0
 
@@ -170,7 +170,7 @@ def read_arrays(
     ``check`` gets the shapes and types of all arrays by name before any is unpacked.
 
     Raises:
-        DataError: It is missing or damaged, or it or its content has more than ``most`` bytes.
+        DataError: The file is missing or damaged, or has more than ``most`` bytes, packed or unpacked.
     """
     content = io.BytesIO(read_bytes(file, cure, most))
     with explain_damage(file, cure, "not an .npz file, or damaged"), zipfile.ZipFile(content) as archive:
@@ -202,10 +202,10 @@ def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def parse_array(data: bytes) -> Array:
-    """Return the read-only array of ``.npy`` bytes; its shape can ask for no more memory than they have.
+    """Return the array in ``.npy`` bytes, read-only; the header must state the size of the data.
 
     Raises:
-        Exception: Of :data:`DAMAGE`.
+        Exception: One of :data:`DAMAGE`.
     """
     stream = io.BytesIO(data)
     shape, is_fortran, dtype = read_array_header(stream)
@@ -220,10 +220,10 @@ def parse_array(data: bytes) -> Array:
 
 
 def read_array_header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file, up to the first byte of data.
+    """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file; stop at the first byte of data.
 
     Raises:
-        Exception: Of :data:`DAMAGE`.
+        Exception: One of :data:`DAMAGE`.
     """
     with _HEADER_LOCK:
         version = np.lib.format.read_magic(file)

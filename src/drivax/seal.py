@@ -27,7 +27,7 @@ _MOST_BYTES, _MOST_SEALED_BYTES = 1 << 20, 4 << 30
 
 @dataclass(frozen=True)
 class _Block:
-    """Whether edited files are used, and those that were read, in order."""
+    """State of :func:`allow_edited`: whether edited files may be used, and those that were noted, in order."""
 
     is_allowed: bool
     files: dict[str, None] = field(default_factory=dict)
@@ -38,8 +38,8 @@ _block: ContextVar[_Block | None] = ContextVar("block", default=None)
 
 def seal(folder: Path, *names: str) -> None:
     """Seal files of a folder in their present state: their content, or that they do not exist."""
-    former = edited_files(folder)  # An edited file stays one: its entry does not change.
-    digests = {name: _digest(folder / name) for name in names if str(folder / name) not in former}
+    edited = edited_files(folder)  # Their entries do not change, so that they stay edited.
+    digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
     write_json(folder / SEAL, {**_read(folder / SEAL), **digests}, follow=False)
 
 
@@ -55,7 +55,7 @@ def check_seal(file: Path) -> None:
     """Check that a file is as it was sealed, before it is read.
 
     Raises:
-        DataError: The file changed, appeared or disappeared since, or the seal is damaged; not in :func:`allow_edited`.
+        DataError: The file changed, appeared or disappeared since, or the seal is damaged (:func:`refuse_edited`).
     """
     entries = _read(file.parent / SEAL)
     if file.name in entries and (digest := _digest(file)) != (sealed := entries[file.name]):
@@ -67,7 +67,7 @@ def require_entries(folder: Path, *names: str) -> None:
     """Check that the seal of a folder that was sealed still exists and has entries for these files.
 
     Raises:
-        DataError: The seal is missing or damaged, or lacks an entry; not in :func:`allow_edited`.
+        DataError: The seal is missing or damaged, or lacks an entry (:func:`refuse_edited`).
     """
     entries = _read(folder / SEAL)
     if missing := [name for name in names if name not in entries]:

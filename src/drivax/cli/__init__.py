@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """The line of a command in the list of commands, and whether it takes settings of its configuration."""
+    """A command: its line in the list of commands, and whether it takes settings of its configuration."""
 
     summary: str
     overrides: bool = False
@@ -55,11 +55,11 @@ _FLAGS = ("--debug", "--no-cache", "--edited")
 #: Width of tables and help that are not printed to a terminal, and the largest width of tables that are.
 _COLUMNS = 100
 #: Ends of the paths of Python files whose functions no exception may interrupt.
-_BAD_MOMENTS = (
+_UNINTERRUPTIBLE_FILES = (
     "<frozen importlib._bootstrap>", "multiprocessing/popen_spawn_posix.py", "multiprocessing/resource_tracker.py",
     "multiprocessing/synchronize.py", "orbax/checkpoint/_src/asyncio_utils.py",
 )  # fmt: skip
-#: Delay until a signal that came at a bad moment is sent again, and time after which it is obeyed at any moment, s.
+#: Delay until a signal that came during such a function is sent again, and time after which it is obeyed anyway, s.
 _RESEND_S, _PATIENCE_S = 0.01, 10.0
 COMMANDS = {
     "demo": Command("the whole pipeline on the built-in world: generate, train, evaluate, report"),
@@ -170,9 +170,9 @@ class _SignalHandler:
     A signal waits, 10 s at most, for the end of
 
     - an import: modules of C++ crash when an exception interrupts their initialisation;
-    - the start of a worker process, which else misses its arguments;
-    - the creation or removal of a semaphore, of which Python's process that removes them else has a wrong list;
-    - the use of an event loop by Orbax, which else reports a loop that is not closed.
+    - the start of a worker process, which would otherwise miss its arguments;
+    - the creation or removal of a semaphore, which Python's resource tracker would otherwise lose;
+    - the use of an event loop by Orbax, which would otherwise report an unclosed loop.
     """
 
     def __init__(self, signals: Sequence[signal.Signals]) -> None:
@@ -188,7 +188,7 @@ class _SignalHandler:
             signal.signal(number, self)
 
     def remove(self, previous: Mapping[signal.Signals, Any]) -> None:
-        """Send no signal again, and restore the handlers of before."""
+        """Cancel signals that are to be sent again, and restore the ``previous`` handlers."""
         for timer in self._timers.values():
             timer.cancel()
         if sys.unraisablehook == self._raise_again:
@@ -200,29 +200,29 @@ class _SignalHandler:
         """Handle a signal in the main thread, which executes ``frame``."""
         now_s = time.monotonic()
         waited_s = now_s - self._first_s.setdefault(number, now_s)
-        if waited_s < _PATIENCE_S and _is_bad_moment(frame):
-            # Ever later, because on a busy machine a signal every 10 ms takes all of the time.
+        if waited_s < _PATIENCE_S and _is_uninterruptible(frame):
+            # Wait longer each time: on a busy machine, a signal every 10 ms would take all of the time.
             self._send_later(number, max(_RESEND_S, waited_s / 2))
             return
-        # Another exception would interrupt the removal of partial output, or of this handler. With SIG_IGN, Python
-        # reports signals that have come already.
+        # Another exception would interrupt the removal of partial output, or of this handler. With SIG_IGN,
+        # Python would report signals that have already come.
         for other in {signal.SIGTERM, signal.SIGHUP}.intersection(self.signals):
             signal.signal(other, lambda *_: None)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise Stopped(signal.Signals(number))
 
-    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
+    def _raise_again(self, unraisable: sys.UnraisableHookArgs) -> None:
         # Python drops exceptions of callbacks, such as JAX's garbage collection callback.
-        error = dropped.exc_value
+        error = unraisable.exc_value
         if not isinstance(error, KeyboardInterrupt):
-            self._report_unraisable(dropped)
+            self._report_unraisable(unraisable)
             return
         self.install()
         self._send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _RESEND_S)
 
     def _send_later(self, number: int, wait_s: float) -> None:
-        """Send a signal to the main thread again, which wakes it if it waits."""
+        """Send a signal to the main thread again after ``wait_s``; it wakes a waiting thread."""
         if number in self._timers:
             self._timers[number].cancel()
         main_thread = threading.main_thread().ident
@@ -231,10 +231,10 @@ class _SignalHandler:
         self._timers[number].start()
 
 
-def _is_bad_moment(frame: FrameType | None) -> bool:
+def _is_uninterruptible(frame: FrameType | None) -> bool:
     """Return whether a function that no exception may interrupt is running."""
     while frame is not None and frame.f_code is not main.__code__:
-        if frame.f_code.co_filename.endswith(_BAD_MOMENTS):
+        if frame.f_code.co_filename.endswith(_UNINTERRUPTIBLE_FILES):
             return True
         frame = frame.f_back
     return False
@@ -302,10 +302,10 @@ def _run(name: str, command: Command, arguments: list[str], use_cache: bool) -> 
     """Parse the arguments of a command and run it."""
     import tyro
 
-    # Before the module is imported: JAX reads the setting as it starts.
+    # Before the module is imported: JAX reads the setting when it is imported.
     cache = use_compilation_cache() if use_cache else None
     if not use_cache:
-        # Also for a folder of JAX's own variable, which is read when a command imports JAX.
+        # This also disables a cache folder that JAX_COMPILATION_CACHE_DIR names.
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     check_memory_limit()  # nearly all commands use JAX
     module = importlib.import_module(f"drivax.cli.{name}")

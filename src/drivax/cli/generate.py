@@ -50,7 +50,7 @@ class Generate:  # noqa: D101
     out: tyro.conf.Positional[Path]
     """Scenario set to write (a folder); with --benchmark the folder of the four sets."""
     scenarios: int | None = None
-    """How many scenarios, 256 by default; with --benchmark those of train, by default 4,096, others in proportion."""
+    """Number of scenarios, 256 by default; with --benchmark those of train, 4,096 by default, others in proportion."""
     seed: int | None = None
     """Seed of the set, 0 by default; scenario i of a seed does not depend on the number of scenarios."""
     config: Path | None = None
@@ -97,7 +97,7 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
 
 
 def _audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
-    """Audit scenarios; JAX is imported in the audit's thread, while workers draw."""
+    """Audit scenarios; the thread of the audit imports JAX while workers generate."""
     from drivax.evaluation.audit import audit
 
     return audit(scenarios)
@@ -126,8 +126,8 @@ def coverage(families: Mapping[str, FamilyCount]) -> list[str]:
     width = max(map(len, totals))
     lines = [f"  {sum(totals.values()):,} scenarios with an event:"]
     for event in sorted(totals):
-        where = ", ".join(
+        counts_text = ", ".join(
             f"{name} {count.events[event]}" for name, count in families.items() if event in count.events
         )
-        lines.append(f"    {event:<{width}}  {totals[event]:>6,} ({where})")
+        lines.append(f"    {event:<{width}}  {totals[event]:>6,} ({counts_text})")
     return lines

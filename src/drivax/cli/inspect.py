@@ -41,7 +41,7 @@ class Inspect:
     html: Path | None = None
     """Write a page with histograms to this file instead of printing tables."""
     no_check: bool = False
-    """Skip the checksums, which read the whole set."""
+    """Skip the test of checksums, which reads the whole set."""
     observations: bool = False
     """Describe the observations of a planner: distributions, correlation with collisions and actions."""
     planner: str | None = None

@@ -56,8 +56,8 @@ class Train:
     out: Path
     """Run folder to write."""
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
-    """Scenario set for the choice of the best checkpoint. By default DATA holds out whole recordings, about a tenth of
-    its scenarios (at most 256), or if none is so small the smallest of several; `none` trains on all of them."""
+    """Scenario set for the choice of the best checkpoint. By default, whole recordings of DATA are held out: about a
+    tenth of its scenarios (at most 256), or the smallest of several if none fits; `none` trains on all of them."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc, offline algorithms and sac with demonstrations draw logged steps by them."""
     scale: Literal["step", "scenario"] | None = None
@@ -106,7 +106,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
 
 
 def _validation(name: str) -> ScenarioSet | Literal["held_out"] | None:
-    """Return the validation of a name: ``held_out``, none, or a scenario set."""
+    """Return the validation data that a name stands for: ``held_out``, None, or a scenario set."""
     if name == "held_out":
         return name
     return None if name == "none" else ScenarioSet.open(name)

@@ -26,7 +26,7 @@ _RIGHT, _TOP, _BOTTOM = 12, 10, 34
 Points = Float[np.ndarray[Any, Any], "point 2"]
 #: Maximum number of points of a line; longer lines are averaged into bins.
 _MAX_POINTS = 150
-#: Groups of quantities with visible curves, in order.
+#: Groups of quantities whose curves are visible, not collapsed, in order.
 _VISIBLE = ("validation", "evaluation", "rollout")
 
 
@@ -50,15 +50,15 @@ def chart(
 ) -> str:
     """Return one chart as HTML, with a title above and ``x_label`` below.
 
-    ``lines`` has the stroke and the points (x, y) of each line; some line has points. With ``share``, the vertical axis
-    spans 0 to 1 if all values fit.
+    ``lines`` has the stroke and the points (x, y) of each line; at least one line must have points. With ``share``, the
+    vertical axis spans 0 to 1 if all values fit.
     """
     series = {name: (style, _bin_points(points)) for name, (style, points) in lines.items() if len(points)}
     values = np.concatenate([points for _, points in series.values()])
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
-    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # an axis has a length
+    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # a length above 0
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
     shapes = [axes.grid_line(value, compact(value)) for value in y_ticks]
     shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]
@@ -122,11 +122,11 @@ class Axes:
         y = HEIGHT - _BOTTOM + 15
         return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
 
-    def figure(self, title: str, shapes: Iterable[str], x_label: str, facts: str = "") -> str:
-        """Return the chart with its caption, shapes and label of the horizontal axis; ``facts`` is HTML."""
+    def figure(self, title: str, shapes: Iterable[str], x_label: str, subtitle: str = "") -> str:
+        """Return the chart with its caption, shapes and label of the horizontal axis; ``subtitle`` is HTML."""
         middle = (self.left + WIDTH - _RIGHT) / 2
         return (
-            f"<figure class=chart><figcaption>{escape(title)}{facts}</figcaption>"
+            f"<figure class=chart><figcaption>{escape(title)}{subtitle}</figcaption>"
             f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(shapes)}'
             f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text></svg></figure>'
         )
@@ -163,7 +163,7 @@ def series_legend(names: Sequence[str]) -> str:
 
 
 Values = Float[np.ndarray[Any, Any], "_"]
-#: Metrics with a chart, in order.
+#: Metrics with a distribution chart, in order.
 SPREAD = (
     "vmax_score", "progress_ratio", "min_ttc", "average_ttc", "max_jerk", "max_lateral_acceleration", "comfort",
     "speeding_max", "route_deviation_max", "ade", "goal_distance", "distance",
@@ -206,7 +206,7 @@ def distribution(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
 def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenario") -> str:
     """Return one histogram as HTML: the share of each series in common bins, labelled with the unit.
 
-    Some series has values.
+    At least one series must have values.
     """
     values = np.concatenate(list(series.values()))
     edges = bins(values)
@@ -215,14 +215,14 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     low, high = float(edges[0]), float(edges[-1])
     axes = Axes(low, high, 0.0, levels[-1], left=44)
     shapes = [axes.grid_line(value, f"{compact(100 * value)} %") for value in levels]
-    integers = bool((values == np.round(values)).all())
+    are_integers = bool((values == np.round(values)).all())
     x_ticks = [value for value in ticks(low, high, 5) if low <= value <= high]
-    shapes += [axes.tick_label(value) for value in x_ticks if not integers or value == round(value)]
+    shapes += [axes.tick_label(value) for value in x_ticks if not are_integers or value == round(value)]
     draw = _bars if len(shares) == 1 else _outline
     shapes += [draw(axes, edges, share, stroke(index)) for index, share in enumerate(shares.values())]
     prefixes = {name: escape(f"{name}: ") if len(series) > 1 else "" for name in series}
-    facts = "".join(f"<small>{prefixes[name]}{_facts(numbers)}</small>" for name, numbers in series.items())
-    return axes.figure(title, shapes, unit, facts)
+    summaries = (f"<small>{prefixes[name]}{_summary(numbers)}</small>" for name, numbers in series.items())
+    return axes.figure(title, shapes, unit, "".join(summaries))
 
 
 def bins(values: Values, maximum: int = BINS) -> Values:
@@ -231,10 +231,10 @@ def bins(values: Values, maximum: int = BINS) -> Values:
     Each integer gets a bin centred on it if there are enough bins. A single value gets the middle one of three bins.
     """
     low, high = float(values.min()), float(values.max())
-    integers = bool((values == np.round(values)).all())
+    are_integers = bool((values == np.round(values)).all())
     if low == high:
         return low + np.array([-1.5, -0.5, 0.5, 1.5])
-    if integers and high - low < maximum:
+    if are_integers and high - low < maximum:
         return np.arange(low - 0.5, high + 1.0)
     # Begin at zero or below, unless all values are far above it.
     start = min(low, 0.0) if low < 0.5 * high else low
@@ -245,7 +245,7 @@ def bins(values: Values, maximum: int = BINS) -> Values:
 
 
 def short(value: Any) -> str:
-    """Return a number with three figures, but no more than two decimals and all digits before them."""
+    """Format a number with three significant digits, but at most two decimals and all digits before the point."""
     value = float(value)
     if abs(value) >= 100 or value == round(value):
         return f"{value:,.0f}"
@@ -258,7 +258,7 @@ def _shares(values: Values, edges: Values) -> Values:
     return counts / max(len(values), 1)
 
 
-def _facts(values: Values) -> str:
+def _summary(values: Values) -> str:
     """Return median, maximum and number of values as text."""
     if not len(values):
         return "n 0"

@@ -50,7 +50,7 @@ class EpisodeGroup:
 
     @property
     def key(self) -> ScenarioKey:
-        """The scenario."""
+        """Data set and id of the scenario."""
         return self.dataset, self.scenario_id
 
 
@@ -190,7 +190,7 @@ def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
 
 
 def logged_motion(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
-    """Return position, heading and speed of the logged ego; NaN where it is not valid."""
+    """Return position [m], heading [rad] and speed [m/s] of the logged ego at every step; NaN where it is not valid."""
     steps = int(scenario.steps)
     speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
     pose = np.column_stack((scenario.agent_xy[:steps, 0], scenario.agent_heading[:steps, 0], speed))

@@ -92,7 +92,7 @@ class Inspection:
 
     @property
     def source(self) -> Mapping[str, Any]:
-        """Origin of the set, with the records read and skipped; empty for handmade sets."""
+        """Provenance of the set, with the records read and skipped; empty for handmade sets."""
         return self.scenarios.manifest["source"]
 
     def sample(self, maximum: int | None = None) -> Iterator[Scenario]:
@@ -159,7 +159,7 @@ class Inspection:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number of a scenario in tables and histograms."""
+    """A quantity of scenarios in tables and histograms; ``read`` returns its value from a manifest entry."""
 
     label: str
     unit: str
@@ -172,7 +172,7 @@ class Quantity:
         return cls(label, unit, lambda entry: reduce(getitem, path, entry).get(name, default))
 
 
-#: Numbers of every scenario: of its source, before cropping and capping; its stored segments; and of its audit.
+#: Counts of a scenario's source before cropping and capping, its number of stored segments, and findings of its audit.
 QUANTITIES = (
     Quantity.of("agents now", "source", "tracks_valid_now"),
     Quantity.of("tracks", "source", "tracks"),
@@ -309,7 +309,7 @@ def _counts(entry: Entry) -> tuple[int, ...]:
 
 
 def with_distinct_names(inspections: Sequence[Inspection]) -> list[Inspection]:
-    """Return the sets, each of a repeated name with the shortest end of its path that distinguishes it."""
+    """Return the sets; those that share a name get the shortest ends of their paths that distinguish them as names."""
     paths = [inspection.scenarios.path.resolve() for inspection in inspections]
     others = [[other for other in paths if other.name == path.name and other != path] for path in paths]
     triples = zip(inspections, paths, others, strict=True)

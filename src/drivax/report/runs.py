@@ -19,7 +19,7 @@ from drivax.seal import edited_files, mark_edited
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
 Array = np.ndarray[Any, Any]
-#: Most curves of a training; those of the presets have up to a hundred.
+#: Maximum number of curves of a training; those of the presets have up to a hundred.
 _MOST_CURVES = 10_000
 
 

@@ -68,7 +68,7 @@ def data_element(value: Any, **attributes: str) -> str:
 
 
 def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return a table with a label and its facts in each row."""
+    """Return an HTML table with a label and its facts in each row."""
     columns = tuple(Column(heading, label=index == 0) for index, heading in enumerate(headings))
     return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
 

@@ -347,7 +347,7 @@ def _run(
     """Return a run's episodes, worst first."""
     rows = sort_worst_first(run, [other for other in runs if other is not run])
     outcomes = [outcome(run, row) for row in rows]
-    distinct = list(dict.fromkeys(outcomes))
+    outcome_names = list(dict.fromkeys(outcomes))
     keys = run.scenarios
     scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
     crash_rows = [(row, crashes[key]) for row, key in enumerate(scenarios) if key in crashes]
@@ -355,8 +355,8 @@ def _run(
         "name": run.name,
         "playable": comparable(run, runs[-1]),
         "scenario": [index_of[key] for key in scenarios],
-        "outcomes": distinct,
-        "outcome": [distinct.index(name) for name in outcomes],
+        "outcomes": outcome_names,
+        "outcome": [outcome_names.index(name) for name in outcomes],
         "errors": {str(row): (crash.step, crash.error) for row, crash in crash_rows},
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
@@ -376,15 +376,15 @@ def _round_significant(value: float) -> float:
 
 
 def _tags(scenario_tags: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-    """Return each selectable tag: its values, and the indices of those of each scenario."""
+    """Return each selectable tag: its words, and the indices of each scenario's words."""
     columns = []
     for name in dict.fromkeys(name for tags in scenario_tags for name in tags):
         values = [tags.get(name, result_tables.UNKNOWN).split("|") for tags in scenario_tags]
-        distinct = sorted({word for words in values for word in words})
-        if 1 < len(distinct) <= MAX_TAG_VALUES:
-            index_of = {word: index for index, word in enumerate(distinct)}
+        vocabulary = sorted({word for words in values for word in words})
+        if 1 < len(vocabulary) <= MAX_TAG_VALUES:
+            index_of = {word: index for index, word in enumerate(vocabulary)}
             indices = [[index_of[word] for word in words] for words in values]
-            columns.append({"name": name, "words": distinct, "of": indices})
+            columns.append({"name": name, "words": vocabulary, "of": indices})
     return columns
 
 

@@ -28,7 +28,7 @@ _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red", "log_revers
 def select_rows(
     data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = (), order: Sequence[int] | None = None
 ) -> list[int]:
-    """Return at most ``limit`` rows of a set: those of the ids, else of ``order``, which is that of the set by default.
+    """Return at most ``limit`` rows of a set: those of ``ids``, else the first of ``order`` (default: all, as stored).
 
     Of scenarios of several data sets with the same id, the first counts.
 
@@ -101,7 +101,7 @@ def criticality_html(table: ScoreTable, row: int) -> str:
 
 
 def _log(scenario: Scenario) -> Rollout:
-    """Return the log as a rollout; the audit knows its first collision and off-road step, from the current step on."""
+    """Return the log as a rollout, with the first collision and off-road step that the audit found."""
     steps = {name: scenario.audit.get(f"first_{name}_step") for name in ("collision", "offroad")}
     events = {name: -1 if step is None else int(step) for name, step in steps.items()}
     return Rollout("log", logged_motion(scenario), 0, events, findings(scenario))

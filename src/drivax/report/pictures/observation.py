@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Values = np.ndarray[Any, Any]
-#: Colours by position in one-hot features: kinds of agents, states of lights (by name), kinds of road (and widths).
+#: Colours in the order of one-hot features: kinds of agents, states of lights (by name), kinds of road (with widths).
 _KINDS = ("vehicle", "pedestrian", "cyclist", "other")
 _STATES = {"unknown": "unknown", "green": "green", "yellow": "amber", "red": "red"}
 _ROADS = {"lane": ("lane", 1.6), "edge": ("edge", 2.2), "crosswalk": ("line", 5.0)}
@@ -36,7 +36,7 @@ _MIN_EXTENT_M = ((20.0, 12.0), (-8.0, -12.0))
 _MIN_ASPECT = 0.66
 #: Radius of the dot for an agent of unknown size, m.
 _DOT_M = 0.9
-#: Factors that turn scaled features into m and m/s; road pieces have another length.
+#: Factors that turn scaled features into m and m/s; the length of road pieces has another.
 _SCALE = {
     "position": POSITION_M, "goal": POSITION_M, "velocity": SPEED_MPS, "length": SIZE_M, "width": SIZE_M
 }  # fmt: skip
@@ -172,8 +172,8 @@ def _draw_road(axes: Axes, groups: ObservationGroups) -> None:
         length = groups["road", "length"][mask]
     if groups.has("road", "type"):
         kinds = groups["road", "type"][mask]
-    half = direction * length / 2
-    pieces = _to_paper(np.stack([middle - half, middle + half], axis=1))
+    half_piece = direction * length / 2
+    pieces = _to_paper(np.stack([middle - half_piece, middle + half_piece], axis=1))
     for number, (kind, (colour, width)) in enumerate(_ROADS.items()):
         is_kind = kinds[:, number] > 0
         style: dict[str, Any] = {"linewidths": width, "capstyle": "butt", "zorder": 1.5 - number / 4}

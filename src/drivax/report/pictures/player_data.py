@@ -26,7 +26,7 @@ from drivax.scenario.schema import Scenario
 Array = np.ndarray[Any, Any]
 #: Marks an absent pose or value.
 ABSENT = -32768
-#: Packed units per radian, and largest packed value: int16 holds little more.
+#: Packed units per radian, and largest packed value, close to that of int16.
 _PER_RADIAN, _MAX_VALUE = 10_000, 32_000
 
 
@@ -42,8 +42,8 @@ class Scale:
         """Return the scale that holds a box and 10 m around it."""
         low, high = np.array(box[:2]), np.array(box[2:])
         centre = (low + high) / 2
-        reach = float((high - low).max()) / 2 + 10.0
-        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach / _MAX_VALUE))
+        reach_m = float((high - low).max()) / 2 + 10.0
+        return cls((round(float(centre[0]), 2), round(float(centre[1]), 2)), max(0.01, reach_m / _MAX_VALUE))
 
     def points(self, xy: Array) -> Array:
         """Return points ``[..., 2]`` as int16."""

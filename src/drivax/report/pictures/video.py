@@ -101,7 +101,7 @@ def _select_episodes(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGr
 
 
 def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path]:
-    """Return the names of the files: the scenario's id, after its rank in a ranking."""
+    """Return the paths of the files, named by scenario id, with the rank in front if ``ranked``."""
     names = [re.sub(r"[^\w.+-]", "_", group.scenario_id) for group in groups]
     if ranked:
         digits = len(str(len(names)))
@@ -247,8 +247,8 @@ class Canvas:
 
     def bar(self, x: float, y: float, width: float, height: float, fill: str) -> None:
         """Fill a rectangle in pixels with its upper left corner at (x, y)."""
-        edges = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
-        self._draw_pixels(edges, None, 0.0, fill)
+        corners = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
+        self._draw_pixels(corners, None, 0.0, fill)
 
     def _draw_pixels(self, points: Array, line: str | None, width: float, fill: str | None) -> None:
         """Draw a polygon in pixels from the upper left corner."""
@@ -289,8 +289,8 @@ def draw_frame(scenery: Scenery, rollout: Rollout, step: int, dt_s: float) -> Pi
     canvas.bar(0, 0, canvas.width, _BAR, "crosswalk")
     width = canvas.text(10, 20, rollout.planner, 14)
     canvas.text(20 + width, 20, rollout.outcome, 12, "mark" if rollout.outcome != "success" else "ink")
-    absent = not np.isfinite(rollout.ego[step]).all()
-    speed = "gone" if absent else f"{rollout.ego[step, 3]:.1f} m/s"
+    is_absent = not np.isfinite(rollout.ego[step]).all()
+    speed = "gone" if is_absent else f"{rollout.ego[step, 3]:.1f} m/s"
     canvas.text(canvas.width - 10, 20, f"{speed}   {step * dt_s:.1f} s", 12, right=True)
     events = ((name, first) for name, first in rollout.events.items() if name in EVENT_WORDS)
     past_events = ((name, first) for name, first in events if 0 <= first <= step)

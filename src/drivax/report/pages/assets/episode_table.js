@@ -9,7 +9,7 @@
   const players = [...document.querySelectorAll("[data-episode]")];
   const FIRST = 50, MORE = 200;
   const state = { matches: [], drawn: 0, sort: -1, reversed: false };
-  const kind = data.metrics.findIndex((metric) => metric.name === "collision_type");
+  const kindMetric = data.metrics.findIndex((metric) => metric.name === "collision_type");
 
   function make(tag, parent, text, name) {
     const node = parent.appendChild(document.createElement(tag));
@@ -144,9 +144,9 @@
     if (state.sort !== i) Object.assign(state, { sort: i, reversed: false });
     else if (!state.reversed) state.reversed = true;
     else Object.assign(state, { sort: -1, reversed: false });
-    const place = [...heads.children].findIndex((head) => head.contains(document.activeElement));
+    const focused = [...heads.children].findIndex((head) => head.contains(document.activeElement));
     list();
-    heads.children[place]?.querySelector("button")?.focus();
+    heads.children[focused]?.querySelector("button")?.focus();
   }
 
   function play(player) {
@@ -155,9 +155,9 @@
   }
 
   // --- From a table to the list -----------------------------------------------------------------------------------
-  function clear(place) {
+  function clear(runIndex) {
     form.run.form.reset();
-    form.run.value = String(place);
+    form.run.value = String(runIndex);
     outcomes();
     Object.assign(state, { sort: -1, reversed: false });
   }
@@ -169,7 +169,7 @@
       if (i >= 0) tags[i].value = String(data.tags[i].words.indexOf(word));
     }
     if (link.kind !== undefined) {
-      form.metric.value = String(kind); form.sign.value = "eq"; form.bound.value = String(link.kind);
+      form.metric.value = String(kindMetric); form.sign.value = "eq"; form.bound.value = String(link.kind);
     }
     const i = data.metrics.findIndex((metric) => metric.name === link.metric);
     if (i >= 0 && data.metrics[i].bad !== null) form.failed.value = String(i);

@@ -338,7 +338,7 @@
 
   const step = (by) => { play(false); seek(Math.floor(state.time) + by); };
 
-  let before = 0;
+  let previousMs = 0;
   function play(on) {
     if (on === state.playing) return;
     state.playing = on;
@@ -346,14 +346,14 @@
     control.play.setAttribute("aria-label", on ? "pause" : "play");
     if (!on) return;
     if (state.time >= state.episode.steps - 1) state.time = 0;
-    before = performance.now();
+    previousMs = performance.now();
     requestAnimationFrame(advance);
   }
 
-  function advance(now) {
+  function advance(nowMs) {
     if (!state.playing) return;
-    seek(state.time + (Math.max(0, now - before) / 1000 / state.episode.dt) * Number(control.speed.value));
-    before = now;
+    seek(state.time + (Math.max(0, nowMs - previousMs) / 1000 / state.episode.dt) * Number(control.speed.value));
+    previousMs = nowMs;
     if (state.time >= state.episode.steps - 1) play(false);
     else requestAnimationFrame(advance);
   }
@@ -376,9 +376,9 @@
   }
 
   document.addEventListener("keydown", (event) => {
-    const own = event.target.closest("button, select, input, summary, a, .scroll");
-    const native = own && (event.key === " " || own.matches("select, input, .scroll"));
-    if (!keys[event.key] || native || event.ctrlKey || event.metaKey || event.altKey || !visible()) return;
+    const widget = event.target.closest("button, select, input, summary, a, .scroll");
+    const isHandled = widget && (event.key === " " || widget.matches("select, input, .scroll"));
+    if (!keys[event.key] || isHandled || event.ctrlKey || event.metaKey || event.altKey || !visible()) return;
     event.preventDefault();
     keys[event.key]();
   });

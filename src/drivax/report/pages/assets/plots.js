@@ -29,10 +29,10 @@
 
   // Grid lines at multiples of a round distance (1, 2 or 5 times a power of ten), at most five.
   function grid(low, high) {
-    const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
-    const apart = [1, 2, 5, 10].map((factor) => factor * power).find((width) => width >= rough);
-    const first = Math.ceil(low / apart - 1e-9), last = Math.floor(high / apart + 1e-9);
-    return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * apart);
+    const minimum = (high - low) / 4, power = 10 ** Math.floor(Math.log10(minimum));
+    const spacing = [1, 2, 5, 10].map((factor) => factor * power).find((width) => width >= minimum);
+    const first = Math.ceil(low / spacing - 1e-9), last = Math.floor(high / spacing + 1e-9);
+    return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * spacing);
   }
 
   // Limits are drawn where values come near them; otherwise they would flatten every line.
@@ -65,10 +65,10 @@
       draw("text", svg, { x: x(time / episode.dt), y: HEIGHT - 6, "text-anchor": "middle" }, `${short(time)} s`);
     }
     lines.forEach((line, i) => {
-      let path = "", down = false;
+      let path = "", isDrawing = false;
       line.forEach((value, step) => {
-        if (value !== null) path += `${down ? "L" : "M"}${x(step).toFixed(1)} ${y(value).toFixed(1)}`;
-        down = value !== null;
+        if (value !== null) path += `${isDrawing ? "L" : "M"}${x(step).toFixed(1)} ${y(value).toFixed(1)}`;
+        isDrawing = value !== null;
       });
       const [stroke, dash] = strokes[i % strokes.length];
       draw("path", svg, { d: path, stroke, "stroke-dasharray": dash });
