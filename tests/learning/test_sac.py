@@ -227,7 +227,7 @@ def test_impossible_settings_are_refused():
     with pytest.raises(UsageError, match="demonstrations is 1"):
         SacConfig(network=NETWORK, demonstrations=1)
     for share, count in ((0.03, 0), (0.97, 16)):
-        with pytest.raises(UsageError, match=f"demonstrations are {count} of 16 steps of a batch"):
+        with pytest.raises(UsageError, match=f"rounds to {count} logged steps in a batch of 16"):
             replace(CONFIG, demonstrations=share)
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)

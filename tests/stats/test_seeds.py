@@ -38,7 +38,7 @@ def test_crossed_difference_by_hand():
     assert result.scenarios == pytest.approx(2 * (0.25 + 0.25) / 4)
     # Residuals of either kind are +-1/4 in a checkerboard: 2 (4 (1/8)^2) / 2 = 1/16.
     assert result.interaction == pytest.approx((0.0625, 0.0625))
-    assert result.error == pytest.approx(math.sqrt(0.125 + 0.25 - 0.125))
+    assert result.standard_error == pytest.approx(math.sqrt(0.125 + 0.25 - 0.125))
     parts = (0.0625, 0.0625, 0.25)
     assert result.degrees_of_freedom == pytest.approx(0.25**2 / sum(part**2 for part in parts))
 
@@ -108,7 +108,7 @@ def test_standard_error_is_the_deviation_of_the_difference(effects):
         result.append(crossed_difference(a + apart * rng.normal(size=60), b))
     scatter = np.var([one.difference for one in result])
     # Of 600 a variance is known to 6 %; that the error is never below either part costs some percent more.
-    assert 0.85 < np.mean([one.error**2 for one in result]) / scatter < 1.25
+    assert 0.85 < np.mean([one.standard_error**2 for one in result]) / scatter < 1.25
 
 
 def test_weights_count_scenarios_several_times():
@@ -170,7 +170,7 @@ def test_log_ratio_of_a_constant_ratio_is_exact():
     rng = np.random.default_rng(6)
     b = rng.uniform(1.0, 2.0, size=(3, 30))
     result = log_ratio(0.5 * b, b)
-    assert result.difference == pytest.approx(math.log(0.5)) and result.error > 0.0
+    assert result.difference == pytest.approx(math.log(0.5)) and result.standard_error > 0.0
     assert log_ratio(0.0 * b, b) is None
 
 

@@ -504,7 +504,7 @@ def _empty_error(data: Survey, sink: _Sink) -> DataError:
         return DataError("contains no recording", file=data.root, cure="run drivax doctor on it")
     first, others = sink.skipped[0], len(sink.skipped) - 1
     if others:
-        problem = f"{first.problem} (and none of the other {count_text(others, 'record')} could be converted)"
+        problem = f"{first.problem} ({count_text(others, 'more record')} could not be converted either)"
         first = replace(first, problem=problem)
     return first.error()
 

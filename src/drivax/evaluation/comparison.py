@@ -241,7 +241,7 @@ class _Contrast:
     ) -> Sensitivity | None:
         """Return the sensitivity over seeds; more scenarios do not reduce the variance of seeds."""
         plan, effect = self.plan, self._seed_difference(self.plan.primary)[1]
-        if effect is None or effect.error == 0.0:
+        if effect is None or effect.standard_error == 0.0:
             return None
         power, needed = effect.power(smallest, plan.confidence), n
         if power < plan.power:

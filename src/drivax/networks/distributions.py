@@ -22,7 +22,7 @@ from drivax.scenario.record import record, static
 
 DistributionName = Literal["gaussian", "beta", "grid", "mixture"]
 #: Distributions whose samples have a gradient in all parameters.
-REPARAMETRISED: tuple[DistributionName, ...] = ("gaussian", "beta")
+REPARAMETERISED: tuple[DistributionName, ...] = ("gaussian", "beta")
 
 #: Bounds of the standard deviation of an unsquashed Gaussian.
 _MIN_SCALE, _MAX_SCALE = 1e-3, 2.0
@@ -54,7 +54,7 @@ class Distribution(Protocol):
     """A distribution over actions, or a batch of them; a pytree."""
 
     def sample(self, key: Array) -> Float[Array, "*batch raw"]:
-        """Sample a raw action, differentiable in all parameters if :data:`REPARAMETRISED`."""
+        """Sample a raw action, differentiable in all parameters if :data:`REPARAMETERISED`."""
         ...
 
     def log_prob(self, raw_action: Float[Array, "*batch raw"]) -> Float[Array, "*batch"]:

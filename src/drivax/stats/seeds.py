@@ -23,7 +23,7 @@ from drivax.stats.intervals import Interval, effective_size, normal_quantile, wi
 
 Values = Float64[np.ndarray, "seed scenario"]
 #: Values of another policy, with its own number of seeds.
-Others = Float64[np.ndarray, "other_seed other_scenario"]
+OtherValues = Float64[np.ndarray, "other_seed other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
 #: Defaults of a planned comparison.
 _CONFIDENCE, _POWER = 0.95, 0.80
@@ -66,10 +66,11 @@ class CrossedEffect:
     interaction: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def error(self) -> float:
+    def standard_error(self) -> float:
         """Standard error of the difference."""
-        seeds = sum(self.seeds)
-        return math.sqrt(max(seeds + self.scenarios - sum(self.interaction), seeds, self.scenarios))
+        seed_variance = sum(self.seeds)
+        variance = seed_variance + self.scenarios - sum(self.interaction)
+        return math.sqrt(max(variance, seed_variance, self.scenarios))
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -77,31 +78,31 @@ class CrossedEffect:
         variances = (*self.seeds, self.scenarios)
         dofs = (*(count - 1 for count in self.seed_counts), self.clusters - 1)
         denominator = sum(v**2 / dof for v, dof in zip(variances, dofs, strict=True) if v > 0.0)
-        return self.error**4 / denominator if denominator > 0.0 else math.inf
+        return self.standard_error**4 / denominator if denominator > 0.0 else math.inf
 
     @property
     def p(self) -> float:
         """Two-sided p-value of the null hypothesis of no difference."""
-        if self.error == 0.0:
+        if self.standard_error == 0.0:
             return 1.0 if self.difference == 0.0 else 0.0
-        return 2.0 * self._probability(-abs(self.difference) / self.error)
+        return 2.0 * self._probability(-abs(self.difference) / self.standard_error)
 
     def interval(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
         """Return the confidence interval of the difference."""
-        margin = self._critical(confidence) * self.error
+        margin = self._critical(confidence) * self.standard_error
         return self.difference - margin, self.difference + margin
 
     def detectable(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> float:
         """Return the smallest difference that is detected with probability ``power``."""
         if not 0.0 < power < 1.0:
             raise UsageError(f"power {power} is impossible", cure="give a power between 0 and 1")
-        return self.error * (self._critical(confidence) + self._quantile(power))
+        return self.standard_error * (self._critical(confidence) + self._quantile(power))
 
     def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
         """Return the probability of detecting a difference of this size."""
-        if self.error == 0.0:
+        if self.standard_error == 0.0:
             return float(difference != 0.0)
-        return self._probability(abs(difference) / self.error - self._critical(confidence))
+        return self._probability(abs(difference) / self.standard_error - self._critical(confidence))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
         """Return the smallest number of seeds per policy above the present one that detects the difference, or None."""
@@ -170,7 +171,7 @@ def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None =
     return crossed_difference(repeat_single_seed(values), np.zeros((2, values.shape[1])), clusters, weights)
 
 
-def repeat_single_seed(values: Values) -> Others:
+def repeat_single_seed(values: Values) -> OtherValues:
     """Repeat the values of a single seed, so that it has no variance, as for a planner without training."""
     return values if len(values) > 1 else np.repeat(values, 2, axis=0)
 
@@ -204,7 +205,7 @@ def seeds_interval(
 
 
 def crossed_difference(
-    a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
+    a: Values, b: OtherValues, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect:
     """Return the difference of the means of two policies.
 
@@ -244,7 +245,7 @@ def _seed_variances(values: Values, share: Weights, labels: Labels, correction: 
 
 
 def difference_interval(
-    a: Values, b: Others, clusters: Any = None, confidence: float = _CONFIDENCE
+    a: Values, b: OtherValues, clusters: Any = None, confidence: float = _CONFIDENCE
 ) -> tuple[Interval, CrossedEffect | None]:
     """Return the interval of the difference of two policies, of one or several seeds, and its :class:`CrossedEffect`.
 
@@ -261,7 +262,7 @@ def difference_interval(
 
 
 def log_ratio(
-    a: Values, b: Others, clusters: Any = None, weights: Weights | None = None
+    a: Values, b: OtherValues, clusters: Any = None, weights: Weights | None = None
 ) -> CrossedEffect | None:
     """Return ``ln(mean(a) / mean(b))`` with its error (delta method); None unless both means exist and are positive.
 
@@ -279,7 +280,7 @@ def log_ratio(
 
 
 def _weights_and_mask(
-    a: Values, b: Others, weights: Weights | None
+    a: Values, b: OtherValues, weights: Weights | None
 ) -> tuple[Float64[np.ndarray, " scenario"], Bool[np.ndarray, " scenario"]]:
     """Return the weight of each scenario, and the mask of those with a positive weight and only defined values."""
     weight = np.ones(a.shape[1]) if weights is None else np.asarray(weights, np.float64)

@@ -120,7 +120,7 @@ def orient_edges(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
     """Orient road edges so that most lane points next to them are on their left; keep edges without a majority."""
     centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
     if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
-        raise DataError("road edges and lanes of too many points", cure=SKIP)
+        raise DataError("road edges and lanes have too many points", cure=SKIP)
     return [points[::-1].copy() if _votes_left(points[:, :2], centres) < 0 else points for points in edges]
 
 

@@ -132,8 +132,8 @@ def _recording(
         tracks=tracks,
         features=features,
         lights=lights,
-        to_predict=table.find_marks("state/tracks_to_predict", rows),
-        of_interest=table.find_marks("state/objects_of_interest", rows),
+        to_predict=table.find_flagged("state/tracks_to_predict", rows),
+        of_interest=table.find_flagged("state/objects_of_interest", rows),
         tags={"source_format": source_format},
         lost=parsing.nonzero(
             paths=_paths(table),
@@ -197,7 +197,7 @@ def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
 
 def _ego_row(features: ExampleFeatures, rows: Array) -> int:
     """Return the index of the ego among the rows."""
-    ego = features.find_marks("state/is_sdc", rows)
+    ego = features.find_flagged("state/is_sdc", rows)
     if len(ego) != 1:
         raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
     return ego[0]

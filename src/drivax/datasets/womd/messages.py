@@ -276,8 +276,8 @@ class ExampleFeatures:
             raise DataError(f"feature {name} contains floats, not integers", cure=SKIP)
         return values
 
-    def find_marks(self, name: str, rows: _Array) -> tuple[int, ...]:
-        """Return the positions in ``rows`` of the rows with the value 1; none if the file lacks the feature."""
+    def find_flagged(self, name: str, rows: _Array) -> tuple[int, ...]:
+        """Return the positions within ``rows`` of the tracks whose feature is 1; none if the file lacks it."""
         if not self.has(name):
             return ()
         values = self.numbers(name, (self.numbers("state/id").size,))[rows]

@@ -427,7 +427,7 @@ class Constraints:
         ``multiplier' = max(0, multiplier + rate (cost - limit))`` with the cost per episode that ended; unchanged if
         none did.
         """
-        reward, after, logs = rollout.reward, dict[str, Array](), dict[str, Array]()
+        reward, next_multipliers, logs = rollout.reward, dict[str, Array](), dict[str, Array]()
         for name, limit in self.limits.items():
             multiplier, weight = multipliers[name], self.weights[name]
             cost = jnp.where(rollout.alive, rollout.terms[name] / -weight, 0.0)
@@ -436,7 +436,7 @@ class Constraints:
             episodes = jnp.sum(ends).astype(jnp.float32)
             excess = jnp.sum(cost) / jnp.maximum(episodes, 1.0) - limit
             step = jnp.where(episodes > 0.0, self.rate * excess, 0.0)
-            after[name] = jnp.maximum(multiplier + step, 0.0)
+            next_multipliers[name] = jnp.maximum(multiplier + step, 0.0)
             logs |= {f"multiplier/{name}": multiplier, f"cost/{name}": jnp.sum(cost)}
             logs[f"cost/{name}/n"] = episodes
-        return reward, after, logs
+        return reward, next_multipliers, logs

@@ -57,7 +57,7 @@ from drivax.learning.experience import (
 from drivax.learning.program import is_largest
 from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
 from drivax.networks.actor_critic import NetworkConfig
-from drivax.networks.distributions import REPARAMETRISED
+from drivax.networks.distributions import REPARAMETERISED
 from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
@@ -125,10 +125,13 @@ class SacConfig:
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")
         if not 0.0 <= self.demonstrations < 1.0:
-            raise UsageError(f"demonstrations is {self.demonstrations}", cure="use 0 to less than 1")
+            raise UsageError(
+                f"demonstrations is {self.demonstrations}", cure="use a share of at least 0 and below 1"
+            )
         if self.demonstrations and not 0 < self.logged_batch < self.batch:
-            problem = f"demonstrations are {self.logged_batch} of {self.batch} steps of a batch"
-            raise UsageError(problem, cure="use a share of at least one step, and less than all")
+            rounded = f"{self.logged_batch} logged steps in a batch of {self.batch}"
+            problem = f"demonstrations {self.demonstrations} rounds to {rounded}"
+            raise UsageError(problem, cure="choose a share of at least 1 step and less than the whole batch")
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             problem = f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows"
@@ -136,7 +139,7 @@ class SacConfig:
         if self.unroll < 2 and self.warm_up < 2 * self.environments:
             cure = f"set warm_up to {2 * self.environments} or more"
             raise UsageError("the first update has no step with a successor to sample", cure=cure)
-        if self.network.distribution not in REPARAMETRISED:
+        if self.network.distribution not in REPARAMETERISED:
             cure = "set distribution to gaussian or beta"
             raise UsageError("SAC needs a policy with reparameterised samples", cure=cure)
 
