@@ -77,10 +77,10 @@ class Pendulum:
     def draw(self, data, key, count):
         return key
 
-    def step(self, data, now, cache, action, key):
+    def step(self, data, now, cache, action, drawn):
         angle, rate, reward = swing(now.state.angle, now.state.rate, MAX_TORQUE * action[:, 0])
         moved = Swing(angle, rate, now.state.step + 1, now.state.earned + reward)
-        fresh = self._begin(key, len(now.over))
+        fresh = self._begin(drawn, len(now.over))
         state = jax.tree.map(lambda new, old: jnp.where(now.over, new, old), fresh, moved)
         over = (state.step >= STEPS) & ~now.over
         # Only whole episodes have a return: those at the start began in the middle.

@@ -62,9 +62,9 @@ class Bandit:
     def draw(self, data, key, count):
         return key
 
-    def step(self, data, now, cache, action, key):
+    def step(self, data, now, cache, action, drawn):
         pay = (action[:, 0] + 1.0) / 2.0
-        fails = (jax.random.uniform(key, pay.shape) < pay**2) & ~now.over
+        fails = (jax.random.uniform(drawn, pay.shape) < pay**2) & ~now.over
         terms = {"pay": pay, "failure": -self.price * fails}
         totals = {f"reward/{name}": jnp.sum(jnp.where(now.over, 0.0, term)) for name, term in terms.items()}
         outcome = Outcome(pay + terms["failure"], fails, ~fails & ~now.over, (), totals, terms)

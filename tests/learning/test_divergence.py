@@ -102,8 +102,8 @@ def test_learning_rate_of_1e30_is_noticed_in_its_iteration(name):
 class NanReward(Pendulum):
     """A pendulum whose reward is NaN after three steps."""
 
-    def step(self, data, now, cache, action, key):
-        after, outcome = super().step(data, now, cache, action, key)
+    def step(self, data, now, cache, action, drawn):
+        after, outcome = super().step(data, now, cache, action, drawn)
         reward = jnp.where(jnp.arange(len(now.over)) == 2, jnp.nan, outcome.reward)
         totals = outcome.totals | {"reward/swing": jnp.sum(jnp.where(now.over, 0.0, reward))}
         return after, replace(outcome, reward=reward, totals=totals)

@@ -224,13 +224,14 @@ def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):
     double = Driving(Simulator(replace(task, hold=2)), LATEST, EARLIEST)
     start = jax.jit(single.start, static_argnums=2)(bank, jax.random.key(0), 24)
     steps = {name: jax.jit(each.step) for name, each in (("single", single), ("double", double))}
+    draw = jax.jit(single.draw, static_argnums=2)
     action, now = jnp.tile(jnp.array([[1.0, 0.4], [-1.0, -0.4]]), (12, 1)), start
     ended = 0
     for number in range(40):
-        key, cache = jax.random.key(number), single.cache(bank, now.state)
-        held, result = steps["double"](bank, now, cache, action, key)
-        first, one = steps["single"](bank, now, cache, action, key)
-        second, two = steps["single"](bank, first, one.cache, action, key)
+        drawn, cache = draw(bank, jax.random.key(number), 24), single.cache(bank, now.state)
+        held, result = steps["double"](bank, now, cache, action, drawn)
+        first, one = steps["single"](bank, now, cache, action, drawn)
+        second, two = steps["single"](bank, first, one.cache, action, drawn)
         idle = np.asarray(now.over | first.over)
         ended += int((np.asarray(first.over) & ~np.asarray(now.over)).sum())
         expected = np.asarray(one.reward) + np.where(idle, 0.0, two.reward)

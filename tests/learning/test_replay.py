@@ -48,7 +48,7 @@ class Counting:
     def draw(self, data, key, count):
         return key
 
-    def step(self, data, now, cache, action, key):
+    def step(self, data, now, cache, action, drawn):
         env, episode, step = jnp.moveaxis(now.state, -1, 0)
         moved = jnp.stack([env, episode, step + 1], axis=-1)
         fresh = jnp.stack([env, episode + 1, jnp.zeros_like(step)], axis=-1)

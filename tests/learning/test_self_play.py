@@ -282,12 +282,13 @@ def test_held_decision_of_a_group_takes_its_steps(bank, environment):
     """Two steps of one action equal two single steps, of vehicles that drive on after their end, too."""
     double = replace(environment, simulator=replace(SIMULATOR, task=replace(SIMULATOR.task, hold=2)))
     steps = {name: jax.jit(each.step) for name, each in (("single", environment), ("double", double))}
+    draw = jax.jit(environment.draw, static_argnums=2)
     now, waits = jax.jit(environment.start, static_argnums=2)(bank, jax.random.key(0), COUNT), 0
     for number in range(60):
-        action, key = swerve(jax.random.key(number)), jax.random.key(number)
-        held, result = steps["double"](bank, now, (), action, key)
-        first, one = steps["single"](bank, now, (), action, key)
-        second, two = steps["single"](bank, first, (), action, key)
+        action, drawn = swerve(jax.random.key(number)), draw(bank, jax.random.key(number), COUNT)
+        held, result = steps["double"](bank, now, (), action, drawn)
+        first, one = steps["single"](bank, now, (), action, drawn)
+        second, two = steps["single"](bank, first, (), action, drawn)
         # A group that starts, or ends within the decision, takes no second step.
         groups = (np.asarray(each.over).reshape(-1, VEHICLES).all(axis=1) for each in (now, first))
         idle = np.repeat(np.logical_or(*groups), VEHICLES)

@@ -154,7 +154,7 @@ def test_mixture_equals_its_blocks_alone(bank):
         now = mixture.start(bank, jax.random.key(0), 6)
 
         def step(carry, row):
-            after, outcome = mixture.step(bank, *carry, *row)
+            after, outcome = mixture.step(bank, *carry, row[0], mixture.draw(bank, row[1], 6))
             return (after, outcome.cache), (after.over, after.observation, outcome.reward, outcome.totals)
 
         first = (now, mixture.cache(bank, now.state))
@@ -168,7 +168,7 @@ def test_mixture_equals_its_blocks_alone(bank):
 
             def step(carry, row, block=block, number=number):
                 own, key = row[0][3 * number : 3 * number + 3], jax.random.split(row[1], 2)[number]
-                after, outcome = block.step(bank, *carry, own, key)
+                after, outcome = block.step(bank, *carry, own, block.draw(bank, key, 3))
                 return (after, outcome.cache), (after.over, after.observation, outcome.reward, outcome.totals)
 
             first = (now, block.cache(bank, now.state))

@@ -39,7 +39,7 @@ class Part:
     """Files of one format, data set and version.
 
     ``description`` merges those of ``sample_size`` files (all intact ones if ``whole``): sum of ``recordings`` (None if
-    unknown for a file), most frequent ``notes``, all ``missing`` files. ``convertible`` means that a file lacks none.
+    unknown for a file), most frequent ``notes``, all ``missing`` files. ``convertible``: some file lacks none.
     """
 
     format: str

@@ -306,7 +306,7 @@ class Driving:
         else:
             is_usable = (bank.agents[index, step, ego_slot, AgentColumn.VALID] > 0) & (step <= last_step)
         step = jnp.where(is_usable, step, fallback_step)
-        # Logged starts without conditions use no keys; the compiler then removes this line.
+        # Logged starts without conditions do not use the keys.
         keys = jax.random.split(jax.random.fold_in(step_key, 1), count)
         return index, step, slot, keys
 

@@ -112,9 +112,8 @@ class Mixture:
         return [block.draw(data, key, size) for (_, block), key, size in blocks]
 
     def step(
-        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"],
-        drawn: list[Any],
-    ) -> tuple[Environments, Outcome]:  # fmt: skip
+        self, data: ScenarioBank, now: Environments, cache: Any, action: Float[Array, "B D"], drawn: Any
+    ) -> tuple[Environments, Outcome]:
         """Step or reset the environments of every block; devices sum the totals of all blocks in every step."""
         sizes = self.sizes(len(action))
         after, outcomes = [], []

@@ -357,7 +357,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
 
 
 def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
-    """Return the current step: that of the file, or step 10 (the last of fewer) if a long recording names none."""
+    """Return the current step: that of the file, or step 10 (the last of fewer) if it names none."""
     step = as_int(metadata.get("current_time_index"))
     if step is None:
         return min(CURRENT_STEP, steps - 1)

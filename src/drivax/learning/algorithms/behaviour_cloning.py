@@ -28,7 +28,7 @@ from drivax.learning.experience import (
 )  # fmt: skip
 from drivax.learning.program import sum_over_devices
 from drivax.networks.actor_critic import NetworkConfig, Policy, graph_of
-from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
+from drivax.networks.distributions import REPARAMETERISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
 from drivax.scenario.record import record
 
@@ -248,6 +248,6 @@ def require_expert(environment: Environment) -> ExpertEnvironment:
 
 def check_loss(cloning: Cloning, network: NetworkConfig) -> None:
     """Raise UsageError for the loss ``mse`` of a grid or mixture policy, whose mode has no gradient in the logits."""
-    if cloning.loss == "mse" and network.distribution not in REPARAMETRISED:
+    if cloning.loss == "mse" and network.distribution not in REPARAMETERISED:
         problem = f"the mode of {network.distribution!r} has no gradient for the loss 'mse'"
         raise UsageError(problem, cure="use loss: likelihood")

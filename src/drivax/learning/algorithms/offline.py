@@ -38,7 +38,7 @@ from drivax.learning.experience import (
 from drivax.learning.program import map_over_devices
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Critic, NetworkConfig
-from drivax.networks.distributions import REPARAMETRISED, Actions
+from drivax.networks.distributions import REPARAMETERISED, Actions
 from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
 from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
@@ -192,7 +192,7 @@ class OfflineConfig:
 
     def check_gradient(self) -> None:
         """Raise UsageError for a grid or mixture policy, whose actions have no gradient in the logits."""
-        if self.network.distribution not in REPARAMETRISED:
+        if self.network.distribution not in REPARAMETERISED:
             problem = f"{type(self).__name__} needs a policy with a gradient through its actions"
             raise UsageError(problem, cure="use gaussian or beta, or iql or bc with loss: likelihood")
 

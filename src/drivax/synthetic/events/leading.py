@@ -123,8 +123,8 @@ class LeadBrakes(EventScript):
         draft = draw_braking(speed, float(gap[leader]), leader_mps, rng) if leader_mps > _LEADER_MPS else None
         if draft is None:
             return None
-        braking_mps2, severity_mps2 = draft
-        last = step + _stop_steps(speed, severity_mps2)
+        braking_mps2, drawn_severity_mps2 = draft
+        last = step + _stop_steps(speed, drawn_severity_mps2)
         if last > view.last_step:
             return None
         staging = Staging(overrides=(Override(leader, step, last, -braking_mps2),), tailgates=tailgates)
