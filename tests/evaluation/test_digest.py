@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -106,6 +107,7 @@ def test_slightly_different_planner_has_another_digest():
 #: Settings of XLA that stand for other machines: threads, devices, older processors, another order of operations.
 SETTINGS = {
     "default": "",
+    "without kernels": "",
     "one thread": "--xla_cpu_multi_thread_eigen=false",
     "two devices": "--xla_force_host_platform_device_count=2",
     "without AVX": "--xla_cpu_max_isa=SSE4_2",
@@ -119,12 +121,16 @@ def test_digest_is_one_value_under_every_setting():
     digests = {}
     for name, flags in SETTINGS.items():
         environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
+        if name == "without kernels":
+            environment["DRIVAX_NATIVE"] = "0"
         call = [sys.executable, "-m", "drivax", "doctor", "--digest"]
         out = subprocess.run(call, env=environment, capture_output=True, text=True, check=True).stdout
         lines = (line.strip() for line in out.splitlines() if not line.startswith("jax"))
         digests[name] = dict(re.split(r"\s{2,}", line) for line in lines)
     assert len(digests["default"]["digest"]) == 16
     assert all(rows == digests["default"] for rows in digests.values()), digests
+    page = Path(__file__).parents[2] / "docs" / "guide" / "reproducibility.md"
+    assert f"the digest `{digests['default']['digest']}`" in page.read_text()
 
 
 @pytest.mark.slow
