@@ -146,7 +146,9 @@ def test_error_names_the_first_cause_if_nothing_is_converted(wire, write_records
         convert(single, tmp_path / "set")
     assert "others" not in str(caught.value)
     write_records("src/second.tfrecord")
-    with pytest.raises(DataError, match=r"record 0: sdc_track_index .*other 1 record"):
+    with pytest.raises(
+        DataError, match=r"record 0: sdc_track_index .*1 more record could not be converted either"
+    ):
         convert(tmp_path / "src", tmp_path / "set")
     assert leftovers(tmp_path) == ["src"]
 

@@ -63,9 +63,7 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
         ignored = [name for name in _SIMULATOR_FLAGS if getattr(args, name) != getattr(Bench, name)]
         if ignored:
             flags = " ".join(f"--{name.replace('_', '-')}" for name in ignored)
-            raise UsageError(
-                f"--encoders cannot be combined with {flags}", cure="leave out --encoders or the other flags"
-            )
+            raise UsageError("--encoders uses no flags of the simulator", cure=f"leave out {flags}")
         times = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
         show(json.dumps(times, indent=1) if args.json else _encoders_text(times))
         return 0
