@@ -280,7 +280,7 @@ class Bench:
         command = self.commands[name]
         # An unfinished run or study is continued.
         if not replaces and (command.overwrite or not self._differences(name)):
-            self.remove(command)
+            remove_outputs(command, self.work)
         first, whole = self.rng.choice(((0.0, self.seconds[name][1]), self.seconds[name]))
         before = _paths(self.work)
         process = self._start(command)
@@ -300,10 +300,6 @@ class Bench:
         """Compare all output with the reference, and look for files that should not exist."""
         lines = differences(self.reference, digests(self.work))
         self.problems += [f"{name}: {line}" for line in (*lines, *self._litter())]
-
-    def remove(self, command: Command) -> None:
-        """Remove the outputs of a command."""
-        remove_outputs(command, self.work)
 
     def _exists(self, command: Command) -> bool:
         return any((self.work / output).exists() for output in command.outputs)
@@ -492,7 +488,7 @@ def run_kills(bench: Bench, moments: int) -> dict[str, Any]:
         name, fault = pairs[number % len(pairs)]
         known = len(bench.problems)
         if not bench.commands[name].overwrite:
-            bench.remove(bench.commands[name])
+            remove_outputs(bench.commands[name], bench.work)
         bench.disturb(name, fault)
         bench.finish(name)
         bench.check(f"{name} after {fault}")

@@ -288,6 +288,12 @@ def test_speed_page_shows_ratios_against_the_earlier_state(script, stored):
         assert f"{comparison.begin}\n\n{table}\n\n{comparison.end}" in ratios.PAGE.read_text()
 
 
+def test_speed_page_shows_stored_times_of_commands(script, stored):
+    commands = script("speed.commands")
+    table = commands.table(stored("command_times")["rows"])
+    assert f"{commands.BEGIN}\n\n{table}\n\n{commands.END}" in commands.PAGE.read_text()
+
+
 def test_robustness_page_shows_stored_outcomes(script, stored):
     robustness = script("robustness")
     table = robustness.table(stored("kills"), stored("soak"))

@@ -3,7 +3,8 @@
     python -m experiments.speed --data SET --against TREE [--only NAME ...]
 
 SET has at least 4,096 scenarios; TREE is a checkout of the earlier state (``experiments.speed.ratios``). Nothing else
-may run on the machine; all of it takes about an hour.
+may run on the machine; all of it takes about an hour. ``experiments.speed.commands`` compares with another state, so it
+is run by itself.
 """
 
 from __future__ import annotations

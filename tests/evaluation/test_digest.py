@@ -104,25 +104,25 @@ def test_slightly_different_planner_has_another_digest():
     assert digests[0] == digests[1] != digests[2]
 
 
-#: Settings of XLA that stand for other machines: threads, devices, older processors, another order of operations.
+#: Settings that stand for other machines: kernels, threads, devices, older processors, another order of operations.
 SETTINGS = {
-    "default": "",
-    "without kernels": "",
-    "one thread": "--xla_cpu_multi_thread_eigen=false",
-    "two devices": "--xla_force_host_platform_device_count=2",
-    "without AVX": "--xla_cpu_max_isa=SSE4_2",
-    "not optimised": "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-    " --xla_llvm_disable_expensive_passes=true",
+    "default": {},
+    "without kernels": {"DRIVAX_NATIVE": "0"},
+    "one thread": {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"},
+    "two devices": {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"},
+    "without AVX": {"XLA_FLAGS": "--xla_cpu_max_isa=SSE4_2"},
+    "not optimised": {
+        "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+        " --xla_llvm_disable_expensive_passes=true"
+    },
 }
 
 
 @pytest.mark.slow
 def test_digest_is_one_value_under_every_setting():
     digests = {}
-    for name, flags in SETTINGS.items():
-        environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(sys.path)}
-        if name == "without kernels":
-            environment["DRIVAX_NATIVE"] = "0"
+    for name, variables in SETTINGS.items():
+        environment = os.environ | {"XLA_FLAGS": "", "PYTHONPATH": os.pathsep.join(sys.path)} | variables
         call = [sys.executable, "-m", "drivax", "doctor", "--digest"]
         out = subprocess.run(call, env=environment, capture_output=True, text=True, check=True).stdout
         lines = (line.strip() for line in out.splitlines() if not line.startswith("jax"))

@@ -51,6 +51,13 @@ def test_side_on_one_core_is_pinned_to_it(ratios, tmp_path):
     assert row["ratio"] == pytest.approx(len(available_cores()), rel=0.3)
 
 
+def test_row_of_a_command_has_the_ratios_of_its_pairs_and_their_interval():
+    """Of nine pairs, the second least and the second largest ratio: the median is outside with probability 0.04."""
+    pairs = [(2.0, 2.0 + number / 10) for number in (8, 0, 1, 2, 3, 4, 5, 6, 7)]
+    row = load_script("speed.commands").row(pairs)
+    assert row == {"before_s": 2.0, "after_s": 2.4, "time_ratio": 1.2, "low": 1.05, "high": 1.35}
+
+
 def test_failed_program_is_an_error(ratios, tmp_path):
     with pytest.raises(SystemExit, match="failed"):
         side = ratios.Side(tmp_path)

@@ -161,7 +161,7 @@ class ReplayBuffer:
         """
         rows, environments = replay.reward.shape
         newest = (replay.next_row - 1) % rows
-        # Blocks of neighbouring environments of one device: a running count over all steps takes five times as long.
+        # Blocks of neighbouring environments of one device: a running count over all steps is slower.
         size = math.gcd(environments, environments // device_count(), _BLOCK)
         sampleable = (replay.alive & (jnp.arange(rows) != newest)[:, None]).reshape(rows, -1, size)
         counts = sampleable.sum(axis=-1, dtype=jnp.int32).reshape(-1)
