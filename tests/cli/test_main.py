@@ -383,3 +383,33 @@ def test_interrupt_at_exit_prints_no_traceback():
         assert process.stdout.readline().startswith("drivax ") and process.stdout.readline() == "\n"
         process.send_signal(signal.SIGINT)
         assert process.communicate(timeout=10)[1] == "" and process.returncode == -signal.SIGINT
+
+
+@pytest.mark.parametrize(
+    ("enabled", "tunables", "is_started_again"),
+    [
+        ("always [madvise] never", None, True),
+        ("always [madvise] never", "glibc.malloc.check=1", False),
+        ("always madvise [never]", None, False),
+        (None, None, False),
+    ],
+)
+def test_training_starts_again_where_huge_pages_are_granted_on_request(
+    enabled: str | None, tunables: str | None, is_started_again: bool, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    calls: list[Any] = []
+    file = tmp_path / "enabled"
+    if enabled is not None:
+        file.write_text(enabled)
+    monkeypatch.setattr(cli, "_HUGE_PAGES", file)
+    monkeypatch.setattr(os, "execv", lambda *call: calls.append(call))
+    monkeypatch.setattr(sys, "argv", ["drivax", "train", "--help"])
+    monkeypatch.setattr(sys, "orig_argv", ["python3", "-u", "/bin/drivax", "train", "--help"])
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    if tunables is not None:
+        monkeypatch.setenv("GLIBC_TUNABLES", tunables)
+    assert cli.main() == 0
+    again = [(sys.executable, [sys.executable, "-u", "/bin/drivax", "train", "--help"])]
+    assert calls == (again if is_started_again else [])
+    assert os.environ.get("GLIBC_TUNABLES") == ("glibc.malloc.hugetlb=1" if is_started_again else tunables)

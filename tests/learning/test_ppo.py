@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 from jax.flatten_util import ravel_pytree
+from scipy import stats
 
 from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import Cloning
@@ -18,7 +19,7 @@ from drivax.learning.algorithms.optimisers import (
     clipped_adam,
     trained_parameters,
 )
-from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.ppo import PpoConfig, _random_order
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.environment import Rollout
 from drivax.learning.replay import ReplayConfig
@@ -74,9 +75,8 @@ def minibatch_of(learner, parameters):
 
 
 def entropy_of(policy, key):
-    """Return the entropy from one sample with a key each."""
-    keys = jax.random.split(jax.random.split(key)[0], 32)
-    return jax.vmap(lambda one, key: one.entropy_estimate(key))(policy, keys)
+    """Return the entropy from one sample each."""
+    return policy.entropy_estimate(jax.random.normal(jax.random.split(key)[0], (32, 1)))
 
 
 def in_chunks(minibatch, count):
@@ -149,6 +149,18 @@ def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
         gradient,
         jax.grad(loss)(parameters),
     )
+
+
+@pytest.mark.parametrize("count", [1, 4, 8, 13])
+def test_random_order_is_a_uniform_permutation(count):
+    orders = np.asarray(
+        jax.vmap(lambda key: _random_order(key, count))(jax.random.split(jax.random.key(0), 4096))
+    )
+    np.testing.assert_array_equal(np.sort(orders), np.broadcast_to(np.arange(count), orders.shape))
+    places = np.stack([np.bincount(column, minlength=count) for column in orders.T])
+    # Rows and columns of the table have fixed sums.
+    distance = (count - 1) / 4096 * ((places - 4096 / count) ** 2).sum()
+    assert count == 1 or stats.chi2((count - 1) ** 2).sf(distance) > 1e-3
 
 
 @pytest.mark.parametrize(("batch", "chunk"), [(2048, 64), (96, 48), (40, 40), (97, 97), (8, 8), (320, 64)])

@@ -77,13 +77,13 @@ class Distribution(Protocol):
         """Return the mean of the actions."""
         ...
 
-    def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
-        """Return the entropy of the action, in closed form or estimated from one sample."""
+    def entropy_estimate(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Return the entropy of the action, in closed form or estimated from standard normal noise."""
         ...
 
 
 class _SquashedActions:
-    """Actions that are ``tanh`` of raw actions; their entropy has no closed form."""
+    """Actions that are ``tanh`` of raw actions."""
 
     def action(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
         """Return the squashed raw action."""
@@ -92,10 +92,6 @@ class _SquashedActions:
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
         """Return ``arctanh`` of actions, clipped to +-0.999."""
         return jnp.arctanh(jnp.clip(action, -_MAX_ACTION, _MAX_ACTION))
-
-    def entropy_estimate(self: Distribution, key: Array) -> Float[Array, "*batch"]:
-        """Return minus the log-density of one sample."""
-        return -self.log_prob(self.sample(key))
 
 
 @record
@@ -113,7 +109,11 @@ class SquashedGaussian(_SquashedActions):
 
     def sample(self, key: Array) -> Float[Array, "*batch action"]:
         """Sample ``loc + scale * noise``."""
-        return self.loc + self.scale * jax.random.normal(key, self.loc.shape)
+        return self.sample_of(jax.random.normal(key, self.loc.shape))
+
+    def sample_of(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """Return the sample that standard normal noise gives."""
+        return self.loc + self.scale * noise
 
     def log_prob(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
         """Return the log-density of ``tanh(x)``, with the exact Jacobian ``2 (ln 2 - x - softplus(-2 x))``."""
@@ -130,6 +130,10 @@ class SquashedGaussian(_SquashedActions):
         """Return the mean of ``tanh`` by Gauss-Hermite quadrature, within 1e-3."""
         nodes = jnp.tanh(self.loc[..., None] + self.scale[..., None] * jnp.asarray(_NODES, jnp.float32))
         return nodes @ jnp.asarray(_WEIGHTS / _WEIGHTS.sum(), jnp.float32)
+
+    def entropy_estimate(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Return minus the log-density of one sample."""
+        return -self.log_prob(self.sample_of(noise))
 
 
 @record
@@ -171,7 +175,7 @@ class Beta:
         """Return ``(alpha - beta) / (alpha + beta)``."""
         return (self.alpha - self.beta) / (self.alpha + self.beta)
 
-    def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
+    def entropy_estimate(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
         """Return the exact differential entropy of the action."""
         a, b = self.alpha, self.beta
         # E[ln(x^(a - 1) (1 - x)^(b - 1))]: the mean log-density without its normaliser.
@@ -215,7 +219,7 @@ class Grid:
         """Return the mean of the actions."""
         return jax.nn.softmax(self.logits) @ self._actions()
 
-    def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
+    def entropy_estimate(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
         """Return the exact entropy."""
         log_probs = jax.nn.log_softmax(self.logits)
         return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
@@ -260,6 +264,13 @@ class Mixture(_SquashedActions):
     def mean_action(self) -> Float[Array, "*batch action"]:
         """Return the weighted mean of the components' means, within 1e-3."""
         return jnp.sum(jax.nn.softmax(self.logits)[..., None] * self.components.mean_action(), axis=-2)
+
+    def entropy_estimate(self, noise: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Return minus the mean log-density of one sample per component, weighted as the components are."""
+        noise = jnp.broadcast_to(noise[..., None, :], self.components.loc.shape)
+        raw_actions = self.components.sample_of(noise)
+        log_probs = jnp.stack([self.log_prob(raw_actions[..., k, :]) for k in range(_COMPONENTS)], axis=-1)
+        return -jnp.sum(jax.nn.softmax(self.logits) * log_probs, axis=-1)
 
 
 def _select_component(values: Float[Array, "*batch component action"], index: Int[Array, "*batch"]) -> Array:

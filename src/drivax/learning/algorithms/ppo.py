@@ -272,7 +272,7 @@ class Ppo:
         """Shuffle a flattened rollout, and take an update on each of its minibatches."""
         order_key, noise_key = jax.random.split(key)
         steps, minibatches = self.config.steps_per_iteration, self.config.minibatches
-        order = jax.random.permutation(order_key, steps)
+        order = _random_order(order_key, steps)
         order = order.reshape(minibatches, -1, chunk_size(steps // minibatches))
         # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
         whole, divided = _split(batch)
@@ -320,7 +320,10 @@ class Ppo:
             "target": target,
             "alive": rollout.alive.astype(jnp.float32),
         }
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+        batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+        # As rows: XLA reads arrays with an axis of size 1 in another layout, and copies them.
+        rows = {name: group.reshape(len(group), -1) for name, group in batch["observation"].items()}
+        return batch | {"observation": rows}
 
     def _gradient(
         self, parameters: Any, minibatch: dict[str, Any], key: Array, auxiliary_loss: AuxiliaryLoss | None
@@ -329,9 +332,9 @@ class Ppo:
         whole, samples = _split(minibatch)
         normalised, variance = compute_on_each_device(_normalise, whole)
         entropy_key, auxiliary_key = jax.random.split(key)
-        # A key per sample: its noise does not depend on the chunks.
-        keys = jax.random.split(entropy_key, normalised["weight"].shape)
-        samples |= normalised | {"key": keys}
+        # In one call, which is faster than a call per chunk.
+        noise = jax.random.normal(entropy_key, (*normalised["weight"].shape, self.environment.action_size))
+        samples |= normalised | {"noise": noise}
         logs, gradient = sum_gradients(self._loss, parameters, samples)
         logs["explained_variance"] = 1.0 - logs["value"] / jnp.maximum(variance, 1e-8)
         return add_auxiliary(auxiliary_loss, parameters, auxiliary_key, logs, gradient)
@@ -339,10 +342,12 @@ class Ppo:
     def _loss(self, parameters: Any, samples: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
         """Return the weighted sum of the samples' losses, and sums to log."""
         config, weight = self.config, samples["weight"]
-        policy, value = self.network(parameters).policy_and_value(samples["observation"])
+        rows = samples["observation"]
+        observation = {name: rows[name].reshape(-1, *shape) for name, shape in self.spec.items()}
+        policy, value = self.network(parameters).policy_and_value(observation)
         log_prob, old_log_prob = policy.log_prob(samples["raw_action"]), samples["log_prob"]
         surrogate = clipped_surrogate_loss(log_prob, old_log_prob, samples["advantage"], config.clip)
-        entropy = jax.vmap(type(policy).entropy_estimate)(policy, samples["key"])
+        entropy = policy.entropy_estimate(samples["noise"])
         is_outside = jnp.abs(jnp.exp(log_prob - old_log_prob) - 1.0) > config.clip
         values = {
             "policy": surrogate,
@@ -354,6 +359,17 @@ class Ppo:
         logs = {name: jnp.sum(value * weight) for name, value in values.items()}
         value_loss, entropy_bonus = config.value_coefficient * logs["value"], logs["entropy"]
         return logs["policy"] + value_loss - config.entropy_coefficient * entropy_bonus, logs
+
+
+def _random_order(key: Array, count: int) -> Int[Array, " count"]:
+    """Return the numbers below ``count`` in a random order: random bits with a number each as lowest bits, sorted.
+
+    This takes a tenth of the time of ``jax.random.permutation`` on CPUs, which sorts pairs, and twice. Numbers whose
+    other bits are equal stay in ascending order: one in 64 of 8,192 has such a neighbour.
+    """
+    mask = jnp.uint32(2 ** (count - 1).bit_length() - 1)
+    bits = jax.random.bits(key, (count,)) & ~mask
+    return (jnp.sort(bits | jnp.arange(count, dtype=jnp.uint32)) & mask).astype(jnp.int32)
 
 
 def _read(batch: dict[str, Any], order: Int[Array, "*samples"]) -> dict[str, Any]:
