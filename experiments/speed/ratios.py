@@ -72,7 +72,12 @@ def first(count):
     return [stored[row] for row in range(count)]
 """
 _TRAINING = (
-    _BANK
+    """
+from drivax import cli
+if hasattr(cli, "use_huge_pages"):  # as the command `train` of this tree does
+    cli.use_huge_pages()
+"""
+    + _BANK
     + """
 from drivax import settings
 from drivax.learning.config import TrainConfig

@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug, without_cache, edited = (flag in arguments for flag in _FLAGS)
     arguments = [argument for argument in arguments if argument not in _FLAGS]
     if argv is None and arguments[:1] == ["train"]:
-        _use_huge_pages()
+        use_huge_pages()
     try:
         with _stop_at_signals():
             status = _dispatch(arguments, not without_cache, edited)
@@ -138,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def _use_huge_pages() -> None:
+def use_huge_pages() -> None:
     """Start this process again with large arrays in huge pages, where Linux grants them on request.
 
     Training takes about a tenth less time (docs/log/2026-11-27-cores-as-devices.md). Only glibc's tunables ask for huge
