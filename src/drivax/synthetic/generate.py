@@ -41,7 +41,7 @@ _BATCH, _FIRST = 64, 4
 #: Largest number of scenarios per task, and number of tasks per worker that smaller sets are divided into.
 _CHUNK, _TASKS = 16, 4
 #: Submitted tasks per worker, and batches in the audit, whose results may be outstanding.
-_AHEAD, _AHEAD_BATCHES = 3, 2
+_AHEAD, _AHEAD_BATCHES = 3, 1
 _EVENT = "event"
 #: First seed of the benchmark's splits.
 RESERVED_SEED = 1_000_000_000
@@ -255,23 +255,23 @@ def _count_draws(
         yield draw.scenario
 
 
-def _no_audit(scenarios: list[Scenario]) -> list[dict[str, Any]]:
-    return [{} for _ in scenarios]
-
-
 def _audit_batches(
     scenarios: Iterator[Scenario], audit: Audit | None
 ) -> Generator[tuple[Scenario, dict[str, Any]], None, None]:
     """Yield scenarios with their audits, computed in batches by a thread while further scenarios are drawn.
 
-    The first batch is as small as the first task of a worker, so that the audit is compiled early.
+    The first batch is as small as the first task of a worker, so that the audit is compiled early. Without an audit,
+    scenarios are passed on one by one.
     """
+    if audit is None:
+        yield from ((scenario, {}) for scenario in scenarios)
+        return
     auditor = ThreadPoolExecutor(1)
     waiting: deque[tuple[list[Scenario], Future[list[dict[str, Any]]]]] = deque()
     try:
         size = _FIRST
         while batch := list(islice(scenarios, size)):
-            waiting.append((batch, auditor.submit(audit or _no_audit, batch)))
+            waiting.append((batch, auditor.submit(audit, batch)))
             size = _BATCH
             if len(waiting) > _AHEAD_BATCHES:
                 yield from _pairs(*waiting.popleft())
