@@ -313,10 +313,11 @@ class Bench:
         return differences(expected, actual)
 
     def _own(self, name: str, paths: dict[str, str]) -> dict[str, str]:
-        """Select what a command writes, without what others write into its folders."""
+        """Select what a command writes, without hidden files, and without what others write into its folders."""
         folders = self.commands[name].outputs
         nested = [output for other in self._writers_into(name) for output in self.commands[other].outputs]
-        return {path: paths[path] for path in paths if _is_below(path, folders) and path not in nested}
+        own = (path for path in paths if _is_below(path, folders) and path not in nested)
+        return {path: paths[path] for path in own if not _is_hidden(path)}
 
     def _writers_into(self, name: str) -> list[str]:
         folders = self.commands[name].outputs
@@ -404,8 +405,7 @@ class Bench:
 
     def _litter(self) -> list[str]:
         """Return hidden files, and temporary files."""
-        paths = (path for path in _paths(self.work) if "/." in f"/{path}" or ".partial" in path)
-        hidden = [f"leaves {path}" for path in sorted(paths)]
+        hidden = [f"leaves {path}" for path in sorted(filter(_is_hidden, _paths(self.work)))]
         return hidden + [f"leaves tmp/{path}" for path in sorted(_paths(self.temporary))]
 
 
@@ -444,6 +444,11 @@ def _stable(path: Path) -> bytes:
     records = content.splitlines() if path.suffix == ".jsonl" else [content]
     stable = ({key: value for key, value in json.loads(line).items() if key not in names} for line in records)
     return json.dumps(list(stable), sort_keys=True).encode()
+
+
+def _is_hidden(path: str) -> bool:
+    """Return whether a relative path is that of an incomplete or temporary file."""
+    return "/." in f"/{path}" or ".partial" in path
 
 
 def _is_below(path: str, folders: Sequence[str]) -> bool:

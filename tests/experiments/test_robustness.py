@@ -18,9 +18,17 @@ robustness = load_script("robustness")
 PROGRAM = """
 import contextlib, json, os, sys, time
 from pathlib import Path
-from drivax.files import replace_folder
+from drivax.files import atomic_write, replace_folder
 
 out, fault = Path(sys.argv[1]), sys.argv[2]
+if fault == "files":
+    out.mkdir(exist_ok=True)
+    for name in ("first", "second"):
+        with atomic_write(out / name) as file:
+            for number in range(20):
+                file.write(b"x")
+                time.sleep(0.01)
+    sys.exit()
 if fault == "direct":
     out.mkdir(exist_ok=True)
 with contextlib.nullcontext(out) if fault == "direct" else replace_folder(out) as folder:
@@ -52,6 +60,14 @@ def test_atomic_program_is_identical_after_kills(bench):
     assert robustness.run_kills(bench, 4) == {"moments": 4}
     assert bench.problems == []
     assert sum(bench.counts.values()) == 4 and bench.counts["write", "kill", "stopped"] >= 1
+
+
+def test_files_that_are_replaced_one_by_one_stay_whole(bench):
+    """An incomplete hidden file may lie beside them until the next run."""
+    bench = bench("files")
+    bench.measure()
+    robustness.run_kills(bench, 6)
+    assert bench.problems == [] and bench.counts["write", "kill", "stopped"] >= 1
 
 
 def test_soak_ends_with_the_digest_of_undisturbed_runs(bench):
