@@ -387,11 +387,12 @@ class Bench:
 
     def _check_end(self, name: str, fault: str, process: subprocess.Popen[str], error: str) -> None:
         status, place = process.returncode, f"{name}, {fault}"
-        if status not in (0, *STATUSES[fault]):
+        is_own = not _interrupts_python(error)
+        if is_own and status not in (0, *STATUSES[fault]):
             self.problems.append(f"{place}: status {status}: {error[-600:]}")
-        if status >= 0 and "Traceback" in error:
+        if is_own and status >= 0 and "Traceback" in error:
             self.problems.append(f"{place}: traceback: {error[-1200:]}")
-        if status > 0 and not error.strip().rpartition("\n")[2].startswith("drivax: "):
+        if is_own and status > 0 and not error.strip().rpartition("\n")[2].startswith("drivax: "):
             self.problems.append(f"{place}: the last line is no message: {error[-600:]}")
         if not _wait(lambda: not _group_exists(process.pid), 20.0):
             os.killpg(process.pid, signal.SIGKILL)
@@ -444,6 +445,11 @@ def _stable(path: Path) -> bytes:
     records = content.splitlines() if path.suffix == ".jsonl" else [content]
     stable = ({key: value for key, value in json.loads(line).items() if key not in names} for line in records)
     return json.dumps(list(stable), sort_keys=True).encode()
+
+
+def _interrupts_python(error: str) -> bool:
+    """Return whether Ctrl-C stopped Python while it started, by its traceback, before any code of drivax ran."""
+    return error.rstrip().endswith("KeyboardInterrupt") and "drivax" not in error
 
 
 def _is_hidden(path: str) -> bool:

@@ -130,3 +130,12 @@ def test_volatile_values_are_not_compared(tmp_path):
 def test_differences_name_each_file():
     lines = robustness.differences({"a": "1", "b": "1", "c": "1"}, {"b": "2", "c": "1", "d": "1"})
     assert lines == ["a: missing", "b: differs", "d: additional"]
+
+
+def test_an_interrupt_of_python_itself_is_no_problem():
+    trace = (
+        'Traceback (most recent call last):\n  File "<frozen site>", line 1, in <module>\nKeyboardInterrupt\n'
+    )
+    assert robustness._interrupts_python(trace)
+    assert not robustness._interrupts_python(trace.replace("<frozen site>", "src/drivax/__main__.py"))
+    assert not robustness._interrupts_python("")
