@@ -56,6 +56,7 @@ def ppo_gradient(learner, observation, parameters, rng):
         "advantage": normal(rng),
         "target": value + normal(rng),
         "alive": jnp.asarray(rng.random(BATCH) < 0.9, jnp.float32),
+        "noise": normal(rng, learner.environment.action_size),
     }
     minibatch = jax.tree.map(lambda leaf: leaf[None], minibatch)
     return lambda parameters: learner._gradient(parameters, minibatch, jax.random.key(2), None)

@@ -1,5 +1,6 @@
 """PPO on the pendulum: what it bootstraps, heads; its optimiser."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -19,7 +20,7 @@ from drivax.learning.algorithms.optimisers import (
     clipped_adam,
     trained_parameters,
 )
-from drivax.learning.algorithms.ppo import PpoConfig, _random_order
+from drivax.learning.algorithms.ppo import PpoConfig, minibatch_order
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.environment import Rollout
 from drivax.learning.replay import ReplayConfig
@@ -53,30 +54,26 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
         first = 0.1 + 0.99 * 2.0 - 1.0 + 0.99 * 0.95 * last
         open_end = 0.4 + 0.99 * 5.0 - 4.0
         np.testing.assert_allclose(
-            batch["advantage"][jnp.array([0, 1, 3])], [first, last, open_end], rtol=1e-6
+            batch["advantage"][jnp.array([0, 1, 3]), 0], [first, last, open_end], rtol=1e-6
         )
-        np.testing.assert_allclose(batch["target"][:2], [first + 1.0, last + 2.0], rtol=1e-6)
-        np.testing.assert_array_equal(batch["alive"], [1, 1, 0, 1])
+        np.testing.assert_allclose(batch["target"][:2, 0], [first + 1.0, last + 2.0], rtol=1e-6)
+        np.testing.assert_array_equal(batch["alive"][:, 0], [1, 1, 0, 1])
 
 
 def minibatch_of(learner, parameters):
     """Return 32 samples, every fourth between episodes (``alive`` 0)."""
-    keys = jax.random.split(jax.random.key(1), 5)
+    keys = jax.random.split(jax.random.key(1), 6)
     minibatch = {
         "observation": {"pendulum": jax.random.normal(keys[0], (32, 3))},
         "raw_action": jax.random.normal(keys[1], (32, 1)),
         "advantage": 3.0 + 2.0 * jax.random.normal(keys[2], (32,)),
         "target": jax.random.normal(keys[3], (32,)),
         "alive": jnp.array([1.0, 1.0, 0.0, 1.0] * 8),
+        "noise": jax.random.normal(keys[5], (32, 1)),
     }
     policy = learner.network(parameters).policy(minibatch["observation"])
     log_prob = policy.log_prob(minibatch["raw_action"])
     return minibatch | {"log_prob": log_prob + 0.3 * jax.random.normal(keys[4], (32,))}
-
-
-def entropy_of(policy, key):
-    """Return the entropy from one sample each."""
-    return policy.entropy_estimate(jax.random.normal(jax.random.split(key)[0], (32, 1)))
 
 
 def in_chunks(minibatch, count):
@@ -101,7 +98,8 @@ def test_logged_losses_against_numpy():
         np.asarray(samples, np.float64)[alive]
         for samples in (
             minibatch["advantage"], minibatch["target"], minibatch["log_prob"],
-            policy.log_prob(minibatch["raw_action"]), value, entropy_of(policy, key),
+            policy.log_prob(minibatch["raw_action"]), value,
+            policy.entropy_estimate(minibatch["noise"]),
         )
     )  # fmt: skip
     ratio = np.exp(new_log_prob - log_prob)
@@ -137,9 +135,9 @@ def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
         advantage = minibatch["advantage"]
         advantage = (advantage - advantage[alive].mean()) / advantage[alive].std()
         surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 0.9, 1.1) * advantage)
-        entropy = entropy_of(policy, key)
+        entropy = policy.entropy_estimate(minibatch["noise"])
         total = -surrogate + 0.7 * (value - minibatch["target"]) ** 2 - 0.03 * entropy
-        return total[alive].mean() + auxiliary_loss(parameters, jax.random.split(key)[1])[0]
+        return total[alive].mean() + auxiliary_loss(parameters, key)[0]
 
     _, gradient = jax.jit(learner._gradient, static_argnums=3)(
         parameters, in_chunks(minibatch, chunks), key, auxiliary_loss
@@ -151,16 +149,33 @@ def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
     )
 
 
-@pytest.mark.parametrize("count", [1, 4, 8, 13])
-def test_random_order_is_a_uniform_permutation(count):
-    orders = np.asarray(
-        jax.vmap(lambda key: _random_order(key, count))(jax.random.split(jax.random.key(0), 4096))
+@pytest.mark.parametrize(
+    ("time", "environments", "minibatches"), [(4, 3, 2), (8, 1, 8), (3, 4, 2), (5, 4, 4), (13, 1, 1)]
+)
+def test_minibatches_are_uniform_and_take_equally_of_each_environment(time, environments, minibatches):
+    draw = partial(minibatch_order, shape=(time, environments), minibatches=minibatches)
+    keys = jax.random.split(jax.random.key(0), 4096)
+    order = np.asarray(jax.vmap(draw)(keys)).reshape(4096, minibatches, -1)
+    steps = time * environments
+    np.testing.assert_array_equal(
+        np.sort(order.reshape(4096, -1)), np.broadcast_to(np.arange(steps), (4096, steps))
     )
-    np.testing.assert_array_equal(np.sort(orders), np.broadcast_to(np.arange(count), orders.shape))
-    places = np.stack([np.bincount(column, minlength=count) for column in orders.T])
-    # Rows and columns of the table have fixed sums.
-    distance = (count - 1) / 4096 * ((places - 4096 / count) ** 2).sum()
-    assert count == 1 or stats.chi2((count - 1) ** 2).sf(distance) > 1e-3
+    members = minibatches // math.gcd(time, minibatches)
+    groups = order % environments // members
+    for group in range(environments // members):
+        assert ((groups == group).sum(axis=-1) == time * members // minibatches).all()
+    for index in range(steps):  # is in every minibatch equally often
+        counts = (order == index).any(axis=-1).sum(axis=0)
+        assert minibatches == 1 or stats.chisquare(counts).pvalue > 1e-4
+
+
+def test_minibatches_do_not_depend_on_the_number_of_devices():
+    """Each of two devices finds half of every chunk among its own environments."""
+    key = jax.random.key(0)
+    alone, divided = (np.asarray(minibatch_order(key, (4, 64), 2, devices)) for devices in (1, 2))
+    assert alone.shape == divided.shape == (2, 2, 64)
+    np.testing.assert_array_equal(*(np.sort(order.reshape(2, -1)) for order in (alone, divided)))
+    np.testing.assert_array_equal(divided % 64 // 32, np.broadcast_to(np.arange(64) // 32, (2, 2, 64)))
 
 
 @pytest.mark.parametrize(("batch", "chunk"), [(2048, 64), (96, 48), (40, 40), (97, 97), (8, 8), (320, 64)])

@@ -252,7 +252,7 @@ def shard_axis(tree: Any, axis: int) -> Any:
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(tree)):
         return tree
-    return jax.lax.with_sharding_constraint(tree, PartitionSpec(*[None] * axis, _AXIS))
+    return jax.lax.with_sharding_constraint(tree, _divided_along(axis))
 
 
 def device_count() -> int:
@@ -278,7 +278,7 @@ def sum_over_devices(
     count = device_count()
     if count == 1 or any(leaf.shape[axis] % count for leaf in jax.tree.leaves(divided)):
         return function(whole, divided)
-    specs = (PartitionSpec(), PartitionSpec(*[None] * axis, _AXIS))
+    specs = (_divided_along(None), _divided_along(axis))
     # Devices wait for each other once per array: parameters and sums are exchanged as one vector each.
     parameters, unravel_parameters = ravel_pytree(whole)
 
@@ -313,17 +313,30 @@ def mean_over_devices(x: Array) -> Float[Array, ""]:
     return jax.lax.pmean(mean, _AXIS) if _AXIS in jax.sharding.get_abstract_mesh().manual_axes else mean
 
 
-def map_over_devices(function: Callable[[Any, Any], Any], whole: Any, divided: Any) -> Any:
-    """Return ``function(whole, divided)``, computed by each device for its share of ``divided``.
+def map_over_devices(
+    function: Callable[..., Any],
+    *arguments: Any,
+    in_axes: Sequence[int | None] = (None, 0),
+    out_axis: int = 0,
+) -> Any:
+    """Return ``function(*arguments)``, computed by each device for its share of the arguments.
 
-    Arrays of ``divided`` and of the result are divided along their first axis. A result that is a sum over it differs
-    between devices: give it a leading axis of size 1. If the axis does not divide evenly, nothing is divided.
+    Arrays of an argument are divided along its entry of ``in_axes`` (None: every device has them whole), those of the
+    result along ``out_axis``. A result that is a sum over this axis differs between devices: give it an axis of size 1.
+    If an axis does not divide evenly, nothing is divided.
     """
-    count = device_count()
-    if count == 1 or any(leaf.shape[0] % count for leaf in jax.tree.leaves(divided)):
-        return function(whole, divided)
-    specs = (PartitionSpec(), PartitionSpec(_AXIS))
-    return jax.shard_map(function, in_specs=specs, out_specs=specs[1], check_vma=False)(whole, divided)
+    count, pairs = device_count(), list(zip(arguments, in_axes, strict=True))
+    sizes = [leaf.shape[axis] for tree, axis in pairs if axis is not None for leaf in jax.tree.leaves(tree)]
+    if count == 1 or any(size % count for size in sizes):
+        return function(*arguments)
+    specs = tuple(map(_divided_along, in_axes))
+    mapped = jax.shard_map(function, in_specs=specs, out_specs=_divided_along(out_axis), check_vma=False)
+    return mapped(*arguments)
+
+
+def _divided_along(axis: int | None) -> PartitionSpec:
+    """Return the layout of arrays that devices divide along an axis; None: that every device has whole."""
+    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS)
 
 
 def read_columns(
@@ -340,7 +353,7 @@ def read_columns(
     is_divided = count > 1 and all(leaf.shape[1] % count == 0 for leaf in jax.tree.leaves(ring))
     if not is_divided or not all(_has_bits(leaf.dtype) for leaf in jax.tree.leaves(shapes)):
         return read(ring, row, column)
-    specs = (PartitionSpec(None, _AXIS), PartitionSpec())
+    specs = (_divided_along(1), _divided_along(None))
 
     @partial(jax.shard_map, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)
     def exchange(share: Any, index: tuple[Array, Array]) -> Any:

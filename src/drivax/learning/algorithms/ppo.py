@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,7 +44,7 @@ from drivax.learning.environment import (
     past_policy,
     transition,
 )
-from drivax.learning.program import compute_on_each_device, shard_axis
+from drivax.learning.program import compute_on_each_device, device_count, map_over_devices, shard_axis
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig, graph_of
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -269,15 +270,17 @@ class Ppo:
     def _epoch(
         self, batch: dict[str, Any], auxiliary_loss: AuxiliaryLoss | None, carry: _Carry, key: Array
     ) -> tuple[_Carry, dict[str, Array]]:
-        """Shuffle a flattened rollout, and take an update on each of its minibatches."""
-        order_key, noise_key = jax.random.split(key)
-        steps, minibatches = self.config.steps_per_iteration, self.config.minibatches
-        order = _random_order(order_key, steps)
-        order = order.reshape(minibatches, -1, chunk_size(steps // minibatches))
+        """Shuffle a rollout, and take an update on each of its minibatches."""
+        order_key, noise_key, auxiliary_key = jax.random.split(key, 3)
+        shape, minibatches = batch["alive"].shape, self.config.minibatches
+        devices = _dividing_devices(shape, minibatches)
+        order = minibatch_order(order_key, shape, minibatches, devices)
         # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
         whole, divided = _split(batch)
-        shuffled = compute_on_each_device(_read, whole, order) | shard_axis(_read(divided, order), axis=2)
-        keys = jax.random.split(noise_key, minibatches)
+        noise = jax.random.normal(noise_key, (*shape, self.environment.action_size))
+        divided |= {"noise": shard_axis(noise, axis=1)}
+        shuffled = compute_on_each_device(_read, whole, order) | _read_shares(divided, order, devices)
+        keys = jax.random.split(auxiliary_key, minibatches)
         return jax.lax.scan(partial(self._update, auxiliary_loss), carry, (shuffled, keys))
 
     def _update(
@@ -304,7 +307,7 @@ class Ppo:
         return jax.tree.map(partial(jnp.where, refresh), parameters, older)
 
     def _batch(self, rollout: Rollout, last_value: Array) -> dict[str, Any]:
-        """Return the flattened rollout with advantages, given the values of the last observations."""
+        """Return the rollout with advantages, ``[time, environment, ...]``, given the values after it."""
         value_t = rollout.extra["value"]
         # The row after a truncated step holds its final state, so this is the value to bootstrap.
         value_tp1 = jnp.concatenate([value_t[1:], last_value[None]])
@@ -312,18 +315,16 @@ class Ppo:
             rollout.reward, value_t, value_tp1, rollout.terminated, rollout.truncated, self.config.gamma,
             self.config.lambda_,
         )  # fmt: skip
-        batch = {
-            "observation": rollout.observation,
+        # As rows: XLA reads arrays with an axis of size 1 in another layout, and copies them.
+        rows = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:2], -1), rollout.observation)
+        return {
+            "observation": rows,
             "raw_action": rollout.raw_action,
             "log_prob": rollout.extra["log_prob"],
             "advantage": advantage,
             "target": target,
             "alive": rollout.alive.astype(jnp.float32),
         }
-        batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
-        # As rows: XLA reads arrays with an axis of size 1 in another layout, and copies them.
-        rows = {name: group.reshape(len(group), -1) for name, group in batch["observation"].items()}
-        return batch | {"observation": rows}
 
     def _gradient(
         self, parameters: Any, minibatch: dict[str, Any], key: Array, auxiliary_loss: AuxiliaryLoss | None
@@ -331,13 +332,9 @@ class Ppo:
         """Return values to log, and the gradient of the loss of a minibatch ``[chunk, sample]``."""
         whole, samples = _split(minibatch)
         normalised, variance = compute_on_each_device(_normalise, whole)
-        entropy_key, auxiliary_key = jax.random.split(key)
-        # In one call, which is faster than a call per chunk.
-        noise = jax.random.normal(entropy_key, (*normalised["weight"].shape, self.environment.action_size))
-        samples |= normalised | {"noise": noise}
-        logs, gradient = sum_gradients(self._loss, parameters, samples)
+        logs, gradient = sum_gradients(self._loss, parameters, samples | normalised)
         logs["explained_variance"] = 1.0 - logs["value"] / jnp.maximum(variance, 1e-8)
-        return add_auxiliary(auxiliary_loss, parameters, auxiliary_key, logs, gradient)
+        return add_auxiliary(auxiliary_loss, parameters, key, logs, gradient)
 
     def _loss(self, parameters: Any, samples: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
         """Return the weighted sum of the samples' losses, and sums to log."""
@@ -361,20 +358,59 @@ class Ppo:
         return logs["policy"] + value_loss - config.entropy_coefficient * entropy_bonus, logs
 
 
-def _random_order(key: Array, count: int) -> Int[Array, " count"]:
-    """Return the numbers below ``count`` in a random order: random bits with a number each as lowest bits, sorted.
+def _group_size(time: int, minibatches: int) -> int:
+    """Return the number of environments whose steps of a rollout can be divided among minibatches."""
+    return minibatches // math.gcd(time, minibatches)
 
-    This takes a tenth of the time of ``jax.random.permutation`` on CPUs, which sorts pairs, and twice. Numbers whose
-    other bits are equal stay in ascending order: one in 64 of 8,192 has such a neighbour.
+
+def _dividing_devices(shape: tuple[int, int], minibatches: int) -> int:
+    """Return the number of devices that can divide each minibatch of a rollout by environments; 1 if they cannot."""
+    groups = shape[1] // _group_size(shape[0], minibatches)
+    chunk = chunk_size(math.prod(shape) // minibatches)
+    return 1 if groups % device_count() or chunk % device_count() else device_count()
+
+
+def minibatch_order(
+    key: Array, shape: tuple[int, int], minibatches: int, devices: int = 1
+) -> Int[Array, "minibatch chunk sample"]:
+    """Draw the minibatches of an epoch: indices of a flattened rollout of the shape ``[time, environment]``.
+
+    Every minibatch has equally many steps of each environment, or of each group of environments where it cannot.
+    Devices that divide the environments find an equal share of each chunk among their own. The minibatches do not
+    depend on the number of devices, the order of their samples does.
     """
+    (time, environments), members = shape, _group_size(shape[0], minibatches)
+    groups, count = environments // members, time * members
+    # Random bits above an index, sorted: ten times as fast on CPUs as sorting pairs like `jax.random.permutation`.
     mask = jnp.uint32(2 ** (count - 1).bit_length() - 1)
-    bits = jax.random.bits(key, (count,)) & ~mask
-    return (jnp.sort(bits | jnp.arange(count, dtype=jnp.uint32)) & mask).astype(jnp.int32)
+    bits = jax.random.bits(key, (groups, count)) & ~mask
+    step = (jnp.sort(bits | jnp.arange(count, dtype=jnp.uint32)) & mask).astype(jnp.int32)
+    environment = members * jnp.arange(groups)[:, None] + step % members
+    index = environments * (step // members) + environment
+    chunk = chunk_size(time * environments // minibatches)
+    index = index.reshape(devices, groups // devices, minibatches, -1)
+    index = jnp.moveaxis(index, 2, 0).reshape(minibatches, devices, -1, chunk // devices)
+    return jnp.moveaxis(index, 1, 2).reshape(minibatches, -1, chunk)
 
 
 def _read(batch: dict[str, Any], order: Int[Array, "*samples"]) -> dict[str, Any]:
-    """Return the samples of a batch in an order."""
-    return jax.tree.map(lambda leaf: leaf[order], batch)
+    """Return the samples of a batch (leaves ``[time, environment, ...]``) at indices of its flattened leaves."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[order], batch)
+
+
+def _read_shares(
+    batch: dict[str, Any], order: Int[Array, "minibatch chunk sample"], devices: int
+) -> dict[str, Any]:
+    """Return samples as :func:`_read` does; each of several devices reads its share from its own environments."""
+    if devices == 1:
+        return shard_axis(_read(batch, order), axis=2)
+    environments = batch["log_prob"].shape[1]
+
+    def read(share: dict[str, Any], order: Array) -> dict[str, Any]:
+        own = environments // devices
+        return _read(share, order // environments * own + order % own)
+
+    return map_over_devices(read, batch, order, in_axes=(1, 2), out_axis=2)
 
 
 def _split(minibatch: dict[str, Any]) -> tuple[dict[str, Array], dict[str, Any]]:
