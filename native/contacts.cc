@@ -1,34 +1,37 @@
-// Contacts of the driven agent with the others: their codes, fault and type of collision, and time to collision.
+// Contacts of the driven agent with the other agents: contact codes, fault and type of a new collision, and time to
+// collision. Native version of next_contacts, classify_contacts and time_to_collision in drivax.simulator.contact.
 #include "kernel.h"
 
 namespace drivax {
 
 struct ContactRules {
-  int32_t pedestrian, cyclist;     // kinds
-  float level_m;                   // largest difference of heights
-  float horizon_s;                 // of the time to collision
-  float stopped_mps;               // speed below which an agent is stopped
-  float rear_axle;                 // behind the centre, as a share of the length
-  float behind_tan, parallel_cos;  // of the angles that separate types of collision
-  float bumper_m;                  // length of the box that stands for the front
+  int32_t pedestrian, cyclist;  // values of AgentKind
+  float level_m;                // largest height difference of agents that can collide
+  float horizon_s;              // largest time to collision
+  float stopped_mps;            // speed below which an agent is stopped
+  float rear_axle;              // distance of the rear axle behind the box centre, as a fraction of the length
+  // Tangent of half the angle of the sector behind the rear axle; cosine of the largest heading difference of parallel
+  // agents.
+  float behind_tan, parallel_cos;
+  float bumper_m;               // length of the narrow box that represents the front bumper
 };
 
 struct Contacts : ContactRules {
-  const float* box;                // [batch, slots, 6]
+  const float* box;                // [batch, slots, 6]: columns as in overlap.h
   const float* velocity;           // [batch, slots, 2]
-  const float* z;                  // [batch, slots]
+  const float* z;                  // [batch, slots]: height of the box centre
   Mask valid;                      // [batch, slots]
-  const int32_t* kind;             // [batch, slots]
-  const float* previous_velocity;  // [batch, slots, 2], one step before
-  Mask previous_valid;             // [batch, slots]
-  const int32_t* slot;             // [batch]: the driven agent
-  const float* speed;              // [batch]: its larger one of before and after the step
-  Mask unlawful;                   // [batch]: whether a lateral hit is its fault
-  const int8_t* before;            // [batch, slots]: codes one step before
+  const int32_t* kind;             // [batch, slots]: AgentKind
+  const float* previous_velocity;  // [batch, slots, 2]: velocity at the previous step
+  Mask previous_valid;             // [batch, slots]: valid at the previous step
+  const int32_t* slot;             // [batch]: slot of the driven agent
+  const float* speed;              // [batch]: the larger of its speeds before and after the step
+  Mask unlawful;                   // [batch]: it is in several lanes or off the road: at fault in lateral collisions
+  const int8_t* before;            // [batch, slots]: contact codes of the previous step
   int64_t slots = -1;
-  int8_t* codes;                   // [batch, slots]
-  bool* at_fault;                  // [batch]: whether a contact that begins is its fault
-  int8_t* type;                    // [batch]: of the nearest contact that begins
+  int8_t* codes;                   // [batch, slots]: contact codes of this step
+  bool* at_fault;                  // [batch]: whether the driven agent is at fault in a new contact
+  int8_t* type;                    // [batch]: CollisionType of the nearest new contact
   float* time_s;                   // [batch]: time to collision
 };
 
@@ -44,25 +47,28 @@ EACH_TARGET(void measure_contacts(const Contacts& arguments, int64_t first, int6
 
 namespace drivax::TARGET {
 
-// As in drivax.simulator.contact.
+// The enums of drivax.simulator.contact.
 enum Contact : int8_t { kAbsent, kApart, kHit, kIgnored, kAtFault, kParted, kGone, kReturned };
 enum CollisionType : int8_t { kNone, kRearEnd, kRearEnded, kSideSwipe, kHeadOn, kVulnerable, kStoppedObject };
 
-// What a slot holds at this step.
+// State of a slot at this step: no agent, no overlap with the driven agent, overlap, or a new overlap for which the
+// driven agent is at fault.
 enum Now { kEmpty, kSeparate, kTouching, kTouchingAtFault, kStates };
 
+// Contact code of a slot, given its code at the previous step and its state at this one.
 constexpr int8_t next_contact(int before, int now) {
   const bool was_hit = before == kHit || before >= kAtFault;
   if (now == kEmpty) return was_hit ? kGone : kAbsent;
   if (now == kSeparate) return was_hit ? kParted : kApart;
-  // A slot that overlaps as it appears is ignored. A contact after kParted is never a new fault.
+  // An agent that already overlaps when it appears is ignored until it separates. Renewed contact after kParted is a
+  // hit, never a new fault.
   if (before == kAbsent) return kIgnored;
   if (before == kGone) return kReturned;
   if (before == kApart) return now == kTouchingAtFault ? kAtFault : kHit;
   return before == kParted ? (int)kHit : before;
 }
 
-// Codes by state and code before, which has three bits.
+// Table of next_contact. A previous code has three bits, so that any byte is a valid index once masked with 7.
 struct NextContacts {
   int8_t code[kStates][8] = {};
   constexpr NextContacts() {
@@ -72,7 +78,7 @@ struct NextContacts {
 };
 static constexpr NextContacts kNext;
 
-// Gathers the boxes of the given slots.
+// Transposes the boxes and velocities of LANES slots from rows into vectors.
 INLINE MovingBoxes gather_boxes(const float* box, const float* velocity, const int32_t* slots) {
   alignas(64) float columns[kBoxColumns + 2][LANES];
   for (int lane = 0; lane < LANES; ++lane) {
@@ -85,18 +91,20 @@ INLINE MovingBoxes gather_boxes(const float* box, const float* velocity, const i
           load(columns[4]), load(columns[5]), load(columns[6]), load(columns[7])};
 }
 
-// One driven agent, and what is known so far.
+// The driven agent of a sample, and its results accumulated over batches of other agents.
 struct Measurement {
   const Contacts& a;
   int64_t sample;
   MovingBoxes ego;
-  Floats time;
-  int64_t nearest;  // order of the contact that begins and is nearest, by its distance
+  Floats time;      // smallest time to collision in each vector element
+  int64_t nearest;  // sort key (order_of) of the nearest new contact: squared distance, then slot
   bool at_fault;
   int8_t type;
 };
 
-// Decides codes, fault and type of the boxes that overlap, and returns those that do not count for time to collision.
+// Writes the contact codes of overlapping agents, and updates `at_fault` and the type of the nearest new contact.
+// Returns the mask of agents whose overlap the time to collision ignores. `ahead`, `left` and `cos` are the other
+// agents' positions and the cosines of their headings in the frame of the driven agent.
 static Ints decide(Measurement& m, const MovingBoxes& other, const int32_t* slots, Ints overlapping, Floats ahead,
                    Floats left, Floats cos) {
   const Contacts& a = m.a;
@@ -106,6 +114,7 @@ static Ints decide(Measurement& m, const MovingBoxes& other, const int32_t* slot
                               splat(a.bumper_m), m.ego.width, m.ego.vx, m.ego.vy};
   Ints front;
   time_to_overlap(bumper, other, a.horizon_s, &front);
+  // Seen from the rear axle, the other agent's centre is in the sector straight behind.
   const Ints behind = absolute(left) < -a.behind_tan * (ahead + a.rear_axle * m.ego.length);
   const Ints opposite = cos < -a.parallel_cos, parallel = cos > a.parallel_cos;
   const Floats squared = comparable(ahead * ahead + left * left);
@@ -119,7 +128,7 @@ static Ints decide(Measurement& m, const MovingBoxes& other, const int32_t* slot
     const int64_t slot = start + slots[lane];
     const int before = a.before[slot] & 7;
     Now now = kTouching;
-    if (before == kApart) {
+    if (before == kApart) {  // a new contact
       const float speed = speed_at(a.velocity + 2 * slot);
       const float previous = a.previous_valid[slot] ? speed_at(a.previous_velocity + 2 * slot) : 0;
       const bool is_stopped = speed < a.stopped_mps && previous < a.stopped_mps;
@@ -145,7 +154,8 @@ static Ints decide(Measurement& m, const MovingBoxes& other, const int32_t* slot
   return ignored;
 }
 
-// Measures the agent against the first `count` of the given slots.
+// Computes overlap and time to collision of the driven agent with the agents in the first `count` of LANES slots; the
+// other vector elements repeat the first slot and are masked.
 INLINE void measure(Measurement& m, int32_t* slots, int count) {
   const Contacts& a = m.a;
   for (int lane = count; lane < LANES; ++lane) slots[lane] = slots[0];
@@ -161,7 +171,8 @@ INLINE void measure(Measurement& m, int32_t* slots, int count) {
   const Floats ahead = dx * m.ego.cos + dy * m.ego.sin, left = dy * m.ego.cos - dx * m.ego.sin;
   Ints counts = is_used;
   if (any(overlapping)) counts &= ~decide(m, other, slots, overlapping, ahead, left, cos);
-  // Agents entirely behind the rear axle are followers.
+  // `reach` is the other box's half extent along the driven agent's heading. Agents entirely behind the rear axle are
+  // following and do not count.
   const Floats reach = absolute(cos) * other.length / 2.0f + absolute(sin) * other.width / 2.0f;
   counts &= ahead + reach > -a.rear_axle * m.ego.length;
   m.time = smaller(m.time, select(counts, time, splat(a.horizon_s)));
@@ -173,13 +184,15 @@ void measure_contacts(const Contacts& a, int64_t first, int64_t last) {
     const Mask valid = a.valid + start;
     const int8_t* before = a.before + start;
     const float* z = a.z + start;
-    // An agent outside all slots is measured as the last one, but no slot is its own.
+    // A slot out of range reads the box of the last slot; `own` then excludes no slot from the other agents.
     const int32_t own = a.slot[sample];
     const int64_t slot = clamp_row(own, a.slots);
     const int64_t row = start + slot;
     Measurement m = {a, sample, splat_box(a.box + row * kBoxColumns, a.velocity + row * 2), splat(a.horizon_s),
                      INT64_MAX, false, kNone};
     const float height = z[slot];
+    // Collects the other agents on the driven agent's level in batches of LANES. Every slot first gets the code of an
+    // agent that does not overlap; `decide` overwrites the codes of those that do.
     int32_t pending[LANES];
     int count = 0;
     for (int32_t i = 0; i < a.slots; ++i) {

@@ -1,27 +1,29 @@
-// The lanes around the box of a vehicle: drivax.scenario.bank.queries.around_lanes.
+// Lanes around the bounding box of a vehicle; native version of drivax.scenario.bank.queries.around_lanes.
 //
-// One pass over the lanes in the cells around the centre finds all values. The driven and the nearest lane, which the
-// minima of keys name, are then measured again.
+// One vectorised pass over the lane segments in the 3 x 3 grid cells around the box centre accumulates the results. For
+// the driven and the nearest lane, the pass keeps only the minimum of a key: a rank or squared distance whose low bits
+// hold the number of the segment (order.h). After the pass, these two segments are read again by their numbers.
 #include "segments.h"
 
 namespace drivax {
 
 struct LaneQuery {
-  SegmentGrid grid;          // of lanes, with the features of drivax.scenario.bank.columns.LaneRow
-  const float* map_box;      // [scenarios, 4]: smallest and largest x, y
+  SegmentGrid grid;          // lane segments with the features of drivax.scenario.bank.columns.LaneRow
+  const float* map_box;      // [scenarios, 4]: smallest x and y, largest x and y of the map
   const int32_t* scenario;   // [batch]
-  const int32_t* ego;        // [batch]: number of the ego whose corridor counts
-  const float* centre;       // [batch, 2]
+  const int32_t* ego;        // [batch]: index of the ego whose route corridor is used
+  const float* centre;       // [batch, 2]: box centre
   const float* heading;      // [batch, 2]: cosine and sine
-  const float* corners;      // [batch, 4, 2]
-  const float* ground;       // [batch]: height
-  Mask routed;               // [batch]: whether lanes of the corridor are driven before others
+  const float* corners;      // [batch, 4, 2]: box corners
+  const float* ground;       // [batch]: height of the ground, m
+  Mask routed;               // [batch]: whether lanes of the corridor take precedence as the driven lane
+  // Constants of queries.py: LANE_CUTOFF_M, LEVEL_M, LANE_MARGIN_M, _GOES_ON_M, _JOINT_M, _PARALLEL_COS.
   float cutoff_m, level_m, margin_m, goes_on_m, joint_m, parallel_cos;
-  bool long_ego;             // corners are outside of the cells around the centre: read those around each
-  // Results; see queries.LaneHits.
+  bool long_ego;             // corners may lie outside the cells around the centre: search around each corner
+  // Results: the attributes of queries.LaneHits.
   bool* near;                // [batch]
   bool* corners_near;        // [batch, 4]
-  bool* on_corridor;         // [batch], as the following
+  bool* on_corridor;         // [batch], as are all results below
   bool* wrong_way;
   bool* straddling;
   bool* leaving_lane;
@@ -41,29 +43,36 @@ namespace drivax::TARGET {
 
 constexpr int kCorners = 4;
 enum LaneRow { kHeight = 4, kHalfWidth, kLimit, kLane };
-// Cosine of 45 degrees: lanes that lead further away from the opposite direction are not driven against.
+// Cosine of 45 degrees. A lane is opposed to the ego if its direction is within 45 degrees of the opposite heading.
 constexpr float kAgainstCos = 0.70710678118654752f;
 
 INLINE float squared(float value) { return value * value; }
 
-// What is known of the lanes that were visited.
+// Accumulated results of the pass over the lane segments. Each vector element covers every LANES-th segment; they are
+// reduced at the end.
 struct Visited {
-  // Keys of the lane that is driven, and of the nearest, in each element of the vectors.
+  // Smallest keys: rank of the driven lane, squared distance of the nearest lane.
   Floats driven, nearest;
-  // Smallest squared distances to lanes against and in the direction; smallest width outside of a lane.
+  // Smallest squared distance from the centre to a lane that contains it and is opposed to the heading (`opposed`), and
+  // to a lane in the direction of the heading, within 90 degrees (`friendly`). Smallest overhang of the farthest corner
+  // beyond a lane border, over lanes in the direction of the heading that run alongside the centre (`outside_m`).
   Floats opposed, friendly, outside_m;
+  // Whether the centre is inside a lane of the corridor.
   Ints on_corridor;
+  // Whether a lane centre is within the cut-off of the corner; whether the corner is inside a lane in the direction of
+  // the heading.
   Ints corner_near[kCorners], corner_held[kCorners];
 };
 
-// One lane, measured alone.
+// One lane segment, with its squared distance from the box centre.
 struct Lane {
   bool exists;
   Segments<float> segment;
   float squared, height, half_width, limit;
-  float side[kCorners];
+  float side[kCorners];  // signed distance of each corner from the line of the segment, left positive
 };
 
+// Reads the segment whose number is in the low bits of a key. There is none if the key is that of an empty minimum.
 INLINE Lane lane_of(const LaneQuery& q, const Runs& runs, float key, int64_t stride, int bits, int64_t sample) {
   Lane lane = {};
   lane.exists = key < kFar / 2;
@@ -82,12 +91,14 @@ INLINE Lane lane_of(const LaneQuery& q, const Runs& runs, float key, int64_t str
   return lane;
 }
 
-// Whether the index of a lane, scaled by a power of two, says that it is in the corridor of an ego.
+// Mask of lanes in the corridor of ego k. The integer part of `code` is the lane index, and bit k after the binary
+// point is set for lanes in the corridor of ego k. Multiplying by `scale` = 2^k makes it the first bit of the fraction.
 INLINE Ints in_corridor(Floats code, float scale) {
   const Floats scaled = code * scale;
-  return scaled - as_floats(as_ints(scaled)) >= 0.5f;  // Codes are not negative.
+  return scaled - as_floats(as_ints(scaled)) >= 0.5f;  // truncation is floor: codes are not negative
 }
 
+// Accumulates all results over the lane segments in the cells around the centre.
 INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride, int bits, int64_t sample) {
   const Floats far = splat(kFar);
   const float x = q.centre[2 * sample], y = q.centre[2 * sample + 1];
@@ -95,7 +106,8 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
   const float* corner = q.corners + 2 * kCorners * sample;
   const Ints routed = splat(-(int32_t)q.routed[sample]);
   const float corridor_scale = (float)(1 << clamp_index(q.ego[sample], 0, 30));
-  // Lanes further away than the farthest corner and all that counts there have no effect.
+  // `corner_m` is the distance of the farthest corner from the centre. From it follows `reach` below, the distance from
+  // the centre beyond which a segment changes no result.
   float corner_m = 0;
   for (int c = 0; c < kCorners; ++c)
     corner_m = larger(corner_m, squared(corner[2 * c] - x) + squared(corner[2 * c + 1] - y));
@@ -120,7 +132,9 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
       const Ints is_parallel = is_alongside & (aligned_cos > q.parallel_cos);
       const Ints is_corridor = inside & in_corridor(feature(q.grid, runs, kLane, i), corridor_scale);
 
-      // By limit, on the route first; without lanes that hold the centre the nearest, parallel ones first.
+      // The driven lane has the lowest rank. Parallel lanes that contain the centre rank below 1: lanes of the corridor
+      // first (if `routed`), then by descending speed limit. Other parallel lanes within the cut-off rank 1 plus their
+      // squared distance, all other lanes within 90 degrees of the heading 100 plus their squared distance.
       const Floats by_limit = select(is_corridor & routed, Floats{}, splat(0.2f)) + 1e-3f * (100.0f - limit);
       const Floats by_distance =
           select(is_parallel & (own <= squared(q.cutoff_m)), splat(1.0f), splat(100.0f)) + own;
@@ -147,7 +161,7 @@ INLINE Visited visit_lanes(const LaneQuery& q, const Runs& runs, int64_t stride,
   return v;
 }
 
-// Looks up the lanes around one corner of a long vehicle.
+// Recomputes corner_near and corner_held of one corner of a long vehicle from the cells around that corner.
 INLINE void visit_corner(const LaneQuery& q, int64_t scenario, int64_t sample, int c, Visited& v) {
   const float* corner = q.corners + 2 * (kCorners * sample + c);
   const float cosine = q.heading[2 * sample], sine = q.heading[2 * sample + 1];
@@ -166,6 +180,7 @@ INLINE void visit_corner(const LaneQuery& q, int64_t scenario, int64_t sample, i
   }
 }
 
+// Reduces the accumulated vectors and writes the results of a sample.
 INLINE void write_hits(const LaneQuery& q, int64_t scenario, int64_t sample, const Visited& v, const Lane& driven,
                        const Lane& nearest) {
   const float* corner = q.corners + 2 * kCorners * sample;
@@ -174,6 +189,8 @@ INLINE void write_hits(const LaneQuery& q, int64_t scenario, int64_t sample, con
   float widest = 0;
   for (int c = 0; c < kCorners; ++c) {
     const float x = corner[2 * c], y = corner[2 * c + 1];
+    // A corner outside the map's box is near a lane if the nearest lane, extended beyond its end, passes within the
+    // cut-off of it, or if there is no lane within `goes_on_m` of the centre.
     const bool is_outside_box = x < box[0] || y < box[1] || x > box[2] || y > box[3];
     const bool goes_on = !nearest.exists || absolute(nearest.side[c]) <= q.cutoff_m ||
                          nearest.squared > squared(q.goes_on_m);
@@ -195,7 +212,8 @@ INLINE void write_hits(const LaneQuery& q, int64_t scenario, int64_t sample, con
 }
 
 void query_lanes(const LaneQuery& q, int64_t first, int64_t last) {
-  // Numbers as in the concatenated runs of queries.lanes_around.
+  // The i-th segment of a run has number run * stride + i, its index in the array of queries.lanes_around. Equal keys
+  // are therefore resolved as in JAX.
   const int64_t stride = q.grid.side == 1 ? q.grid.size : q.grid.longest_run;
   const int bits = bits_for(q.grid.side == 1 ? stride : kRuns * stride);
   for (int64_t sample = first; sample < last; ++sample) {

@@ -55,7 +55,7 @@ KERNELS = Comparison(
     "kernel_rows", "<!-- ratios.py kernels: begin -->", "<!-- ratios.py kernels: end -->", ("without", "with")
 )
 CORES = Comparison(
-    "core_rows", "<!-- ratios.py cores: begin -->", "<!-- ratios.py cores: end -->", ("one core", "two cores")
+    "core_rows", "<!-- ratios.py cores: begin -->", "<!-- ratios.py cores: end -->", ("one core", "all cores")
 )
 COMPARISONS = (TREES, KERNELS, CORES)
 

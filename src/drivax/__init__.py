@@ -1,4 +1,4 @@
-"""Train, curate and judge driving planners on recorded traffic, in one JAX program.
+"""Train and evaluate driving planners on recorded traffic, and curate their training data, in one JAX program.
 
 ``generate``, ``train``, ``evaluate``, ``write_report`` and other functions do what the commands do. Names are imported
 on first use: ``import drivax`` is fast, and worker processes that convert data never load JAX.

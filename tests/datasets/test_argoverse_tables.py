@@ -68,6 +68,15 @@ def test_columns_of_each_form(tmp_path, form, is_dictionary):
     assert result.numbers["x"].tolist() == list(range(8))
 
 
+@pytest.mark.parametrize("form", FORMATS)
+def test_optional_columns_may_be_missing(tmp_path, form):
+    path = write(tmp_path / form, pa.table({"x": np.arange(8.0)}), **FORMATS[form])
+    result = read_table(path, COLUMNS, optional=("name",))
+    assert result.rows == 8 and not result.texts
+    with pytest.raises(DataError, match="has no column name"):
+        read_table(path, COLUMNS)
+
+
 def test_words_of_several_dictionaries_and_repeated_words(tmp_path):
     parts = [(["x", "b", "x"], [2, 1, 0]), (["b", "y"], [1, 0, 1])]
     column = pa.chunked_array([

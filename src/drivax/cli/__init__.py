@@ -284,7 +284,7 @@ def overview() -> str:
     width = max(map(len, COMMANDS))
     rows = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
     return "\n".join((
-        "drivax trains, curates and evaluates driving planners on recorded traffic.",
+        "drivax trains and evaluates driving planners on recorded traffic, and curates their training data.",
         "",
         "usage: drivax COMMAND [options]      drivax COMMAND --help  explains one, with an example",
         "",

@@ -55,7 +55,7 @@ def widen_pool() -> None:
     Programs of several seeds can deadlock on a smaller pool, when every thread waits for a task that no thread is free
     to run (jaxlib 0.10.2). Do not call it for other programs: they are slower with more threads than cores.
     """
-    if (os.cpu_count() or 1) < _THREADS:
+    if len(available_cores()) < _THREADS:
         os.environ.setdefault("NPROC", str(_THREADS))
 
 

@@ -300,16 +300,16 @@ class Signal:
 
 SIGNALS = (
     Signal("speed", "speed", "m/s", 0.01),
-    Signal("acceleration", "acceleration along the road", "m/s²", 0.01, comfort.LONGITUDINAL_MPS2),
-    Signal("jerk", "jerk along the road", "m/s³", 0.01, (-comfort.JERK_MPS3, comfort.JERK_MPS3)),
+    Signal("acceleration", "longitudinal acceleration", "m/s²", 0.01, comfort.LONGITUDINAL_MPS2),
+    Signal("jerk", "longitudinal jerk", "m/s³", 0.01, (-comfort.JERK_MPS3, comfort.JERK_MPS3)),
     Signal("curvature", "curvature", "1/m", 0.0001),
     Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-comfort.YAW_RATE_RPS, comfort.YAW_RATE_RPS)),
     Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-comfort.LATERAL_MPS2, comfort.LATERAL_MPS2)),
 )
 #: Commands: the first two numbers of an action.
 COMMANDS = (
-    Signal("lengthwise", "command lengthwise", "maximum 1", 0.001),
-    Signal("sideways", "command sideways", "maximum 1", 0.001),
+    Signal("longitudinal_command", "longitudinal command", "maximum 1", 0.001),
+    Signal("lateral_command", "lateral command", "maximum 1", 0.001),
 )
 
 

@@ -60,7 +60,7 @@ class Table:
 def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
     """Read columns of a parquet or feather file; ``columns`` gives the kind of each by name.
 
-    ``optional`` columns, which not every version of the format has, may be missing from a parquet file.
+    ``optional`` columns, which not every version of the format has, may be missing from the file.
 
     Raises:
         DataError: The file is missing or damaged, has no rows, or lacks a column.
@@ -112,7 +112,7 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
             # Read the stream inside the file and not its footer, which may point elsewhere.
             unpacked_size.check_messages(source)
             schema = pa.ipc.open_stream(source).schema
-            names = _check(schema, columns)
+            names = _check(schema, columns, optional)
             unpacked_size.check_messages(source)
             indices = [schema.names.index(name) for name in names]
             options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=indices)
@@ -121,7 +121,7 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
     return table, frozenset(schema.names) - {*names}
 
 
-def _check(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> list[str]:
+def _check(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str]) -> list[str]:
     """Return the names of the columns to read; refuse a missing one, a repeated one, and one of another type.
 
     A column of another type could repeat one value without limit; pyarrow would read ``a.b`` together with ``a``.
