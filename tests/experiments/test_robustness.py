@@ -63,7 +63,7 @@ def test_atomic_program_is_identical_after_kills(bench):
 
 
 def test_files_that_are_replaced_one_by_one_stay_whole(bench):
-    """An incomplete hidden file may lie beside them until the next run."""
+    """An incomplete hidden file may lie next to them until the next run."""
     bench = bench("files")
     bench.measure()
     robustness.run_kills(bench, 6)
