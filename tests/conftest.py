@@ -29,6 +29,8 @@ if not os.environ.get("DRIVAX_OPTIMISED"):
         "--xla_cpu_use_fusion_emitters=false",
         "--xla_backend_optimization_level=0",
         "--xla_llvm_disable_expensive_passes=true",
+        # Parts of a program that are compiled in parallel; a worker has one core.
+        "--xla_cpu_parallel_codegen_split_count=1",
     ]
 os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
