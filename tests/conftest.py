@@ -9,6 +9,7 @@ as long. ``DRIVAX_OPTIMISED=1`` compiles as users do; ``make test-all`` sets it.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import types
@@ -29,6 +30,8 @@ if not os.environ.get("DRIVAX_OPTIMISED"):
         "--xla_cpu_use_fusion_emitters=false",
         "--xla_backend_optimization_level=0",
         "--xla_llvm_disable_expensive_passes=true",
+        # Parts of a program that are compiled in parallel; a worker has one core.
+        "--xla_cpu_parallel_codegen_split_count=1",
     ]
 os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -62,6 +65,13 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.register_profile("ci", hypothesis.settings.get_profile("dev"), derandomize=True)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage seldom: tracing makes many objects that are no garbage, and imported ones stay for ever."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 10, 10)
 
 
 @pytest.fixture(scope="session")

@@ -25,19 +25,22 @@ START = 10
 def _program():
     simulator = Simulator(evaluation_task(Task()))
 
-    def evaluate(bank, row, motion):
+    def evaluate(bank, rows, motions):
         def step(state, pose):
             state, _ = simulator.replay(bank, state, pose, jnp.zeros(2))
             return state, step_metrics(simulator.situation(bank, state))
 
-        begin = simulator.reset(bank, row, START)
-        state, series = jax.lax.scan(step, begin, motion)
-        return episode_metrics(bank, state), event_steps(state.episode), series
+        begin = jax.vmap(lambda row: simulator.reset(bank, row, START))(rows)
+        # Map the step, not the loop: to map a loop, JAX traces its body several times.
+        states, series = jax.lax.scan(jax.vmap(step), begin, jnp.swapaxes(motions, 0, 1))
+        metrics = jax.vmap(partial(episode_metrics, bank))(states)
+        series = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), series)
+        return metrics, jax.vmap(event_steps)(states.episode), series
 
     def log(bank, row):
         return jax.vmap(lambda t: logged_history(bank, row, t, 0)[-1])(jnp.arange(bank.steps))
 
-    return jax.jit(jax.vmap(evaluate, (None, 0, 0))), jax.jit(jax.vmap(log, (None, 0)))
+    return jax.jit(evaluate), jax.jit(jax.vmap(log, (None, 0)))
 
 
 def judge(recordings, motions=None):

@@ -7,6 +7,7 @@ import keyword
 import re
 import subprocess
 import tokenize
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ def _files() -> list[Path]:
     ]
 
 
+@cache
 def prose(file: Path, text: str) -> list[tuple[int, str]]:
     """Numbered lines in which words are searched: of tests only names and first lines of docstrings."""
     lines = list(enumerate(text.splitlines(), start=1))
@@ -42,6 +44,7 @@ def prose(file: Path, text: str) -> list[tuple[int, str]]:
     return [(number, line if file.suffix == ".md" else line.replace("_", " ")) for number, line in lines]
 
 
+@cache
 def names(text: str) -> list[tuple[int, str]]:
     """Numbered identifiers of Python code, attributes aside."""
     tokens, previous = [], ""

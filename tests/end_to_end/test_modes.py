@@ -21,6 +21,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.actions import Published
+from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.tracking.sinks import read_rows
 from tiny_run import write_run
@@ -87,9 +88,10 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
 
 @pytest.mark.parametrize("planner", [pytest.param("random", marks=pytest.mark.slow), "constant_velocity"])
 def test_task_flags_hold_for_rule_based_planners(data, planner, tmp_path):
-    assert evaluate(data, planner, tmp_path / "run", "--task.actions", "published") == 0
+    flags = ["--task.actions", "published", "--task.observation.road", "0", "--task.observation.agents", "1"]
+    assert evaluate(data, planner, tmp_path / "run", *flags) == 0
     task = settings.load(EvaluationConfig, tmp_path / "run" / "config.yaml").task
-    assert task == Task(actions=Published())
+    assert task == Task(actions=Published(), observation=ObservationConfig(agents=1, road=0))
     options = {"start": NoisyStart(), "start_step": START, "seed": 7}
     published = drivax.evaluate(planner, data, task=task, **options)
     ego = rollouts(tmp_path / "run")["ego"]

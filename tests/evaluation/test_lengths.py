@@ -16,6 +16,7 @@ from drivax.adapters.gym import DrivingEnv
 from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import score_bank
 from drivax.errors import DataError, UsageError
+from drivax.evaluation import runner
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.observation_statistics import observation_statistics
 from drivax.evaluation.runner import evaluate
@@ -142,9 +143,15 @@ def test_starts_after_the_end_of_the_log_are_refused(logs):
     for step, counted in ((SHORT - 1, "2 of 3"), (60, "2 of 3")):
         with pytest.raises(UsageError, match=rf"no action after step {step} in {counted}"):
             evaluate(Expert(), [*padded, long[0]], task=TASK, start_step=step)
-    assert len(evaluate(Expert(), padded, task=TASK, start_step=SHORT - 2)) == 2
+    assert len(runner._stored_names(padded, SHORT - 2)) == 2
     with pytest.raises(UsageError, match="use 0 to 43"):
         evaluate(Expert(), logs[1], task=TASK, start_step=SHORT - 1)
+
+
+@pytest.mark.slow
+def test_episode_of_one_step_starts_before_the_end_of_the_log(logs):
+    table = evaluate(Expert(), logs[0], task=TASK, start_step=SHORT - 2)
+    assert table.metrics["steps"].tolist() == [1, 1]
 
 
 @pytest.mark.slow
@@ -202,16 +209,18 @@ def test_training_episodes_lie_within_their_logs(logs):
 def test_collected_episodes_are_truncated_at_the_last_step_of_their_log(logs):
     padded, _, long = logs
     bank = ScenarioBank.from_scenarios([*padded, long[0]], trim=False)
-    driving = Driving(Simulator(replace(TASK, ends=(), metrics="training")))
-    environments = jax.jit(lambda bank: driving.start(bank, jax.random.key(0), 8))(bank)
+    driving = Driving(Simulator(replace(TASK, ends=(), metrics="none")))
 
     def actor(observation, key):
         action = jnp.zeros((8, 2))
         return action, action, {}
 
-    _, rollout, _ = jax.jit(
-        lambda bank, now: collect(driving, bank, now, actor, jax.random.key(1), 100, "state")
-    )(bank, environments)
+    @jax.jit
+    def run(bank):
+        environments = driving.start(bank, jax.random.key(0), 8)
+        return collect(driving, bank, environments, actor, jax.random.key(1), 100, "state")[1]
+
+    rollout = run(bank)
     index, step, alive, truncated = map(
         np.asarray, (rollout.state.index, rollout.state.step, rollout.alive, rollout.truncated)
     )
@@ -228,7 +237,7 @@ def test_gymnasium_truncates_a_short_log_at_its_end(tmp_path):
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         for name, steps in (("short", SHORT), ("long", STEPS)):
             writer.add(named(cut(straight_road([car(speed=8.0)]), steps), name))
-    env = DrivingEnv(tmp_path / "set", TASK)
+    env = DrivingEnv(tmp_path / "set", replace(TASK, metrics="none"))
     for row, steps in ((0, SHORT), (1, STEPS)):
         env.reset(options={"scenario": row})
         ends = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(steps - 11)]

@@ -27,7 +27,8 @@ from drivax.planners.catalogue import make_planner
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.synthetic.world import generate_recording
-from scenes import SMALL, car, straight_road
+from drivax.tasks.task import Task
+from scenes import GLIMPSE, SMALL, car, straight_road
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +45,8 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "constant"
-    return run_evaluation(
-        EvaluationConfig("constant_velocity"), make_planner("constant_velocity"), data, out
-    ), out
+    config = EvaluationConfig("constant_velocity", task=Task(observation=GLIMPSE))
+    return run_evaluation(config, make_planner("constant_velocity"), data, out), out
 
 
 def test_lanes_become_strips_of_their_width(data):

@@ -28,7 +28,7 @@ from drivax.synthetic.world import generate_recording
 from drivax.tasks.actions import PUBLISHED
 from drivax.tasks.task import Task
 from own_drivers import fragile, plain
-from scenes import SMALL, bank_of, car, straight_road
+from scenes import GLIMPSE, SMALL, bank_of, car, straight_road
 
 COUNT = 9
 
@@ -49,8 +49,9 @@ def driven(data):
 
     def drive(some, planner=None, batch=4, seed=0):
         return evaluate(
-            planner or fragile(), some, start=NoisyStart(), batch=batch, seed=seed, sizes=data.sizes
-        )
+            planner or fragile(), some, task=Task(observation=GLIMPSE), start=NoisyStart(), batch=batch, seed=seed,
+            sizes=data.sizes,
+        )  # fmt: skip
 
     return drive
 
@@ -235,12 +236,17 @@ def test_planner_finds_scenarios_whose_hashes_are_equal():
     numbers = identities([(dataset, name) for name in ids]).tolist()
     assert numbers[:1] == identities([(dataset, ids[0])]).tolist() == identities([(dataset, ids[1])]).tolist()
 
+    class EnoughError(Exception):
+        """Ends the evaluation before its program is compiled."""
+
     @record
     class Prepared(Expert):
         def prepare(self, scenario_of):
             asked.extend(scenario_names([scenario_of(number)])[0]["scenario_id"] for number in numbers)
+            raise EnoughError
 
-    evaluate(Prepared(), scenarios)
+    with pytest.raises(EnoughError):
+        evaluate(Prepared(), scenarios)
     assert asked == list(ids)
 
 

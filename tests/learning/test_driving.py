@@ -219,16 +219,16 @@ def test_demonstrations_leave_out_gaps_of_the_log(bank, driving):
 
 def test_held_decision_takes_its_steps_and_stops_at_an_end(bank, driving):
     """Two steps of one action equal two single steps; rewards add up, and an ended episode waits for its reset."""
-    task = replace(driving.task, rewards=RewardConfig(preset="pace"))
+    task = replace(driving.task, rewards=RewardConfig(preset="pace"), metrics="none")
     single = Driving(Simulator(task), LATEST, EARLIEST)
     double = Driving(Simulator(replace(task, hold=2)), LATEST, EARLIEST)
     start = jax.jit(single.start, static_argnums=2)(bank, jax.random.key(0), 24)
     steps = {name: jax.jit(each.step) for name, each in (("single", single), ("double", double))}
-    draw = jax.jit(single.draw, static_argnums=2)
+    draw, cache_of = jax.jit(single.draw, static_argnums=2), jax.jit(single.cache)
     action, now = jnp.tile(jnp.array([[1.0, 0.4], [-1.0, -0.4]]), (12, 1)), start
     ended = 0
     for number in range(40):
-        drawn, cache = draw(bank, jax.random.key(number), 24), single.cache(bank, now.state)
+        drawn, cache = draw(bank, jax.random.key(number), 24), cache_of(bank, now.state)
         held, result = steps["double"](bank, now, cache, action, drawn)
         first, one = steps["single"](bank, now, cache, action, drawn)
         second, two = steps["single"](bank, first, one.cache, action, drawn)

@@ -1,6 +1,7 @@
 """Logged experience: equal to an expert in the simulator, and drawn by weight."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +47,7 @@ def experience(bank):
     return ExperienceConfig().of(DRIVING, bank)
 
 
-def drive_expert(bank, index):
+def drive_expert(bank, indices):
     """Drive the planner ``expert`` in the simulator; return all steps from the current one on."""
     simulator, planner = DRIVING.simulator, Expert(DRIVING.task.actions)
 
@@ -62,11 +63,14 @@ def drive_expert(bank, index):
             transition.truncated,
         )  # fmt: skip
 
-    return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]
+    states = jax.vmap(partial(simulator.reset, bank))(indices)
+    # Map the step, not the loop: to map a loop, JAX traces its body several times.
+    _, steps = jax.lax.scan(jax.vmap(step, (0, None)), states, None, bank.steps - 11)
+    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), steps)
 
 
 def test_transitions_equal_a_simulated_expert(bank, experience):
-    online = jax.device_get(jax.jit(jax.vmap(drive_expert, (None, 0)))(bank, jnp.arange(3)))
+    online = jax.device_get(jax.jit(drive_expert)(bank, jnp.arange(3)))
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.usable)
     positions = jnp.asarray(index), jnp.asarray(step)

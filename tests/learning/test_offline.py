@@ -73,8 +73,7 @@ def step_keys(count):
 
 def draw_raw(policy, keys):
     """A raw action of each step, by its own key."""
-    steps = [jax.tree.map(lambda leaf, row=row: leaf[row], policy) for row in range(COUNT)]
-    return jnp.stack([step.sample(keys[row]) for row, step in enumerate(steps)])
+    return jax.vmap(lambda step, key: step.sample(key))(policy, keys)
 
 
 def draw_several(policy, keys, count):
@@ -106,8 +105,8 @@ def test_cql_against_numpy(batch, policy_batch):
         now = learner.distribution(trained["policy"], batch.observation)
         there = learner.distribution(trained["policy"], policy_batch[0])
         then = jnp.tanh(draw_several(following, next_keys, 2))
-        uniform = [jax.random.uniform(uniform_keys[row], (ACTIONS, 1), minval=-1.0) for row in range(COUNT)]
-        uniform = jnp.stack(uniform, axis=1)
+        draw_uniform = partial(jax.random.uniform, shape=(ACTIONS, 1), minval=-1.0)
+        uniform = jax.vmap(draw_uniform, out_axes=1)(uniform_keys)
         drawn = {
             "now": draw_several(now, now_keys, ACTIONS),
             "then": draw_several(following, then_keys, ACTIONS),
@@ -234,7 +233,7 @@ def test_td3_bc_against_numpy(batch, policy_batch):
     @jax.jit
     def outputs(trained):
         mode = learner.distribution(target["policy"], batch.next_observation).mode()
-        noise = 0.5 * jnp.stack([jax.random.normal(keys[row], mode.shape[1:]) for row in range(COUNT)])
+        noise = 0.5 * jax.vmap(lambda key: jax.random.normal(key, mode.shape[1:]))(keys)
         then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
         action = learner.distribution(trained["policy"], policy_batch[0]).mode()
         return {

@@ -83,12 +83,23 @@ def in_chunks(minibatch, count):
 LOSS = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
 
 
-def test_logged_losses_against_numpy():
-    """Samples between episodes do not count, advantages are normalised."""
+@pytest.fixture(scope="module")
+def sampled():
+    """A learner with parameters, a minibatch, and a key."""
     learner = LOSS.build(Pendulum(), (), 1)
-    parameters, key = learner.init((), jax.random.key(0)).parameters, jax.random.key(2)
-    minibatch = minibatch_of(learner, parameters)
-    logs, _ = learner._gradient(
+
+    @jax.jit
+    def draw(key):
+        parameters = learner.init((), key).parameters
+        return parameters, minibatch_of(learner, parameters)
+
+    return learner, *draw(jax.random.key(0)), jax.random.key(2)
+
+
+def test_logged_losses_against_numpy(sampled):
+    """Samples between episodes do not count, advantages are normalised."""
+    learner, parameters, minibatch, key = sampled
+    logs, _ = jax.jit(learner._gradient, static_argnums=3)(
         parameters, in_chunks(minibatch, 4), key, lambda *_: (jnp.float32(0.5), {"also": jnp.ones(())})
     )
 
@@ -118,18 +129,20 @@ def test_logged_losses_against_numpy():
     assert 0.2 < expected["clipped_share"] < 0.9
 
 
-@pytest.mark.parametrize("chunks", [1, 4, 16])
-def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
-    learner = LOSS.build(Pendulum(), (), 1)
-    parameters, key = learner.init((), jax.random.key(0)).parameters, jax.random.key(2)
-    minibatch = minibatch_of(learner, parameters)
-    alive = minibatch["alive"] > 0
+def auxiliary_loss(parameters, key):
+    loss = 0.1 * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(parameters))
+    return loss * jax.random.uniform(key), {}
 
-    def auxiliary_loss(parameters, key):
-        loss = 0.1 * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(parameters))
-        return loss * jax.random.uniform(key), {}
 
-    def loss(parameters):
+@pytest.fixture(scope="module")
+def whole_gradient(sampled):
+    """The gradient of the loss of the minibatch as one formula."""
+    learner, parameters, minibatch, key = sampled
+    alive = np.asarray(minibatch["alive"]) > 0
+
+    @jax.jit
+    @jax.grad
+    def gradient(parameters):
         policy, value = learner.network(parameters).policy_and_value(minibatch["observation"])
         ratio = jnp.exp(policy.log_prob(minibatch["raw_action"]) - minibatch["log_prob"])
         advantage = minibatch["advantage"]
@@ -139,13 +152,17 @@ def test_gradient_in_chunks_is_that_of_the_whole_minibatch(chunks):
         total = -surrogate + 0.7 * (value - minibatch["target"]) ** 2 - 0.03 * entropy
         return total[alive].mean() + auxiliary_loss(parameters, key)[0]
 
+    return gradient(parameters)
+
+
+@pytest.mark.parametrize("chunks", [1, 4, 16])
+def test_gradient_in_chunks_is_that_of_the_whole_minibatch(sampled, whole_gradient, chunks):
+    learner, parameters, minibatch, key = sampled
     _, gradient = jax.jit(learner._gradient, static_argnums=3)(
         parameters, in_chunks(minibatch, chunks), key, auxiliary_loss
     )
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6),
-        gradient,
-        jax.grad(loss)(parameters),
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), gradient, whole_gradient
     )
 
 
@@ -264,10 +281,10 @@ def test_settings_of_rate_and_norm_reach_the_optimisers(last):
 def test_updates_are_skipped_beyond_the_target_divergence():
     """At a huge learning rate the first of four updates moves the policy far; the others do not happen."""
     states, shares = {}, {}
+    first = jax.jit(CONFIG.build(Pendulum(), (), 1).init)((), jax.random.key(0))
     for name, target in (("none", None), ("far", 1e9), ("near", 1e-3)):
         config = replace(CONFIG, learning_rate=0.1, target_kl=target)
-        learner = config.build(Pendulum(), (), 1)
-        states[name], logs = jax.jit(learner.iterate)((), learner.init((), jax.random.key(0)))
+        states[name], logs = jax.jit(config.build(Pendulum(), (), 1).iterate)((), first)
         shares[name] = float(logs.get("loss/skipped_share", -1.0))
     assert shares == {"none": -1.0, "far": 0.0, "near": 0.75}
     same = [jax.tree.leaves(states[name].parameters) for name in ("none", "far")]
@@ -284,7 +301,9 @@ def test_average_of_parameters(config):
     first = state = plain.init((), jax.random.key(0))
     averaging = averaged.init((), jax.random.key(0))
     assert state.trained is None and averaging.trained is not None
-    iterate, iterate_averaged = (jax.jit(partial(each.iterate, ())) for each in (plain, averaged))
+    iterate = jax.jit(partial(plain.iterate, ()))
+    # A state may be donated: no array is in it twice.
+    iterate_averaged = jax.jit(partial(averaged.iterate, ()), donate_argnums=0)
     history = []
     for _ in range(6):
         state, _ = iterate(state)
@@ -296,9 +315,6 @@ def test_average_of_parameters(config):
             expected = decay * expected + (1.0 - decay) * later
         np.testing.assert_allclose(ravel_pytree(averaging.parameters)[0], expected, rtol=2e-5, atol=1e-6)
     assert np.abs(history[-1] - history[0]).max() > 1e-4
-    # A state may be donated: no array is in it twice.
-    donating = jax.jit(lambda state: averaged.iterate((), state), donate_argnums=0)
-    donating(averaged.init((), jax.random.key(0)))
     # A pretraining sets the parameters alone: training goes on from them.
     pretrained = replace(averaging, parameters=state.parameters, iteration=first.iteration)
     jax.tree.map(np.testing.assert_array_equal, trained_parameters(pretrained), state.parameters)

@@ -1,6 +1,7 @@
 """Replay: what is sampled is what happened, whatever was written over, and every step as often as any other."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -64,16 +65,25 @@ def act(observation, key):
     return action, action, {}
 
 
+@partial(jax.jit, static_argnames=("unroll", "store"))
+def run(environments, unroll, store):
+    return collect(Counting(), (), environments, act, jax.random.key(0), unroll, store)[:2]
+
+
+@partial(jax.jit, static_argnames="buffer")
+def add(buffer, replay, rollout):
+    return buffer.add(replay, rollout)
+
+
 def fill(config, steps, unroll):
     """Return a buffer, its contents after ``steps``, and the steps that it should hold, found by plain loops."""
     environment = Counting()
     environments = environment.start((), jax.random.key(0), COUNT)
     buffer = ReplayBuffer(config, environment)
     replay = buffer.init(environments)
-    run = jax.jit(lambda e, key: collect(environment, (), e, act, key, unroll, config.store)[:2])
     for _ in range(steps // unroll):
-        environments, rollout = run(environments, jax.random.key(0))
-        replay = jax.jit(buffer.add)(replay, rollout)
+        environments, rollout = run(environments, unroll, config.store)
+        replay = add(buffer, replay, rollout)
     stored_steps = set()
     for env in range(COUNT):
         row, episode, step = 0, 0, 0
@@ -88,8 +98,9 @@ def fill(config, steps, unroll):
     return buffer, replay, stored_steps
 
 
-def sample_batch(buffer, replay, count, seed=1, n=1):
-    return buffer.sample((), replay, buffer.draw(replay, jax.random.key(seed), (count,)), 0.9, n)
+@partial(jax.jit, static_argnames=("buffer", "count", "n"))
+def sample_batch(buffer, replay, count, n=1):
+    return buffer.sample((), replay, buffer.draw(replay, jax.random.key(1), (count,)), 0.9, n)
 
 
 @pytest.mark.parametrize("environments", [1, 6, 16])

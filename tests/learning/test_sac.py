@@ -107,15 +107,15 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
     assert float(slopes["total"].log_temperature) == pytest.approx(slope, rel=1e-3, abs=1e-5)
 
 
-@pytest.mark.parametrize("chunk", [4, 16])
-def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
-    monkeypatch.setattr(optimisers, "_CHUNK", chunk)
+def auxiliary_loss(policy, key):
+    scale = jax.random.uniform(key)
+    return scale * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(policy)), {"scale": scale}
+
+
+@pytest.fixture(scope="module")
+def whole_gradient(sac):
+    """Keys of each step and of the auxiliary loss, and with them logs and gradient of the batch as one formula."""
     learner, trained, target, batch = sac
-
-    def auxiliary_loss(policy, key):
-        scale = jax.random.uniform(key)
-        return scale * sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(policy)), {"scale": scale}
-
     key, auxiliary_key = jax.random.split(jax.random.key(3))
     keys = jax.random.split(key, (16, 2))
 
@@ -124,14 +124,20 @@ def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, chunk, monkeypatch):
         auxiliary, auxiliary_logs = auxiliary_loss(trained.policy, auxiliary_key)
         return total + auxiliary, auxiliary_logs | logs
 
+    gradient, logs = jax.jit(jax.grad(loss, has_aux=True))(trained)
+    return keys, auxiliary_key, (logs, gradient)
+
+
+@pytest.mark.parametrize("chunk", [4, 16])
+def test_gradient_in_chunks_is_that_of_the_whole_batch(sac, whole_gradient, chunk, monkeypatch):
+    monkeypatch.setattr(optimisers, "_CHUNK", chunk)
+    learner, trained, target, batch = sac
+    keys, auxiliary_key, expected = whole_gradient
     chunked = jax.jit(
         lambda trained: learner.gradient(trained, target, batch, keys, auxiliary_key, auxiliary_loss)
     )
-    gradient, logs = jax.grad(loss, has_aux=True)(trained)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6),
-        chunked(trained),
-        (logs, gradient),
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), chunked(trained), expected
     )
 
 
@@ -155,21 +161,25 @@ def logged():
     return Logged(), table
 
 
-def iterated(config, logged, settling):
-    """States before and after an iteration, with a learner."""
+def iterated(config, logged, *settling):
+    """A learner with its data, its first state, and for each ``settling`` the state and logs after an iteration."""
     environment, table = logged
     learner = config.build(environment, table, 1)
     data = training_data(config, environment, table)
-    state = jax.jit(learner.init)(data, jax.random.key(0))
-    after, logs = jax.jit(learner.iterate)(data, state, None, settling)
-    return learner, data, state, after, logs
+    state, iterate = jax.jit(learner.init)(data, jax.random.key(0)), jax.jit(learner.iterate)
+    return learner, data, state, *(iterate(data, state, None, value) for value in settling)
 
 
 def test_demonstrations_are_a_share_of_each_batch(logged):
     config = replace(CONFIG, demonstrations=0.25, steps=2)
-    learner, data, _, after, logs = iterated(config, logged, None)
-    index = learner._draw(data, after.replay, jax.random.key(0), 3)
-    batch = learner._sample(data, after.replay, jax.tree.map(lambda leaf: leaf[0], index))
+    learner, data, _, (after, logs) = iterated(config, logged, None)
+
+    @jax.jit
+    def sample(data, replay):
+        index = learner._draw(data, replay, jax.random.key(0), 3)
+        return learner._sample(data, replay, jax.tree.map(lambda leaf: leaf[0], index))
+
+    batch = sample(data, after.replay)
     is_logged = np.asarray(batch.action[:, 0]) == 0.25
     assert is_logged.sum() == 4 and len(is_logged) == 16
     np.testing.assert_array_equal(np.asarray(batch.observation["pendulum"])[is_logged], 9.0)
@@ -209,9 +219,9 @@ def test_clone_learns_from_demonstrations_after_settling(logged):
 
 
 def test_settling_fits_critics_to_a_fixed_policy(logged):
-    _, _, state, fixed, _ = iterated(CONFIG, logged, jnp.asarray(True))
-    _, _, _, free, _ = iterated(CONFIG, logged, jnp.asarray(False))
-    _, _, _, plain, _ = iterated(CONFIG, logged, None)
+    is_settling = jnp.asarray(True)
+    _, _, state, *results = iterated(CONFIG, logged, is_settling, ~is_settling, None)
+    fixed, free, plain = (after for after, _ in results)
 
     def policy_of(state):
         inner = state.optimiser.inner_states

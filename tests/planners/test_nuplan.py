@@ -485,9 +485,12 @@ def test_the_call_sequence_of_the_devkits_idm_planner_works(monkeypatch):
     recording = junction(car(20, 0, 0, 5), car(90, 0, 0, 0, kind=AgentKind.STATIC), light=GREEN)
     scenario, seen = assemble(far_away(recording, "leader"), SMALL), []
     planner = NuplanPlanner(Host(DevkitIdm(seen), "tests:DevkitIdm"), SPACE)
-    results = evaluate(planner, [scenario], task=TASK)
-    assert not results.crashes and not results.metrics["collision"].any()
+    planner.prepare(lambda number: scenario)
+    simulator = Simulator(replace(TASK, metrics=("collision",), to_the_end=True))
+    bank, rows = ScenarioBank.from_scenarios([scenario]), jnp.arange(1)
+    episodes = jax.device_get(drive(simulator, planner, bank, rows, episode_keys(bank, rows, 0)))
+    assert episodes.crashed.tolist() == [-1] and not episodes.metrics["collision"].value.any()
     ego, (gap, speed, static) = seen[0]
     assert (gap, speed, static) == (pytest.approx(15.2, abs=1e-3), pytest.approx(5.0, abs=1e-4), False)
     assert ego.tire_steering_angle == 0.0 and ego.dynamic_car_state.speed == pytest.approx(8.0, abs=1e-4)
-    assert abs(results.trajectories.ego[0, -1, 3] - 5.0) < 1.0
+    assert abs(episodes.motion[0, -1, 3] - 5.0) < 1.0

@@ -32,6 +32,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL, ROUTE, Trajectory, execute
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
+from quick import quick
 from scenes import RED, bank_of, car, straight_road
 
 
@@ -56,6 +57,12 @@ def first_action(planner, bank, state, situation, seen):
 
 def act(planner, simulator, bank):
     return np.asarray(first_action(planner, bank, *first_moment(simulator, bank)))
+
+
+@jax.jit
+def executed(bank, context, action):
+    """The physical action of an action of the route space."""
+    return execute(ROUTE, bank, context, action)
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
@@ -115,8 +122,9 @@ def test_logged_poses_go_on_through_gaps_and_after_the_log(simulator):
     late = car(20, 3.7, 0, 6, steps=[*range(30), *range(35, 60)])
     bank = bank_of(straight_road([car(0, 0, 0, 9), late]))
     time = np.arange(41)
+    find = jax.jit(lambda bank, step, slot: logged_poses(bank, simulator.context(bank, 0, step, slot), 40))
     for slot, step, begin, speed in ((0, 70, 54.0, 9.0), (1, 28, 30.8, 6.0)):
-        poses = logged_poses(bank, simulator.context(bank, 0, step, slot), 40)
+        poses = find(bank, step, slot)
         np.testing.assert_allclose(poses[:, 0], begin + 0.1 * speed * time, atol=1e-3)
         np.testing.assert_allclose(poses[:, 1:], [[3.7 * slot, 0.0]] * 41, atol=1e-4)
 
@@ -152,7 +160,7 @@ def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulato
     planner, bank = RandomActions(), bank_of(straight_road([car(0, 0, 0, 9)]))
     state, situation, _ = first_moment(simulator, bank)
     keys = jax.random.split(jax.random.key(3), 4000)
-    actions = np.asarray(jax.vmap(lambda key: planner.act((), bank, state, situation, None, key)[0])(keys))
+    actions = quick(jax.vmap(lambda key: planner.act((), bank, state, situation, None, key)[0]), keys)
     # Uniform over [-1, 1): mean 0, variance 1/3, axes independent.
     assert np.abs(actions.mean(axis=0)).max() < 0.04
     assert actions.var(axis=0) == pytest.approx(1 / 3, rel=0.06)
@@ -175,7 +183,7 @@ def test_constant_speed_is_the_zero_of_the_route_space(simulator):
     physical, route = (act(ConstantSpeed(space), simulator, bank) for space in (PHYSICAL, ROUTE))
     np.testing.assert_allclose(route, 0.0, atol=1e-5)
     state = first_moment(simulator, bank)[0]
-    np.testing.assert_allclose(execute(ROUTE, bank, state.context, jnp.zeros(2)), physical, atol=1e-6)
+    np.testing.assert_allclose(executed(bank, state.context, jnp.zeros(2)), physical, atol=1e-6)
 
 
 def test_rule_planners_execute_the_same_in_the_route_space(simulator):
@@ -185,9 +193,7 @@ def test_rule_planners_execute_the_same_in_the_route_space(simulator):
     for planner in (IdmPlanner, ConstantVelocity, lambda actions: Expert(actions, replays=False)):
         physical, route = (act(planner(space), simulator, bank) for space in (PHYSICAL, ROUTE))
         assert abs(route[1]) < 1
-        np.testing.assert_allclose(
-            execute(ROUTE, bank, state.context, jnp.asarray(route)), physical, atol=1e-5
-        )
+        np.testing.assert_allclose(executed(bank, state.context, jnp.asarray(route)), physical, atol=1e-5)
 
 
 def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulator):

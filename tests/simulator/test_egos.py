@@ -71,16 +71,16 @@ def roll(bank, index, slot, left_m):
         offset = left_m * (state.context.step - 9)
         motion = jnp.stack([x - offset * jnp.sin(heading), y + offset * jnp.cos(heading), heading, speed])
         after, result = SIMULATOR.replay(bank, state, motion, jnp.zeros(2))
-        planners = (ConstantSpeed(), IdmPlanner())
-        controls = [planner.controls(bank, SIMULATOR.situation(bank, after)) for planner in planners]
+        situation = SIMULATOR.situation(bank, after)
+        controls = [planner.controls(bank, situation) for planner in (ConstantSpeed(), IdmPlanner())]
         obs = SIMULATOR.observe(bank, after.context)
         metrics = episode_metrics(bank, after)
         return after, (after.facts, has_route(bank, after.context), obs, controls, metrics, result.truncated)
 
-    def one(index, slot):
-        return jax.lax.scan(step, SIMULATOR.reset(bank, index, 10, slot), None, STEPS)[1]
-
-    return jax.vmap(one)(index, slot)
+    states = jax.vmap(lambda index, slot: SIMULATOR.reset(bank, index, 10, slot))(index, slot)
+    # Map the step, not the loop: to map a loop, JAX traces its body several times.
+    _, steps = jax.lax.scan(jax.vmap(step, (0, None)), states, None, STEPS)
+    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), steps)
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.2], ids=["log", "offset"])

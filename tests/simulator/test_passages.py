@@ -225,11 +225,12 @@ def test_episodes_that_start_in_a_lane_change_come_from_the_old_lane():
         done, fresh = jnp.asarray(True), simulator.new_episode(bank, 0)
         again, _ = simulator.step_or_reset(bank, state, jnp.zeros(2), done, fresh)
         state = jax.tree.map(lambda first, then: jnp.where(is_reset, first, then), state, again)
-        changes = []
-        for _ in range(3):
+
+        def step(state, _):
             state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), jnp.zeros(2))
-            changes.append(state.facts.lane_changed)
-        return jnp.stack(changes)
+            return state, state.facts.lane_changed
+
+        return jax.lax.scan(step, state, None, 3)[1]
 
     for is_reset in (True, False):
         assert start(bank, is_reset).tolist() == [False, True, False]

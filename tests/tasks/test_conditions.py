@@ -58,8 +58,9 @@ def test_time_gap_by_hand():
     ]
     bank = bank_of(*(straight_road(cars, **light) for cars, light, _ in scenes))
     simulator = Simulator(replace(TASK, ends=()))
-    state = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.arange(len(scenes)))
-    np.testing.assert_allclose(state.facts.time_gap_s, [gap for *_, gap in scenes], atol=0.01)
+    measure = jax.jit(jax.vmap(lambda bank, row: simulator.reset(bank, row).facts.time_gap_s, (None, 0)))
+    gaps = measure(bank, jnp.arange(len(scenes)))
+    np.testing.assert_allclose(gaps, [gap for *_, gap in scenes], atol=0.01)
     assert Simulator(Task()).task.reads.isdisjoint({"time_gap_s"})
 
 
@@ -89,9 +90,13 @@ def test_without_a_key_or_if_fixed_the_number_is_that_of_evaluation():
 
 def test_observation_is_scaled_by_the_range(bank):
     simulator = Simulator(TASK)
-    context = simulator.context(bank, 0)
+
+    @jax.jit
+    def observe(bank, conditions):
+        return simulator.observe(bank, replace(simulator.context(bank, 0), conditions=conditions))
+
     for values, scaled in (([0.5, 0.7, 0.8], [-1, -1, -1]), ([2.0, 0.95, 1.65], [1, 0, 0])):
-        obs = simulator.observe(bank, replace(context, conditions=jnp.array(values, jnp.float32)))
+        obs = observe(bank, jnp.array(values, jnp.float32))
         np.testing.assert_allclose(obs["conditions"], scaled, atol=1e-6)
     assert Driving(simulator).shapes(bank)["conditions"] == (3,)
     assert "conditions" not in Driving(Simulator(replace(TASK, conditions=()))).shapes(bank)
@@ -136,12 +141,12 @@ def test_an_episode_keeps_its_draw_and_the_next_has_another(bank):
 
     @jax.jit
     def run(bank, key):
-        return collect(driving, bank, driving.start(bank, key, 4), actor, key, 90, "state")[1]
+        rollout = collect(driving, bank, driving.start(bank, key, 4), actor, key, 90, "state")[1]
+        return rollout.state.conditions, rollout.alive
 
-    rollout, again = run(bank, jax.random.key(0)), run(bank, jax.random.key(0))
-    values, alive = np.asarray(rollout.state.conditions), np.asarray(rollout.alive)
+    (values, alive), (again, _) = (jax.device_get(run(bank, jax.random.key(0))) for _ in range(2))
     assert values.shape == (90, 4, 3) and (~alive).sum() >= 4
-    np.testing.assert_array_equal(values, again.state.conditions)
+    np.testing.assert_array_equal(values, again)
     changes = (values[1:] != values[:-1]).all(axis=-1)
     same = (values[1:] == values[:-1]).all(axis=-1)
     # The row after one that only resets is the first of a new episode.

@@ -13,6 +13,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 from drivax.tasks.rewards import PRESETS, RewardConfig
 from drivax.tasks.task import Task
+from quick import quick
 from scenes import bank_of, car, straight_road
 
 
@@ -20,8 +21,13 @@ from scenes import bank_of, car, straight_road
 def measured():
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     simulator = Simulator(Task())
-    state = jax.jit(simulator.reset)(bank, 0)
-    return state.facts, jax.jit(simulator.situation)(bank, state).surroundings
+
+    @jax.jit
+    def measure(bank):
+        state = simulator.reset(bank, 0)
+        return state.facts, simulator.situation(bank, state).surroundings
+
+    return measure(bank)
 
 
 def reward(config, before, now, around):
@@ -62,9 +68,8 @@ def test_presets_include_the_previous_preset():
 @pytest.mark.parametrize("space", [PHYSICAL, PUBLISHED])
 def test_action_spaces_invert_and_keep_zero(space):
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
-    for action in jnp.asarray(grid, jnp.float32):
-        back = space.action(jnp.zeros(4), *space.command(action, 4.8), 4.8)
-        np.testing.assert_allclose(back, action, atol=1e-5)
+    there_and_back = jax.vmap(lambda action: space.action(jnp.zeros(4), *space.command(action, 4.8), 4.8))
+    np.testing.assert_allclose(quick(there_and_back, jnp.asarray(grid, jnp.float32)), grid, atol=1e-5)
     np.testing.assert_array_equal(jnp.stack(space.command(jnp.zeros(2), 4.8)), 0.0)
 
 
@@ -92,6 +97,17 @@ def test_termination_and_truncation_are_separate(measured):
     )
 
 
+LAG = Simulator(Task(rewards=RewardConfig(preset="safety", lag=-1.0), metrics="none", ends=()))
+
+
+@jax.jit
+def displaced(bank, shift):
+    state = LAG.reset(bank, 0)
+    motion = logged_motion(bank, state.context, 1)
+    after, transition = LAG.replay(bank, state, motion + shift, jnp.zeros(2))
+    return after.facts.lag_m, transition.reward_terms["lag"]
+
+
 @pytest.mark.parametrize(
     ("x", "y", "heading", "lag"),
     [(-3.0, 0.0, 0.0, 3.0), (2.0, 0.5, 0.0, -2.0), (-3.0, 1.0, np.pi / 3, 0.634)],
@@ -102,15 +118,6 @@ def test_lag_is_the_distance_behind_the_log(x, y, heading, lag):
     The log is then at (-x, -y), of which the part along the heading is -x cos - y sin: 3/2 - 0.866 in the last case.
     """
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
-    task = Task(rewards=RewardConfig(preset="safety", lag=-1.0), metrics="none", ends=())
-    simulator = Simulator(task)
-
-    @jax.jit
-    def displaced(bank, shift):
-        state = simulator.reset(bank, 0)
-        motion = logged_motion(bank, state.context, 1)
-        return simulator.replay(bank, state, motion + shift, jnp.zeros(2))
-
-    after, transition = displaced(bank, jnp.asarray([x, y, heading, 0.0]))
-    assert float(after.facts.lag_m) == pytest.approx(lag, abs=1e-3)
-    assert float(transition.reward_terms["lag"]) == pytest.approx(-max(lag, 0.0), abs=1e-3)
+    lag_m, term = displaced(bank, jnp.asarray([x, y, heading, 0.0]))
+    assert float(lag_m) == pytest.approx(lag, abs=1e-3)
+    assert float(term) == pytest.approx(-max(lag, 0.0), abs=1e-3)
