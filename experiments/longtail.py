@@ -41,7 +41,7 @@ FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 def keep(folder: Path) -> None:
     """Store new evaluated arms, the study's own files, and scores."""
-    study = _study(folder)
+    study = stored_study(folder)
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([folder], folder, KEPT / "study.tar.xz")
     for name in DEFINITION.planners:
@@ -71,7 +71,7 @@ def restore(folder: Path) -> None:
 
 def finish(folder: Path) -> None:
     """Store the results, and the number of test episodes with a collision by planner or arm and seed."""
-    study, results = _study(folder), json.loads((folder / "results.json").read_text())
+    study, results = stored_study(folder), json.loads((folder / "results.json").read_text())
     collisions = {}
     for name in results["rates"]:
         seeds = [None] if name in DEFINITION.planners else range(results["about"]["seeds"])
@@ -80,7 +80,8 @@ def finish(folder: Path) -> None:
     RESULT.write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
 
 
-def _study(folder: Path) -> Study:
+def stored_study(folder: Path) -> Study:
+    """Return the study in a folder, without its scenario sets."""
     return Study(DEFINITION, StudyConfig(), StudySets(folder, folder, ()), folder)
 
 

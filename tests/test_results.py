@@ -184,6 +184,100 @@ def test_longtail_verdicts_hold_under_joint_adjustment(found):
     assert [p < 0.05 for p in together] == [one["verdict"] != "undecided" for one in claims]
 
 
+@pytest.fixture
+def supplement(stored):
+    """What the runs of the long-tail study show beyond its claims."""
+    return stored("longtail_supplement")
+
+
+def test_longtail_page_shows_the_supplement(script, supplement):
+    module = script("longtail_supplement")
+    text = module.PAGE.read_text()
+    assert module.fill_page(text, supplement) == text, (
+        "run python -m experiments.longtail_supplement page, and read what the page says about it"
+    )
+    assert text.count("<!-- longtail_supplement.py: end -->") == len(module.page_tables(supplement))
+    assert f"]({module.PICTURE.name})" in text and module.PICTURE.stat().st_size < 200_000
+
+
+def test_differences_from_bc_follow_from_the_rates(found, supplement):
+    assert set(supplement["against_bc"]) == set(found["draws"]) - {"bc"}
+    for arm, differences in supplement["against_bc"].items():
+        for stratum, difference in differences.items():
+            rates = [found["rates"][name][stratum]["collision"]["mean"] for name in (arm, "bc")]
+            np.testing.assert_allclose(difference["mean"], rates[0] - rates[1], atol=1e-9)
+            assert difference["low"] < difference["mean"] < difference["high"]
+
+
+def test_correlations_with_progress_follow_from_the_rates(found, supplement):
+    rates = [found["rates"][arm] for arm in found["draws"]]
+    correlations = supplement["progress"]
+    assert correlations["arms"] == len(rates) == 16
+    for collisions in ("common", "rare"):
+        for progress in ("common", "rare"):
+            means = [
+                (one[collisions]["collision"]["mean"], one[progress]["progress_ratio"]["mean"])
+                for one in rates
+            ]
+            expected = np.corrcoef(np.transpose(means))[0, 1]
+            np.testing.assert_allclose(correlations[collisions][progress], expected, atol=1e-9)
+
+
+def test_critic_curves_cover_the_training(found, supplement):
+    critics = supplement["critics"]
+    assert set(critics["arms"]) == set(found["draws"]) - {"bc"}
+    assert critics["steps"][-1] == 6_000 * 256
+    for curves in critics["seeds"].values():
+        assert np.shape(curves) == (found["about"]["seeds"], len(critics["steps"]))
+    # The mean Q of the baseline at its validations, on held-out steps, is near that of the training steps.
+    held_out = np.mean([seed["rule"] for seed in found["validations"]], axis=0)
+    trained = np.mean(critics["seeds"]["loss/mean_q"], axis=0)[4::5]
+    np.testing.assert_allclose(trained, held_out, atol=0.3)
+
+
+def test_longtail_text_quotes_the_supplement(script, found, supplement):
+    """Numbers in the paragraphs, which no script writes."""
+    text = " ".join(script("longtail_supplement").PAGE.read_text().split())
+    against = {arm: values["rare"] for arm, values in supplement["against_bc"].items()}
+
+    def quoted(difference, sign="+"):
+        bounds = ", ".join(f"{difference[name]:{sign}.3f}" for name in ("low", "high"))
+        return f"{difference['mean']:{sign}.3f} [{bounds}]"
+
+    assert f"by {quoted(against['baseline'], '')}." in text
+    for arm in ("heuristic", "action_rarity", "action_rarity_scenario", "oracle"):
+        assert quoted(against[arm]) in text
+    methods = [arm for arm in found["draws"] if arm.startswith(("heuristic", "ensemble", "action_rarity"))]
+    assert len(methods) == 6 and all(against[arm]["high"] > 0 for arm in methods)
+    controls = [arm for arm in against if arm.startswith("random_matched")]
+    assert len(controls) == 5 and all(against[arm]["low"] > 0 for arm in ("baseline", *controls))
+    rates, share = found["rates"]["baseline"], found["about"]["share"]
+    without_event = (
+        (1 - share) * rates["common"]["collision"]["mean"] / rates["ordinary"]["collision"]["mean"]
+    )
+    assert (
+        f"{without_event:.0%}".replace("%", " %") + " of the baseline's collisions in ordinary traffic"
+        in text
+    )
+    detectable = found["detectable"]["collision"] / rates["ordinary"]["collision"]["mean"]
+    assert f"{detectable:.0%}".replace("%", " %") + " of the baseline's collisions" in text
+    errors, temperatures = (
+        np.mean(supplement["critics"]["seeds"][name], axis=0)[4::5]
+        for name in ("loss/critic", "loss/temperature")
+    )
+    assert f"rises from {errors[0]:.2f} at the first validation to {errors[-1]:.2f} at the last" in text
+    assert f"temperature rises from {temperatures[0]:.2f} to {temperatures[-1]:.2f}" in text
+    ends = {
+        name: [curves[name][-1] for arm, curves in supplement["critics"]["arms"].items() if arm != "baseline"]
+        for name in ("loss/critic", "loss/temperature")
+    }
+    low, high = min(ends["loss/critic"]), max(ends["loss/critic"])
+    assert f"TD errors of {low:.2f} to {high:.2f}" in text
+    low, high = min(ends["loss/temperature"]), max(ends["loss/temperature"])
+    assert f"temperatures of {low:.2f} to {high:.2f}" in text
+    assert f"r = {supplement['progress']['rare']['rare']:.2f} over the 16 arms" in text
+
+
 def test_nuplan_page_shows_stored_counts(script, stored):
     nuplan = script("data.nuplan")
     shown = (
