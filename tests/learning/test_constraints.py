@@ -132,7 +132,7 @@ def run(config, environment, iterations, seed=0):
     def iterate(state, _):
         return learner.iterate((), state)
 
-    state = jax.jit(learner.init)((), jax.random.key(seed))
+    state = learner.init((), jax.random.key(seed))
     state, logs = jax.jit(lambda state: jax.lax.scan(iterate, state, None, iterations))(state)
     return state, logs
 
@@ -172,7 +172,7 @@ def test_multipliers_at_their_start_leave_the_weighted_sum():
 def test_resuming_is_bit_for_bit(tmp_path):
     config = replace(PPO, environments=8, unroll=4)
     learner = config.build(Bandit(), (), 4)
-    iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)((), jax.random.key(1))]
+    iterate, states = jax.jit(learner.iterate), [learner.init((), jax.random.key(1))]
     for _ in range(4):
         states.append(iterate((), states[-1])[0])
     assert len({float(state.multipliers["failure"]) for state in states}) == 5
