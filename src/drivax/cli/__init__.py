@@ -148,7 +148,7 @@ def use_huge_pages() -> None:
         is_on_request = "[madvise]" in _HUGE_PAGES.read_text()
     except OSError:  # not Linux
         return
-    if is_on_request and "GLIBC_TUNABLES" not in os.environ:
+    if is_on_request and sys.executable and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = "glibc.malloc.hugetlb=1"
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
