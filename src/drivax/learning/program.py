@@ -351,7 +351,7 @@ def read_columns(
     """
     count, shapes = device_count(), jax.eval_shape(read, ring, row, column)
     is_divided = count > 1 and all(leaf.shape[1] % count == 0 for leaf in jax.tree.leaves(ring))
-    if not is_divided or not all(_has_bits(leaf.dtype) for leaf in jax.tree.leaves(shapes)):
+    if not is_divided or not all(_fits_integer(leaf.dtype) for leaf in jax.tree.leaves(shapes)):
         return read(ring, row, column)
     specs = (_divided_along(1), _divided_along(None))
 
@@ -362,7 +362,7 @@ def read_columns(
         is_own = (local_column >= 0) & (local_column < size)
 
         def bits(leaf: Array) -> Array:
-            value = _as_bits(leaf)
+            value = leaf.view(_integer_type(leaf.dtype)).astype(jnp.int32)
             return jnp.where(is_own.reshape(*is_own.shape, *[1] * (value.ndim - is_own.ndim)), value, 0)
 
         columns = read(share, index[0], jnp.clip(local_column, 0, size - 1))
@@ -370,29 +370,20 @@ def read_columns(
         return unravel(jax.lax.psum(vector, _AXIS))
 
     return jax.tree.map(
-        lambda leaf, bits: _from_bits(bits, leaf.dtype), shapes, exchange(ring, (row, column))
-    )
+        lambda leaf, bits: bits.astype(_integer_type(leaf.dtype)).view(leaf.dtype),
+        shapes, exchange(ring, (row, column)),
+    )  # fmt: skip
 
 
-def _has_bits(dtype: Any) -> bool:
-    """Return whether :func:`_as_bits` accepts a type: not random keys or complex numbers."""
-    return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+def _fits_integer(dtype: Any) -> bool:
+    """Return whether a 32-bit integer holds the bits of a value: not of random keys, complex or 64-bit numbers."""
+    is_number = any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+    return is_number and dtype.itemsize <= 4
 
 
-def _as_bits(value: Array) -> Array:
-    """Return the bits of an array as 32-bit integers: one per value, or for 64-bit types two along a last axis."""
-    if value.dtype != jnp.bool_:
-        size = min(value.dtype.itemsize, 4)
-        value = jax.lax.bitcast_convert_type(value, jnp.dtype(f"int{8 * size}"))
-    return value.astype(jnp.int32)
-
-
-def _from_bits(bits: Array, dtype: Any) -> Array:
-    """Return the values whose bits :func:`_as_bits` returned."""
-    if dtype == jnp.bool_:
-        return bits.astype(dtype)
-    size = min(dtype.itemsize, 4)
-    return jax.lax.bitcast_convert_type(bits.astype(jnp.dtype(f"int{8 * size}")), dtype)
+def _integer_type(dtype: Any) -> Any:
+    """Return the integer type of the same size."""
+    return jnp.dtype(f"int{8 * dtype.itemsize}")
 
 
 def _layout(mesh: Mesh, is_stacked: bool, state: Any) -> Any:
