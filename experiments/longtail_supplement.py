@@ -24,6 +24,7 @@ from matplotlib.ticker import FuncFormatter
 
 from drivax import settings
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import find_traffic
 from drivax.report.charts import compact
@@ -149,7 +150,7 @@ def progress_correlations(episodes: Mapping[str, Values], strata: Strata) -> dic
 def collisions_by_kind(
     episodes: Mapping[str, Values], strata: Strata, ids: Sequence[str], sets: Sequence[ScenarioSet]
 ) -> dict[str, Any]:
-    """Return, by kind of scenario, its share of ordinary traffic and the share of each arm's collisions in it."""
+    """Return, by kind of scenario, their number, their share of ordinary traffic, and each arm's rate of collisions."""
     tags = {entry["scenario_id"]: entry["tags"] for scenarios in sets for entry in scenarios.entries}
     kinds = np.array(
         [
@@ -178,7 +179,8 @@ def logged_rewards(train: ScenarioSet) -> dict[str, Any]:
     A return continues the last reward of a log forever, because the critics bootstrap there.
     """
     config = settings.load(TrainConfig, "offline/cql")
-    environment = config.environment(find_traffic(config.traffic))
+    assert isinstance(config.algorithm, CqlConfig)
+    environment = config.environment(find_traffic("log"))
     steps = environment.expert_steps(environment.prepare(ScenarioBank.from_scenarios(train)))
     usable, terminated = np.asarray(steps.usable), np.asarray(steps.terminated)
     reward, gamma = np.where(usable, steps.reward, 0.0), config.algorithm.gamma

@@ -223,6 +223,24 @@ def test_correlations_with_progress_follow_from_the_rates(found, supplement):
             np.testing.assert_allclose(correlations[collisions][progress], expected, atol=1e-9)
 
 
+def test_kinds_of_scenarios_follow_from_the_rates(found, supplement):
+    kinds, about = supplement["kinds"], found["about"]
+    assert sum(kind["scenarios"] for kind in kinds.values()) == about["test"]
+    assert kinds["event"]["scenarios"] == about["rare"]
+    np.testing.assert_allclose(sum(kind["share"] for kind in kinds.values()), 1.0)
+    np.testing.assert_allclose(kinds["event"]["share"], about["share"])
+    for arm in found["draws"]:
+        rate = sum(kind["share"] * kind["rates"][arm] for kind in kinds.values())
+        np.testing.assert_allclose(rate, found["rates"][arm]["ordinary"]["collision"]["mean"], atol=1e-9)
+
+
+def test_logs_of_the_longtail_study_hold_no_failure(supplement):
+    rewards = supplement["rewards"]
+    assert rewards["failures"] == 0
+    np.testing.assert_allclose(rewards["largest"], 0.2, atol=1e-6)
+    assert rewards["return"] < rewards["largest"] / (1.0 - rewards["discount"])
+
+
 def test_critic_curves_cover_the_training(found, supplement):
     critics = supplement["critics"]
     assert set(critics["arms"]) == set(found["draws"]) - {"bc"}
@@ -275,6 +293,9 @@ def test_longtail_text_quotes_the_supplement(script, found, supplement):
     assert f"TD errors of {low:.2f} to {high:.2f}" in text
     low, high = min(ends["loss/temperature"]), max(ends["loss/temperature"])
     assert f"temperatures of {low:.2f} to {high:.2f}" in text
+    q = np.mean(supplement["critics"]["seeds"]["loss/mean_q"], axis=0)[-1]
+    assert f"mean Q of logged actions falls to {q:.1f}" in text
+    assert f"discounted return is {supplement['rewards']['return']:.1f}." in text
     assert f"r = {supplement['progress']['rare']['rare']:.2f} over the 16 arms" in text
 
 
