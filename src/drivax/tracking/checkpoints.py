@@ -9,7 +9,6 @@ state (:func:`pack`).
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import logging
 import math
@@ -366,10 +365,7 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 
 @contextlib.contextmanager
 def _silence_writers() -> Iterator[None]:
-    """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's.
-
-    Asyncio logs the error of a task when the garbage collector deletes the task.
-    """
+    """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's."""
     loggers, report_hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
     levels = [logger.level for logger in loggers]
 
@@ -390,7 +386,7 @@ def _silence_writers() -> Iterator[None]:
         yield
     except BaseException:
         # Threads of Orbax still run and fail, so restore later.
-        timer = threading.Timer(_LATE_S, lambda: (gc.collect(), restore()))
+        timer = threading.Timer(_LATE_S, restore)
         timer.daemon = True
         timer.start()
         raise
