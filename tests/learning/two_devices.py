@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from several_devices import problem
 
 from drivax.learning.algorithms.optimisers import in_chunks
+from drivax.learning.algorithms.ppo import _dividing_devices, _read_shares, minibatch_order
 from drivax.learning.program import (
     _AXIS,
     Program,
@@ -21,6 +22,7 @@ from drivax.learning.program import (
     compute_on_each_device,
     map_over_devices,
     read_columns,
+    shard_axis,
     sum_over_devices,
 )
 from drivax.tracking.checkpoints import Checkpoints
@@ -104,6 +106,21 @@ def check_chunks():
             assert ((chunks < count // 2) == (jnp.arange(shape[1]) < shape[1] // 2)).all(), chunks
 
 
+def check_minibatches():
+    """Devices read the same samples from their own environments, or from all if these cannot be divided."""
+    for time, environments, minibatches, devices in ((4, 64, 2, 2), (3, 4, 4, 1)):
+        shape, key = (time, environments), jax.random.key(0)
+        batch = {"log_prob": jnp.arange(time * environments).reshape(shape)}
+
+        def read(batch, key, shape=shape, minibatches=minibatches, devices=devices):
+            assert _dividing_devices(shape, minibatches) == devices
+            order = minibatch_order(key, shape, minibatches, devices)
+            return order, _read_shares(shard_axis(batch, axis=1), order, devices)["log_prob"]
+
+        order, samples = on_two(read, batch, key)
+        same(samples, order)
+
+
 def exchanges(program):
     """Sizes of the arrays that each exchange of an update has, in the computation that exchanges the gradient."""
     parameters = ravel_pytree(program.initial_state().parameters)[0].size
@@ -143,6 +160,7 @@ def main(name):
         check_sums()
         check_shares()
         check_chunks()
+        check_minibatches()
     else:
         check_training(name)
     print("same")

@@ -142,6 +142,33 @@ def test_samples_agree_with_mean_mode_and_entropy(kind):
     assert estimates.mean() == pytest.approx(-log_probs.mean(), abs=0.04)
 
 
+@pytest.mark.parametrize("kind", ALL)
+def test_gradient_of_the_entropy_reaches_all_parameters(kind):
+    """Mean of estimates, and finite differences of the entropy by numerical integration over the actions."""
+    actions = Actions(1, ((-1.0, 0.0, 1.0),))
+    parameters = jnp.linspace(0.5, -0.4, parameter_count(kind, actions))
+    noise = jax.random.normal(jax.random.key(4), (40_000, 1))
+    values = jnp.arange(3.0)[:, None] if kind == "grid" else jnp.linspace(-0.9999, 0.9999, 20_001)[:, None]
+    width = 1.0 if kind == "grid" else values[1, 0] - values[0, 0]
+
+    def estimate(parameters, noise):
+        return distribution(kind, parameters, actions).entropy_estimate(noise)
+
+    def integral(parameters):
+        one = distribution(kind, parameters, actions)
+        raw_actions = {"grid": values, "beta": (values + 1) / 2}.get(kind, jnp.arctanh(values))
+        log_prob = jax.vmap(one.log_prob)(raw_actions)
+        return -jnp.sum(jnp.exp(log_prob) * log_prob) * width
+
+    result = quick(jax.vmap(jax.grad(estimate), (None, 0)), parameters, noise).mean(0)
+    steps = 0.02 * np.eye(len(parameters), dtype=np.float32)
+    differences = quick(
+        jax.vmap(lambda step: integral(parameters + step) - integral(parameters - step)), steps
+    )
+    np.testing.assert_allclose(result, differences / 0.04, atol=0.02)
+    assert np.abs(differences).max() > 0.002
+
+
 @pytest.mark.parametrize("kind", ["gaussian", "beta"])
 def test_samples_are_differentiable_in_the_parameters(kind):
     """d E[action^2] / d parameters, through samples and by finite differences of SciPy's moments."""
