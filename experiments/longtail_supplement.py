@@ -6,7 +6,6 @@ python -m experiments.longtail_supplement compute --out STUDY --data BENCHMARK
 python -m experiments.longtail_supplement page       (write the tables and the picture of the page)
 
 The comparisons were chosen after the results were known, and their p-values are not adjusted, so they are no verdicts.
-Without ``--data``, the stored numbers that need the scenarios are kept.
 """
 
 from __future__ import annotations
@@ -203,20 +202,19 @@ def logged_rewards(train: ScenarioSet) -> dict[str, Any]:
 
 def page_tables(results: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the tables of the page, by the names of their markers."""
-    tables = {
+    return {
         "critics": _critics_table(results["critics"]),
         "against bc": _bc_table(results["against_bc"]),
         "progress": _progress_table(results["progress"]),
+        "kinds": _kinds_table(results["kinds"]),
+        "rewards": _rewards_table(results["rewards"]),
     }
-    if "kinds" in results:
-        tables |= {"kinds": _kinds_table(results["kinds"]), "rewards": _rewards_table(results["rewards"])}
-    return tables
 
 
 def _critics_table(critics: Mapping[str, Any]) -> list[str]:
     """Return the baseline's curves at the validations: mean over seeds, and the range at the end."""
     every = slice(VALIDATION - 1, None, VALIDATION)
-    steps = [f"{compact(step)}" for step in critics["steps"][every]]
+    steps = [compact(step) for step in critics["steps"][every]]
     rows = []
     for name, label in CURVES.items():
         values = np.array(critics["seeds"][name])[:, every]
@@ -301,24 +299,17 @@ def fill_page(page: str, results: Mapping[str, Any]) -> str:
     return page
 
 
-def compute(folder: Path, data: Path | None) -> dict[str, Any]:
-    """Return the results of a study's folder and, with ``data``, of the benchmark's scenarios."""
-    study = stored_study(folder)
+def compute(folder: Path, data: Path) -> dict[str, Any]:
+    """Return the results of a study's folder and of the benchmark's scenarios."""
+    study, sets = stored_study(folder), StudySets.of(data, None, ())
     episodes, strata, ids = evaluations(study)
-    results: dict[str, Any] = {
+    return {
         "critics": critic_curves(study),
         "against_bc": differences_from_bc(episodes, strata),
         "progress": progress_correlations(episodes, strata),
+        "kinds": collisions_by_kind(episodes, strata, ids, [ScenarioSet.open(path) for path in sets.test]),
+        "rewards": logged_rewards(ScenarioSet.open(sets.train)),
     }
-    if data is not None:
-        sets = StudySets.of(data, None, ())
-        test = [ScenarioSet.open(path) for path in sets.test]
-        results["kinds"] = collisions_by_kind(episodes, strata, ids, test)
-        results["rewards"] = logged_rewards(ScenarioSet.open(sets.train))
-    elif RESULT.exists():
-        stored = json.loads(RESULT.read_text())
-        results |= {name: stored[name] for name in ("kinds", "rewards") if name in stored}
-    return results
 
 
 def main() -> None:
@@ -334,8 +325,8 @@ def main() -> None:
         results = json.loads(RESULT.read_text())
         PAGE.write_text(fill_page(PAGE.read_text(), results))
         save_picture(draw_critics(results["critics"]), PICTURE)
-    elif args.out is None:
-        parser.error("the following arguments are required: --out")
+    elif args.out is None or args.data is None:
+        parser.error("compute needs --out and --data")
     else:
         RESULT.write_text(_dump(compute(args.out, args.data)))
 
