@@ -387,13 +387,13 @@ class Bench:
 
     def _check_end(self, name: str, fault: str, process: subprocess.Popen[str], error: str) -> None:
         status, place = process.returncode, f"{name}, {fault}"
-        is_own = not _interrupts_python(error)
-        if is_own and status not in (0, *STATUSES[fault]):
-            self.problems.append(f"{place}: status {status}: {error[-600:]}")
-        if is_own and status >= 0 and "Traceback" in error:
-            self.problems.append(f"{place}: traceback: {error[-1200:]}")
-        if is_own and status > 0 and not error.strip().rpartition("\n")[2].startswith("drivax: "):
-            self.problems.append(f"{place}: the last line is no message: {error[-600:]}")
+        if fault != "int" or not _interrupts_python(error):
+            if status not in (0, *STATUSES[fault]):
+                self.problems.append(f"{place}: status {status}: {error[-600:]}")
+            if status >= 0 and "Traceback" in error:
+                self.problems.append(f"{place}: traceback: {error[-1200:]}")
+            if status > 0 and not error.strip().rpartition("\n")[2].startswith("drivax: "):
+                self.problems.append(f"{place}: the last line is no message: {error[-600:]}")
         if not _wait(lambda: not _group_exists(process.pid), 20.0):
             os.killpg(process.pid, signal.SIGKILL)
             self.problems.append(f"{place}: processes remain")
