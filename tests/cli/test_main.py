@@ -216,18 +216,8 @@ def test_low_memory_limit_is_one_line(limit, command):
 
 def run_limited(tmp_path, limit, *prefix):
     """Generate a set after a shell command that limits the process; return status, last line, and files left behind."""
-    call = [
-        sys.executable,
-        "-m",
-        "drivax",
-        "generate",
-        str(tmp_path / "out"),
-        "--scenarios",
-        "2",
-        "--workers",
-        "2",
-    ]
-    program = [*prefix, "sh", "-c", f'{limit}; exec "$@"', "sh", *call]
+    command = ["generate", str(tmp_path / "out"), "--scenarios", "2", "--workers", "2"]
+    program = [*prefix, "sh", "-c", f'{limit}; exec "$@"', "sh", sys.executable, "-m", "drivax", *command]
     result = subprocess.run(program, capture_output=True, text=True, check=False)
     assert "Traceback" not in result.stderr
     return result.returncode, result.stderr.splitlines()[-1], [path.name for path in tmp_path.iterdir()]

@@ -141,8 +141,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def use_huge_pages() -> None:
     """Start this process again with large arrays in huge pages, where Linux grants them on request.
 
-    Training takes about a tenth less time (docs/log/2026-11-27-cores-as-devices.md). Only glibc's tunables ask for huge
-    pages, and glibc reads them when a process starts. A user's own tunables stay as they are.
+    This saves page faults (docs/log/2026-11-27-cores-as-devices.md). Only glibc's tunables ask for huge pages, and
+    glibc reads them when a process starts. A user's own tunables stay as they are.
     """
     try:
         is_on_request = "[madvise]" in _HUGE_PAGES.read_text()

@@ -346,7 +346,7 @@ class MapApi(DevkitObject):
         return object_id, distance_m
 
     def __getattr__(self, name: str) -> Any:
-        """Raise NotImplementedError for a method that only the devkit's map has; name the most similar one."""
+        """Raise NotImplementedError for a method that this map lacks, and suggest the most similar one that it has."""
         if name.startswith("_") or name in ("lanes", "blocks", "block_of", "scenario"):
             raise AttributeError(name)
         methods = [method for method in dir(MapApi) if method.startswith(("get_", "is_"))]
