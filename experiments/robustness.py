@@ -259,6 +259,7 @@ class Bench:
         shares = iter(_SHARES)
         process = self._run_until(name, next(shares), replaces)
         while process.poll() is not None and (share := next(shares, None)):
+            process.communicate()  # closes its pipe
             process = self._run_until(name, share, replaces)
         self._apply(fault, process)
         try:
