@@ -125,7 +125,8 @@ def clipped_adam(
             hundred times the policy's, and a joint norm would shrink the policy's steps.
     """
     schedule = optax.linear_schedule(rate, last * rate, updates) if updates else rate
-    adam = optax.adam(schedule, eps=eps)
+    # One vector instead of dozens of arrays: every device computes the whole step.
+    adam = optax.flatten(optax.adam(schedule, eps=eps))
     if norm is None:  # ``identity`` gives the state the structure that it has with clipping
         return optax.chain(optax.identity(), adam)
     return optax.chain(clip_per_network(norm) if per_network else optax.clip_by_global_norm(norm), adam)
