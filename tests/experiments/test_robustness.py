@@ -70,6 +70,16 @@ def test_files_that_are_replaced_one_by_one_stay_whole(bench):
     assert bench.problems == [] and bench.counts["write", "kill", "stopped"] >= 1
 
 
+def test_output_that_was_incomplete_before_may_stay_so(bench):
+    bench = bench("files")
+    bench.measure()
+    for _ in range(5):
+        bench.finish("write")
+        (bench.work / "out" / "second").unlink()
+        bench.disturb("write", "kill")
+    assert bench.problems == []
+
+
 def test_soak_ends_with_the_digest_of_undisturbed_runs(bench):
     bench = bench("none")
     bench.measure()
