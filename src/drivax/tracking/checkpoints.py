@@ -16,7 +16,6 @@ import os
 import re
 import resource
 import sys
-import threading
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -39,8 +38,6 @@ _RETRAIN = "use another checkpoint, or train again"
 _CHUNK_BYTES = 1 << 24
 #: Largest file of a checkpoint: bytes for each number in its arrays (a key has several words), and for all else.
 _MOST_ITEM_BYTES, _MOST_OTHER_BYTES = 32, 1 << 24
-#: Threads of Orbax end within this time after a failure (s).
-_LATE_S = 2.0
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
 
@@ -365,32 +362,27 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 
 @contextlib.contextmanager
 def _silence_writers() -> Iterator[None]:
-    """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's."""
+    """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's.
+
+    After an error this lasts: their threads fail later, and their tasks are deleted at any time.
+    """
     loggers, report_hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
-    levels = [logger.level for logger in loggers]
+
+    def is_other(record: logging.LogRecord) -> bool:
+        return record.levelno < logging.ERROR or "orbax" not in f"{record.pathname} {record.getMessage()}"
 
     def report_other(unraisable: sys.UnraisableHookArgs) -> None:
         if str(unraisable.exc_value) != "Event loop is closed":
             report_hook(unraisable)
 
-    def restore() -> None:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-        if sys.unraisablehook is report_other:
-            sys.unraisablehook = report_hook
-
     for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
+        logger.addFilter(is_other)
     sys.unraisablehook = report_other
-    try:
-        yield
-    except BaseException:
-        # Threads of Orbax still run and fail, so restore later.
-        timer = threading.Timer(_LATE_S, restore)
-        timer.daemon = True
-        timer.start()
-        raise
-    restore()
+    yield
+    for logger in loggers:
+        logger.removeFilter(is_other)
+    if sys.unraisablehook is report_other:
+        sys.unraisablehook = report_hook
 
 
 def _load_arrays(
