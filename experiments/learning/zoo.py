@@ -21,7 +21,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import RunFolder
 from experiments.learning.benchmark import POLICIES
-from experiments.learning.presets import CORE_SECONDS
+from experiments.learning.presets import COMMAND, CORE_SECONDS
 from experiments.repository import ROOT
 
 ZOO = ROOT / "src" / "drivax" / "zoo"
@@ -29,8 +29,6 @@ METRICS = (
     "success", "accuracy", "at_fault_collision", "collision", "offroad", "red_light", "vmax_score",
     "progress_ratio", "comfortable", "ttc_ok", "lane_keeping",
 )  # fmt: skip
-#: ``config.yaml`` of the policy holds its seed and all settings.
-COMMAND = "drivax train config.yaml --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
 
 
 def measure(seed: Path, validation: ScenarioSet) -> dict[str, Any]:
