@@ -122,6 +122,31 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     shown = benchmark.page_tables(found)
     assert [line.split(" | ")[:2] for line in shown["idm"][2:]] == [["| `idm`", "1"]]
     assert shown["random"][2].startswith(f"| {benchmark.BOX} | `log` | 0.5")
+    reached = {
+        "differences": {
+            "log": {
+                "ppo - pdm": {"accuracy": of(0.05), "at_fault_collision": of(0.005), "vmax_score": of(0.015)}
+            }
+        },
+        "planners": {"ppo": {"log": {"success": of(0.86), "accuracy": of(0.97)}}},
+    }
+    rows = [line.strip("| ").split(" | ") for line in benchmark.goals_table(reached)[2:]]
+    assert [(row[0].rpartition(": ")[2], row[-1]) for row in rows] == [
+        ("accuracy", "aim"), ("success", "**no**"),
+        ("accuracy", "aim"), ("vmax_score", "goal"), ("at_fault_collision", "**no**"),
+    ]  # fmt: skip
+    # A training that is no preset is in the table of its comparison only.
+    for name in ("encoder_mlp", "encoder_lq"):
+        (tmp_path / "policies" / name / "seed-0").mkdir(parents=True)
+        (tmp_path / "policies" / name / "training.json").write_text('{"seeds": 1, "seconds": 9}')
+    keep("encoder_mlp", "log", [[1, 0, 0]])
+    keep("encoder_lq", "log", [[1, 1, 1]])
+    assert list(benchmark.compute_results()["planners"]) == list(found["planners"])
+    presets = script("learning.presets")
+    monkeypatch.setattr(presets, "POLICIES", tmp_path / "policies")
+    mlp, lq = presets.compare_trainings(("encoder_mlp", "encoder_lq", "encoder_entity")).values()
+    assert mlp["differences"] == {} and lq["seconds"] == 9
+    np.testing.assert_allclose(lq["differences"]["accuracy"]["mean"], 2 / 3)
     keep("pdm", "log", [[1, 1, 1]], test="b")
     with pytest.raises(SystemExit, match="2 test sets"):
         benchmark.compute_results()
@@ -320,6 +345,10 @@ def of(mean, half=0.01):
     return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
 
 
+def compared(mean):
+    return dict.fromkeys(("success", "accuracy", "at_fault_collision", "offroad", "vmax_score"), of(mean))
+
+
 @pytest.fixture
 def learning():
     columns = (
@@ -335,6 +364,12 @@ def learning():
         "differences": {
             "ppo - idm": {"success": of(0.15), "vmax_score": of(0.005)},
             "ppo - bc": {"success": of(0.25), "vmax_score": of(-0.25)},
+        },
+        "comparisons": {
+            "encoders": {
+                "mlp": {"seeds": 2, "seconds": 90, "results": compared(0.5), "differences": {}},
+                "lq": {"seeds": 2, "seconds": 1800, "results": compared(0.6), "differences": compared(0.1)},
+            }
         },
         "curves": {
             "ppo": {"success": {"seed-0": [[100, 0.2], [200, 0.8]], "seed-1": [[100, 0.3], [200, 0.7]]}}
@@ -355,15 +390,11 @@ def test_learning_tables(script, learning):
     assert [row[0] for row in rows[2:]] == ["| ppo", "| idm", "| bc"]
     assert rows[2][1] == "0.850 [0.840, 0.860]" and rows[3][6] == "-"
     assert lines("differences")[2] == "| ppo - idm | +0.150 [+0.140, +0.160] | +0.005 [-0.005, +0.015] |"
-    # Of the best preset by success: an interval that holds 0 is no difference.
-    said = {line.split(" | ")[0]: line.split(" | ")[-1].rstrip(" |") for line in lines("aims")[2:]}
-    assert said == {
-        "| `success` of `ppo`": "yes", "| `accuracy_at_fault` of `ppo`": "**no**",
-        "| `success`: `ppo` over `idm`": "yes",
-        "| `vmax_score`: `ppo` over `idm`": "**no**", "| `success`: `ppo` over `bc`": "yes",
-        "| `vmax_score`: `ppo` over `bc`": "**no**", "| steps per second of training, `ppo`": "yes",
-    }  # fmt: skip
     assert lines("training")[3] == "| `ppo` | 2 | 1,500 |"
+    heads, _, mlp, lq, difference = (line.split(" | ") for line in lines("comparison", "encoders"))
+    assert heads[:4] == ["| training", "seeds", "core time (s)", "`success`"]
+    assert mlp[:4] == ["| `mlp`", "2", "90", "0.500 [0.490, 0.510]"] and lq[2] == "1,800"
+    assert (difference[0], difference[3]) == ("| `lq` - `mlp`", "+0.100 [+0.090, +0.110]")
     assert lines("speed")[2] == "| ppo | 9,000 | 25% | 75% |"
     shown = lines("curves", "ppo", "bc")
     assert shown[0] == "![Learning curves of ppo](curve-ppo.png)" and "2 seeds" in shown[2]

@@ -4,8 +4,8 @@ python -m experiments.learning.benchmark drive --data BENCHMARK [--planner NAME 
 python -m experiments.learning.benchmark judge     (means with intervals of the episodes, and the page)
 python -m experiments.learning.benchmark table     (write the stored result to the page)
 
-`drive` stores the episodes of each planner and traffic in one file. Learned planners are those of the zoo (one seed)
-and those in experiments/state/policies, where `presets.py collect` stores several seeds of each.
+`drive` stores the episodes of each planner and traffic in one file. Learned planners are those in
+experiments/state/policies, where `presets.py collect` stores all seeds of each.
 """
 
 from __future__ import annotations
@@ -46,22 +46,54 @@ PAGE = DOCS / "results" / "benchmark.md"
 TRAFFIC = ("log", "idm")
 #: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
-ZOO = ("zoo:ppo", "zoo:sac", "zoo:ppo_physical")
-PLANNERS = ("expert", *ZOO, "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
+PLANNERS = ("expert", "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
+#: Trainings that differ in one setting, by table of the docs; the first is the reference. Those that are no presets
+#: are in these tables only.
+COMPARISONS = {
+    "encoders": ("encoder_mlp", "encoder_lq", "encoder_entity"),
+    "constraints": ("weights", "constraints"),
+    "budget": ("ppo_21m", "ppo"),
+}
 #: Columns of the page, with their short names.
 COLUMNS = {
     "success": "success", "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault",
-    "offroad": "off-road", "red_light": "red light", "progress": "progress (m)", "log_lead": "lead (s)",
+    "offroad": "off-road", "red_light": "red light", "distance_ratio": "metres", "log_lead": "lead (s)",
     "ttc_ok": "ttc", "comfortable": "comfort", "vmax_score": "vmax score",
 }  # fmt: skip
 #: Planners to compare every learned planner with, and the metrics of the comparison.
-REFERENCES = ("constant_speed", "idm", "pdm")
+REFERENCES = ("constant_speed", "idm", "pdm", "bc")
 DIFFERENCE_METRICS = ("success", "accuracy", "at_fault_collision", "vmax_score")
 #: Metrics that decisions 0011 and 0012 changed.
 CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
     "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
 }  # fmt: skip
+#: Goals, set before training: what, entry of the result, end of its interval, whether larger is better, the value to
+#: reach, and the value to aim for, if any.
+GOALS = (
+    ("`ppo`, from scratch", ("planners", "ppo", "log", "accuracy"), "mean", True, 0.93, 0.97),
+    ("`ppo`, from scratch", ("planners", "ppo", "log", "success"), "mean", True, 0.87, 0.95),
+    ("`ppo_physical`, from scratch", ("planners", "ppo_physical", "log", "accuracy"), "mean", True, 0.88, 0.95),
+    ("`ppo_physical`, from scratch", ("planners", "ppo_physical", "log", "success"), "mean", True, 0.80, 0.90),
+    ("`sac`, from scratch", ("planners", "sac", "log", "accuracy"), "mean", True, 0.80, 0.95),
+    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "accuracy"), "low", True, 0.0, 0.03),
+    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "vmax_score"), "low", True, 0.0, 0.03),
+    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "at_fault_collision"), "high", False, 0.01, 0.0),
+    ("the same in `idm` traffic", ("differences", "idm", "ppo - pdm", "accuracy"), "low", True, 0.0, 0.03),
+    ("the same in `idm` traffic", ("differences", "idm", "ppo - pdm", "vmax_score"), "low", True, 0.0, 0.03),
+    (
+        "the same in `idm` traffic",
+        ("differences", "idm", "ppo - pdm", "at_fault_collision"), "high", False, 0.01, 0.0,
+    ),
+    (
+        "`ppo` less `constant_speed`",
+        ("differences", "log", "ppo - constant_speed", "success"), "low", True, 0.15, None,
+    ),
+    ("`bc_sac` less `bc`", ("differences", "log", "bc_sac - bc", "success"), "low", True, 0.0, 0.10),
+    ("`ppo`, `idm` less `log` traffic", ("reactive", "ppo", "accuracy"), "low", True, -0.02, 0.0),
+    ("`sac`", ("planners", "sac", "log", "distance_ratio"), "mean", False, 1.08, None),
+    ("`sac`", ("planners", "sac", "log", "log_lead"), "mean", False, 0.5, None),
+)  # fmt: skip
 #: Tags for the breakdown of accuracy, and the file with the tags of the scenarios.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: Metrics of random actions until the first failure, where published episodes end.
@@ -90,6 +122,12 @@ class Episodes:
 def learned_planners() -> dict[str, list[Path]]:
     """Return the folders of all seeds of every learned planner."""
     return {path.name: sorted(path.glob("seed-*")) for path in sorted(POLICIES.glob("*")) if path.is_dir()}
+
+
+def preset_planners() -> dict[str, list[Path]]:
+    """Return the folders of all seeds of the presets."""
+    compared = {name for names in COMPARISONS.values() for name in names} - {"ppo"}
+    return {name: folders for name, folders in learned_planners().items() if name not in compared}
 
 
 def load_planners(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
@@ -216,13 +254,16 @@ def compute_results() -> dict[str, Any]:
     """Compute all results of the page from the stored episodes."""
     all_episodes = {
         (name, kind): episodes
-        for name in (*PLANNERS, *learned_planners())
+        for name in (*PLANNERS, *preset_planners())
         for kind in TRAFFIC
         if (episodes := read_episodes(name, kind)) is not None
     }
     tests = {episodes.about["test"] for episodes in all_episodes.values()}
     if len(tests) != 1:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
+    if expert := all_episodes.get(("expert", "log")):
+        for episodes in all_episodes.values():
+            episodes.values["distance_ratio"] = episodes.values["distance"] / expert.values["distance"]
     planners: dict[str, Any] = {}
     for (name, kind), episodes in all_episodes.items():
         metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
@@ -250,13 +291,8 @@ def compute_results() -> dict[str, Any]:
                     for metric in DIFFERENCE_METRICS
                 }
                 for other in REFERENCES
-                for name in (
-                    "expert",
-                    *(name for name in ("pdm",) if name != other),
-                    *ZOO,
-                    *learned_planners(),
-                )
-                if {(name, kind), (other, kind)} <= all_episodes.keys()
+                for name in (*(("expert", "pdm") if other != "bc" else ()), *preset_planners())
+                if name != other and {(name, kind), (other, kind)} <= all_episodes.keys()
             }
             for kind in TRAFFIC
         },
@@ -304,6 +340,31 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
     return strata
 
 
+def goals_table(result: Mapping[str, Any]) -> list[str]:
+    """Return a table of the goals, what was measured, and whether they and their aims were reached."""
+    rows = []
+    for what, keys, end, is_more_better, goal, aim in GOALS:
+        measured: Any = result
+        for key in keys:
+            measured = measured.get(key, {})
+        if not measured:
+            continue
+        sign = 1 if is_more_better else -1
+        reached = [
+            name
+            for name, bound in (("aim", aim), ("goal", goal))
+            if bound is not None and sign * (measured[end] - bound) >= 0
+        ]
+        rows.append([
+            f"{what}: {COLUMNS[keys[-1]]}",
+            f"{'' if end == 'mean' else 'interval '}{'at least' if is_more_better else 'at most'} {goal:g}",
+            "" if aim is None else f"{aim:g}",
+            interval(measured, signed=keys[0] != "planners"),
+            [*reached, "**no**"][0],
+        ])  # fmt: skip
+    return table(("what", "goal", "aim", "measured", "reached"), rows)
+
+
 def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the lines of the page's tables by name."""
     planners = result["planners"]
@@ -332,6 +393,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         for name in order
         if name in result["reactive"]
     ]
+    tables["goals"] = goals_table(result)
     tables["reactive"] = table(("planner", *COLUMNS.values()), rows)
     tables["differences"] = table(
         ("difference", "traffic", *(COLUMNS[metric] for metric in DIFFERENCE_METRICS)),
@@ -383,7 +445,7 @@ def format_cells(
         interval(
             intervals[metric],
             signed=signed,
-            digits=1 if "progress" in metric or metric in (*FAILURE_METRICS, KM_PER_FAULT) else 3,
+            digits=1 if metric in (*FAILURE_METRICS, KM_PER_FAULT) else 3,
         )
         for metric in metrics
     ]

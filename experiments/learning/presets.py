@@ -28,19 +28,30 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import versions
 from experiments.learning.benchmark import (
+    COMPARISONS,
     POLICIES,
     Episodes,
-    learned_planners,
     mean_interval,
+    preset_planners,
     read_episodes,
 )
-from experiments.learning.tables import COLUMNS, CURVES, curve_file, draw_curves, fill_page, pages
+from experiments.learning.tables import (
+    COLUMNS,
+    COMPARED,
+    CURVES,
+    curve_file,
+    draw_curves,
+    fill_page,
+    pages,
+)
 from experiments.repository import RESULTS, save_picture
 
 RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
 #: File with training time and curves, next to the policies; training time in ``run.json`` of a policy, s.
 TRAINING, CORE_SECONDS = "training.json", "training_core_s"
+#: ``config.yaml`` of a policy holds its seed and all settings. The set of ``self_play`` has ``--egos 8``.
+COMMAND = "drivax train config.yaml --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
 REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 
 
@@ -52,7 +63,7 @@ def collect(run: Path, data: ScenarioSet) -> None:
     shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
     for training, duration in zip(trainings, seconds, strict=True):
-        notes = {CORE_SECONDS: duration}
+        notes = {CORE_SECONDS: duration, "command": COMMAND}
         export_policy(training.folder, policies / training.folder.name, bank, notes, overwrite=True)
     record = {"seconds": max(seconds), "seeds": len(trainings), "curves": learning_curves(trainings)}
     (policies / TRAINING).write_text(json.dumps(record, indent=1) + "\n")
@@ -69,7 +80,7 @@ def training_seconds(training: Training) -> int:
 
 def compute_results() -> dict[str, Any]:
     """Compute results and paired differences of all evaluated presets and the references."""
-    candidates = {name: read_episodes(name, "log") for name in (*REFERENCES, *learned_planners())}
+    candidates = {name: read_episodes(name, "log") for name in (*REFERENCES, *preset_planners())}
     episodes = {
         name: planner_episodes
         for name, planner_episodes in candidates.items()
@@ -80,11 +91,7 @@ def compute_results() -> dict[str, Any]:
         raise SystemExit(
             f"{len(tests)} test sets instead of one: evaluate the others again (benchmark.py drive)"
         )
-    trainings = {
-        name: json.loads((POLICIES / name / TRAINING).read_text())
-        for name in learned_planners()
-        if name in episodes
-    }
+    trainings = {name: read_training(name) for name in preset_planners() if name in episodes}
     return {
         "command": "python -m experiments.learning.presets judge",
         "test": {"scenarios": len(next(iter(episodes.values())).segments), "hash": tests.pop()},
@@ -103,9 +110,34 @@ def compute_results() -> dict[str, Any]:
             for other in ("idm", "bc")
             if other in episodes and other != name
         },
+        "comparisons": {table: compare_trainings(names) for table, names in COMPARISONS.items()},
         "curves": {name: training["curves"] for name, training in trainings.items()},
         "versions": versions(),
     }
+
+
+def read_training(name: str) -> dict[str, Any]:
+    """Return times and curves of a training, which :func:`collect` stored."""
+    return json.loads((POLICIES / name / TRAINING).read_text())
+
+
+def compare_trainings(names: Sequence[str]) -> dict[str, Any]:
+    """Return costs and results of trainings, and their paired differences from the first."""
+    evaluated = {name: episodes for name in names if (episodes := read_episodes(name, "log")) is not None}
+    rows = {}
+    for name, episodes in evaluated.items():
+        training, reference = read_training(name), evaluated[names[0]]
+        rows[name] = {
+            "seeds": training["seeds"],
+            "seconds": training["seconds"],
+            "results": {metric: mean_interval(episodes, metric).as_dict() for metric in COMPARED},
+            "differences": {
+                metric: mean_interval(episodes, metric, reference).as_dict() for metric in COMPARED
+            }
+            if name != names[0]
+            else {},
+        }
+    return rows
 
 
 def _mean(results: Episodes, metric: str) -> dict[str, Any]:

@@ -23,8 +23,8 @@ COLUMNS = (
 )  # fmt: skip
 #: Metrics of the learning curves.
 CURVES = ("success", "vmax_score")
-#: Targets of the best preset, and of PPO's training speed on two cores, environment steps per second.
-AIMS, MIN_SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
+#: Columns of the tables of trainings that differ in one setting.
+COMPARED = ("success", "accuracy", "at_fault_collision", "offroad", "vmax_score")
 _BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
 
 Result = dict[str, Any]
@@ -49,12 +49,12 @@ def fill_page(page: Path, learning: Result, training: Result) -> str:
 
 
 def format_block(kind: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
-    """Return a block: ``reached``, ``differences``, ``aims``, ``training``, ``speed`` or ``curves``."""
+    """Return a block: ``reached``, ``differences``, ``training``, ``comparison``, ``speed`` or ``curves``."""
     blocks: dict[str, Callable[[], list[str]]] = {
         "reached": lambda: results_table(learning),
         "differences": lambda: differences_table(learning),
-        "aims": lambda: aims_table(learning, training),
         "training": lambda: times_table(learning),
+        "comparison": lambda: comparison_table(learning["comparisons"][names[0]]),
         "speed": lambda: speeds_table(training),
         "curves": lambda: curve_images(learning, names, page),
     }
@@ -78,31 +78,6 @@ def differences_table(learning: Result) -> list[str]:
     return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
 
 
-def best_preset(learning: Result) -> str:
-    """Return the preset with the highest success."""
-    return max(learning["training"], key=lambda name: learning["planners"][name]["success"]["mean"])
-
-
-def aims_table(learning: Result, training: Result) -> list[str]:
-    """Return a table of targets and measurements of the best preset."""
-    name = best_preset(learning)
-    rows = []
-    for metric, target in AIMS.items():
-        result = learning["planners"][name][metric]
-        rows.append([f"`{metric}` of `{name}`", f"{target:.2f}", interval(result), result["mean"] >= target])
-    for other in ("idm", "bc"):
-        for metric in CURVES:
-            result = learning["differences"].get(f"{name} - {other}", {}).get(metric)
-            reason = "it is the best itself" if other == name else "not measured"
-            cell = reason if result is None else interval(result, signed=True)
-            is_better = result is not None and result["low"] is not None and result["low"] > 0
-            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", cell, is_better])
-    speed = training["training"]["ppo"]["steps_per_second"]
-    rows.append(["steps per second of training, `ppo`", f"{MIN_SPEED:,}", f"{speed:,}", speed >= MIN_SPEED])
-    cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
-    return table(["what", "aim", "measured", "reached"], cells)
-
-
 def times_table(learning: Result) -> list[str]:
     """Return a table of the training time of each preset."""
     rows = [
@@ -110,6 +85,23 @@ def times_table(learning: Result) -> list[str]:
         for name, training in learning["training"].items()
     ]
     return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
+
+
+def comparison_table(trainings: Mapping[str, Any]) -> list[str]:
+    """Return a table with a row per training, then its differences from the first."""
+    first = next(iter(trainings), None)
+    rows = []
+    for name, training in trainings.items():
+        rows.append([
+            f"`{name}`", str(training["seeds"]), f"{training['seconds']:,}",
+            *(interval(training["results"][metric]) for metric in COMPARED),
+        ])  # fmt: skip
+    for name, training in trainings.items():
+        if name != first:
+            differences = training["differences"]
+            cells = (interval(differences[metric], signed=True) for metric in COMPARED)
+            rows.append([f"`{name}` - `{first}`", "", "", *cells])
+    return table(["training", "seeds", "core time (s)", *(f"`{metric}`" for metric in COMPARED)], rows)
 
 
 def speeds_table(training: Result) -> list[str]:
@@ -136,7 +128,8 @@ def curve_images(learning: Result, names: list[str], page: Path) -> list[str]:
         lines += [
             f"![Learning curves of {name}]({path.as_posix()})",
             "",
-            f"Preset `{name}`, {count} seeds, on the validation split during training. On the test split: {cell}.",
+            f"Preset `{name}`, {count} {'seed' if count == 1 else 'seeds'}, on the validation split during training. "
+            f"On the test split: {cell}.",
             "",
         ]
     return lines[:-1]

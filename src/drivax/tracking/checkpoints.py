@@ -275,7 +275,7 @@ def pack(file: Path, tree: Any) -> None:
     """Write a pytree of arrays atomically to an ``.npz`` file, which can be read with NumPy alone."""
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
     with atomic_write(file, sum(array.nbytes for array in arrays.values())) as out:
-        np.savez(out, **arrays)
+        np.savez_compressed(out, **arrays)
 
 
 def unpack(file: Path, template: State) -> State:
