@@ -135,6 +135,10 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
         ("accuracy", "aim"), ("success", "**no**"),
         ("accuracy", "aim"), ("vmax_score", "goal"), ("at_fault_collision", "**no**"),
     ]  # fmt: skip
+    driven, expert = (
+        benchmark.Episodes({"distance": np.array(d)}, np.zeros(2), {}) for d in ([[3.0, 1]], [[2.0, 0]])
+    )
+    np.testing.assert_array_equal(benchmark.distance_ratio(driven, expert), [[1.5, np.nan]])
     # A training that is no preset is in the table of its comparison only.
     for name in ("encoder_mlp", "encoder_lq"):
         (tmp_path / "policies" / name / "seed-0").mkdir(parents=True)

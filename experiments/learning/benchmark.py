@@ -57,12 +57,14 @@ COMPARISONS = {
 #: Columns of the page, with their short names.
 COLUMNS = {
     "success": "success", "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault",
-    "offroad": "off-road", "red_light": "red light", "distance_ratio": "metres", "log_lead": "lead (s)",
+    "offroad": "off-road", "red_light": "red light", "distance_ratio": "distance ratio", "log_lead": "lead (s)",
     "ttc_ok": "ttc", "comfortable": "comfort", "vmax_score": "vmax score",
 }  # fmt: skip
 #: Planners to compare every learned planner with, and the metrics of the comparison.
 REFERENCES = ("constant_speed", "idm", "pdm", "bc")
 DIFFERENCE_METRICS = ("success", "accuracy", "at_fault_collision", "vmax_score")
+#: Planners that plan along the given route and do not steer, marked in the tables.
+ON_ROUTE = ("ppo", "self_play", "sac", "bc_sac", "bc_ppo")
 #: Metrics that decisions 0011 and 0012 changed.
 CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
@@ -76,9 +78,9 @@ GOALS = (
     ("`ppo_physical`, from scratch", ("planners", "ppo_physical", "log", "accuracy"), "mean", True, 0.88, 0.95),
     ("`ppo_physical`, from scratch", ("planners", "ppo_physical", "log", "success"), "mean", True, 0.80, 0.90),
     ("`sac`, from scratch", ("planners", "sac", "log", "accuracy"), "mean", True, 0.80, 0.95),
-    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "accuracy"), "low", True, 0.0, 0.03),
-    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "vmax_score"), "low", True, 0.0, 0.03),
-    ("`ppo` less `pdm`", ("differences", "log", "ppo - pdm", "at_fault_collision"), "high", False, 0.01, 0.0),
+    ("`ppo` minus `pdm`", ("differences", "log", "ppo - pdm", "accuracy"), "low", True, 0.0, 0.03),
+    ("`ppo` minus `pdm`", ("differences", "log", "ppo - pdm", "vmax_score"), "low", True, 0.0, 0.03),
+    ("`ppo` minus `pdm`", ("differences", "log", "ppo - pdm", "at_fault_collision"), "high", False, 0.01, 0.0),
     ("the same in `idm` traffic", ("differences", "idm", "ppo - pdm", "accuracy"), "low", True, 0.0, 0.03),
     ("the same in `idm` traffic", ("differences", "idm", "ppo - pdm", "vmax_score"), "low", True, 0.0, 0.03),
     (
@@ -86,13 +88,16 @@ GOALS = (
         ("differences", "idm", "ppo - pdm", "at_fault_collision"), "high", False, 0.01, 0.0,
     ),
     (
-        "`ppo` less `constant_speed`",
+        "`ppo` minus `constant_speed`",
         ("differences", "log", "ppo - constant_speed", "success"), "low", True, 0.15, None,
     ),
-    ("`bc_sac` less `bc`", ("differences", "log", "bc_sac - bc", "success"), "low", True, 0.0, 0.10),
-    ("`ppo`, `idm` less `log` traffic", ("reactive", "ppo", "accuracy"), "low", True, -0.02, 0.0),
+    ("`bc_sac` minus `bc`", ("differences", "log", "bc_sac - bc", "success"), "low", True, 0.0, 0.10),
+    ("`ppo`, `idm` minus `log` traffic", ("reactive", "ppo", "accuracy"), "low", True, -0.02, 0.0),
+    ("`ppo`", ("planners", "ppo", "log", "distance_ratio"), "mean", False, 1.08, None),
+    ("`ppo`", ("planners", "ppo", "log", "log_lead"), "mean", False, 0.5, None),
     ("`sac`", ("planners", "sac", "log", "distance_ratio"), "mean", False, 1.08, None),
     ("`sac`", ("planners", "sac", "log", "log_lead"), "mean", False, 0.5, None),
+    ("`self_play`", ("planners", "self_play", "log", "km_per_fault"), "low", True, 0.0, 10.0),
 )  # fmt: skip
 #: Tags for the breakdown of accuracy, and the file with the tags of the scenarios.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
@@ -222,6 +227,12 @@ def mean_interval(episodes: Episodes, metric: str, against: Episodes | None = No
     return difference_interval(values, other_values, segments)[0]
 
 
+def distance_ratio(episodes: Episodes, expert: Episodes) -> np.ndarray[Any, Any]:
+    """Return the distance driven over that of the expert, NaN where the expert stands."""
+    expert_m = expert.values["distance"]
+    return episodes.values["distance"] / np.where(expert_m > 0, expert_m, np.nan)
+
+
 def km_per_fault(episodes: Episodes) -> Interval:
     """Return the kilometres per episode with an at-fault collision, of all seeds together."""
     faults = int(np.nansum(episodes.values["at_fault_collision"]))
@@ -263,7 +274,7 @@ def compute_results() -> dict[str, Any]:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
     if expert := all_episodes.get(("expert", "log")):
         for episodes in all_episodes.values():
-            episodes.values["distance_ratio"] = episodes.values["distance"] / expert.values["distance"]
+            episodes.values["distance_ratio"] = distance_ratio(episodes, expert)
     planners: dict[str, Any] = {}
     for (name, kind), episodes in all_episodes.items():
         metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
@@ -340,6 +351,11 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
     return strata
 
 
+def label(name: str) -> str:
+    """Return the name of a planner in tables, with a mark if it plans along the route."""
+    return f"`{name}` (route)" if name in ON_ROUTE else f"`{name}`"
+
+
 def goals_table(result: Mapping[str, Any]) -> list[str]:
     """Return a table of the goals, what was measured, and whether they and their aims were reached."""
     rows = []
@@ -349,17 +365,22 @@ def goals_table(result: Mapping[str, Any]) -> list[str]:
             measured = measured.get(key, {})
         if not measured:
             continue
-        sign = 1 if is_more_better else -1
-        reached = [
-            name
+        sign, is_interval = 1 if is_more_better else -1, end != "mean"
+        margins = {
+            name: sign * (measured[end] - bound)
             for name, bound in (("aim", aim), ("goal", goal))
-            if bound is not None and sign * (measured[end] - bound) >= 0
+            if bound is not None
+        }
+        # An interval that touches 0 shows no difference.
+        reached = [
+            name for name, margin in margins.items() if margin > 0 or (margin == 0 and not is_interval)
         ]
+        words = ("above", "below") if is_interval else ("at least", "at most")
         rows.append([
-            f"{what}: {COLUMNS[keys[-1]]}",
-            f"{'' if end == 'mean' else 'interval '}{'at least' if is_more_better else 'at most'} {goal:g}",
+            f"{what}: {({**COLUMNS, KM_PER_FAULT: 'km per fault'})[keys[-1]]}",
+            f"{'interval ' if is_interval else ''}{words[not is_more_better]} {goal:g}",
             "" if aim is None else f"{aim:g}",
-            interval(measured, signed=keys[0] != "planners"),
+            interval(measured, signed=keys[0] != "planners", digits=4),
             [*reached, "**no**"][0],
         ])  # fmt: skip
     return table(("what", "goal", "aim", "measured", "reached"), rows)
@@ -378,7 +399,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
             headings,
             [
                 (
-                    f"`{name}`",
+                    label(name),
                     str(planners[name]["seeds"]),
                     *format_cells(planners[name][kind], (*COLUMNS, KM_PER_FAULT)),
                 )
@@ -389,7 +410,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         for kind in TRAFFIC
     }
     rows = [
-        (f"`{name}`", *format_cells(result["reactive"][name], COLUMNS, signed=True))
+        (label(name), *format_cells(result["reactive"][name], COLUMNS, signed=True))
         for name in order
         if name in result["reactive"]
     ]
@@ -423,7 +444,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
     )
     names = [name for name in order if name in result["strata"][0]["planners"]]
     tables["strata"] = table(
-        ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
+        ("tag", "value", "scenarios", *map(label, names)),
         [
             (
                 row["tag"],
@@ -440,7 +461,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
 def format_cells(
     intervals: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
 ) -> list[str]:
-    """Format means with intervals; metres with one digit."""
+    """Format means with intervals; distances with one digit."""
     return [
         interval(
             intervals[metric],

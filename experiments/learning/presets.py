@@ -124,10 +124,12 @@ def read_training(name: str) -> dict[str, Any]:
 def compare_trainings(names: Sequence[str]) -> dict[str, Any]:
     """Return costs and results of trainings, and their paired differences from the first."""
     evaluated = {name: episodes for name in names if (episodes := read_episodes(name, "log")) is not None}
-    rows = {}
+    if len({episodes.about["test"] for episodes in evaluated.values()}) > 1:
+        raise SystemExit(f"{', '.join(evaluated)}: several test sets: drive all on one")
+    trainings = {}
     for name, episodes in evaluated.items():
         training, reference = read_training(name), evaluated[names[0]]
-        rows[name] = {
+        trainings[name] = {
             "seeds": training["seeds"],
             "seconds": training["seconds"],
             "results": {metric: mean_interval(episodes, metric).as_dict() for metric in COMPARED},
@@ -137,7 +139,7 @@ def compare_trainings(names: Sequence[str]) -> dict[str, Any]:
             if name != names[0]
             else {},
         }
-    return rows
+    return trainings
 
 
 def _mean(results: Episodes, metric: str) -> dict[str, Any]:

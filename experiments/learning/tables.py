@@ -66,7 +66,7 @@ def results_table(learning: Result) -> list[str]:
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
     rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
-    return table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
+    return table(["planner", *(f"`{column}`" for column in COLUMNS)], rows)
 
 
 def differences_table(learning: Result) -> list[str]:
