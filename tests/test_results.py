@@ -391,7 +391,7 @@ def test_learning_tables(script, learning):
         return tables.format_block(what, list(names), learning, training, page).splitlines()
 
     rows = [line.split(" | ") for line in lines("reached")]
-    assert [row[0] for row in rows[2:]] == ["| ppo", "| idm", "| bc"]
+    assert [row[0] for row in rows[2:]] == ["| `ppo` (route)", "| `idm`", "| `bc`"]
     assert rows[2][1] == "0.850 [0.840, 0.860]" and rows[3][6] == "-"
     assert lines("differences")[2] == "| ppo - idm | +0.150 [+0.140, +0.160] | +0.005 [-0.005, +0.015] |"
     assert lines("training")[3] == "| `ppo` | 2 | 1,500 |"

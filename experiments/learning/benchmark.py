@@ -34,7 +34,7 @@ from drivax.stats.seeds import difference_interval, seeds_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
-from experiments.learning.tables import interval, table
+from experiments.learning.tables import interval, label, table
 from experiments.repository import DOCS, RESULTS, STATE, fetch
 
 #: Weights of all seeds of the learned planners, and episodes of all planners.
@@ -63,8 +63,6 @@ COLUMNS = {
 #: Planners to compare every learned planner with, and the metrics of the comparison.
 REFERENCES = ("constant_speed", "idm", "pdm", "bc")
 DIFFERENCE_METRICS = ("success", "accuracy", "at_fault_collision", "vmax_score")
-#: Planners that plan along the given route and do not steer, marked in the tables.
-ON_ROUTE = ("ppo", "self_play", "sac", "bc_sac", "bc_ppo")
 #: Metrics that decisions 0011 and 0012 changed.
 CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
@@ -349,11 +347,6 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
                 {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
             )
     return strata
-
-
-def label(name: str) -> str:
-    """Return the name of a planner in tables, with a mark if it plans along the route."""
-    return f"`{name}` (route)" if name in ON_ROUTE else f"`{name}`"
 
 
 def goals_table(result: Mapping[str, Any]) -> list[str]:

@@ -25,6 +25,8 @@ COLUMNS = (
 CURVES = ("success", "vmax_score")
 #: Columns of the tables of trainings that differ in one setting.
 COMPARED = ("success", "accuracy", "at_fault_collision", "offroad", "vmax_score")
+#: Planners that plan along the given route and do not steer, marked in the tables.
+ON_ROUTE = ("ppo", "self_play", "sac", "bc_sac", "bc_ppo")
 _BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
 
 Result = dict[str, Any]
@@ -61,11 +63,16 @@ def format_block(kind: str, names: list[str], learning: Result, training: Result
     return "\n".join(blocks[kind]())
 
 
+def label(name: str) -> str:
+    """Return the name of a planner in tables, with a mark if it plans along the route."""
+    return f"`{name}` (route)" if name in ON_ROUTE else f"`{name}`"
+
+
 def results_table(learning: Result) -> list[str]:
     """Return a table with a row per planner, highest score first."""
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
-    rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
+    rows = [[label(name), *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
     return table(["planner", *(f"`{column}`" for column in COLUMNS)], rows)
 
 
