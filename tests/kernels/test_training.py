@@ -69,7 +69,8 @@ def sac_gradient(learner, observation, parameters, rng):
     ends = jnp.asarray(rng.random(BATCH) < 0.2)
     batch = Transitions(observation, action, normal(rng), ends, after, jnp.full(BATCH, 0.9))
     target = {"critic": parameters.critic}
-    return lambda parameters: learner.gradient(parameters, target, batch, jax.random.key(2), None)
+    keys = jax.random.split(jax.random.key(2), (BATCH, 2))
+    return lambda parameters: learner.gradient(parameters, target, batch, keys, jax.random.key(3), None)
 
 
 def normal(rng, *shape):
