@@ -22,11 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from drivax.learning import TrainConfig
 from drivax.learning.policies import export_policy
 from drivax.report.runs import Training, read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.run_folder import versions
+from drivax.tracking.run_folder import RunFolder, versions
 from experiments.learning.benchmark import (
     COMPARISONS,
     POLICIES,
@@ -50,8 +51,10 @@ RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
 #: File with training time and curves, next to the policies; training time in ``run.json`` of a policy, s.
 TRAINING, CORE_SECONDS = "training.json", "training_core_s"
-#: ``config.yaml`` of a policy holds its seed and all settings. The set of ``self_play`` has ``--egos 8``.
-COMMAND = "drivax train config.yaml --data BENCHMARK/train --validation BENCHMARK/validation --out RUN"
+#: ``config.yaml`` of a policy holds its seed and all settings.
+COMMAND = "drivax train config.yaml --data {0}/train --validation {0}/validation --out RUN"
+#: Name of the output of `drivax generate NAME --benchmark`, for `egos: moving` with `--egos 8`.
+DATA = {"recorded": "BENCHMARK", "moving": "BENCHMARK_EGOS_8"}
 REFERENCES = ("expert", "idm", "constant_speed", "constant_velocity")
 
 
@@ -63,7 +66,8 @@ def collect(run: Path, data: ScenarioSet) -> None:
     shutil.rmtree(policies, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
     for training, duration in zip(trainings, seconds, strict=True):
-        notes = {CORE_SECONDS: duration, "command": COMMAND}
+        config = RunFolder.open(training.folder).config(TrainConfig)
+        notes = {CORE_SECONDS: duration, "command": COMMAND.format(DATA[config.egos])}
         export_policy(training.folder, policies / training.folder.name, bank, notes, overwrite=True)
     record = {"seconds": max(seconds), "seeds": len(trainings), "curves": learning_curves(trainings)}
     (policies / TRAINING).write_text(json.dumps(record, indent=1) + "\n")

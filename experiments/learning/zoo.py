@@ -25,7 +25,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.seal import seal
 from drivax.tracking.run_folder import RunFolder
 from experiments.learning.benchmark import POLICIES
-from experiments.learning.presets import COMMAND, CORE_SECONDS
+from experiments.learning.presets import CORE_SECONDS
 from experiments.repository import ROOT
 
 ZOO = ROOT / "src" / "drivax" / "zoo"
@@ -76,8 +76,7 @@ def main() -> None:
             CORE_SECONDS: RunFolder.open(seed).info[CORE_SECONDS],
             "ego": measure(seed, validation),
         }
-        notes = {"command": COMMAND, "measured": measured}
-        export_policy(seed, ZOO / args.name, bank, notes, overwrite=True)
+        export_policy(seed, ZOO / args.name, bank, {"measured": measured}, overwrite=True)
     print(json.dumps(measured["ego"]))
 
 
