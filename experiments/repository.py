@@ -16,7 +16,7 @@ DOCS = ROOT / "docs"
 RESULTS = ROOT / "experiments" / "results"
 #: Resumable state of long experiments; remove it when they end.
 STATE = ROOT / "experiments" / "state"
-#: The last commit whose tree holds episodes, score tables and the weights of every seed.
+#: A commit whose tree holds the episodes, score tables and weights of the experiments before 26 November 2026.
 STORED = "03b904f"
 
 

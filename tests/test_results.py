@@ -6,8 +6,11 @@ import types
 import numpy as np
 import pytest
 
+from drivax import settings
+from drivax.learning import TrainConfig
 from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import load_study
+from drivax.tasks.actions import Route
 from experiment_scripts import load_script
 
 
@@ -80,13 +83,51 @@ def test_progress_until_failure(script):
     np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])
 
 
+def test_goals_are_judged_by_the_end_of_the_interval(script):
+    benchmark = script("learning.benchmark")
+    reached = {
+        "differences": {
+            "log": {
+                "ppo - pdm": {"accuracy": of(0.05), "at_fault_collision": of(0.005), "vmax_score": of(0.015)}
+            }
+        },
+        "planners": {
+            "ppo": {"log": {"success": of(0.86), "accuracy": of(0.97)}},
+            "self_play": {"log": {"km_per_fault": of(9.0)}},
+        },
+    }
+    rows = [line.strip("| ").split(" | ") for line in benchmark.goals_table(reached)[2:]]
+    assert [(row[0].rpartition(": ")[2], row[-1]) for row in rows] == [
+        ("accuracy", "aim"), ("success", "**no**"),
+        ("accuracy", "aim"), ("vmax score", "goal"), ("at fault", "**no**"),
+        ("km per fault", "**no**"),
+    ]  # fmt: skip
+
+
+def test_distances_are_relative_to_those_of_the_expert(script):
+    benchmark = script("learning.benchmark")
+    driven, expert = (
+        benchmark.Episodes({"distance": np.array(d)}, np.zeros(2), {}) for d in ([[3.0, 1]], [[2.0, 0]])
+    )
+    np.testing.assert_array_equal(benchmark.distance_ratio(driven, expert), [[1.5, np.nan]])
+
+
+def test_planners_along_the_route_are_marked(script, stored):
+    on_route = {
+        name
+        for name in stored("learning")["training"]
+        if isinstance(settings.load(TrainConfig, name, []).task.actions, Route)
+    }
+    assert on_route == set(script("learning.tables").ON_ROUTE)
+
+
 @pytest.mark.slow
 def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     benchmark = script("learning.benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
     monkeypatch.setattr(benchmark, "FORMER_EPISODES", tmp_path / "former")
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
-    few = {name: name for name in (*benchmark.DIFFERENCE_METRICS, "collision", "offroad")}
+    few = {name: name for name in (*benchmark.DIFFERENCE_METRICS, "collision", "offroad", "distance_ratio")}
     monkeypatch.setattr(benchmark, "COLUMNS", few)
     for seed in ("seed-0", "seed-1"):
         (tmp_path / "policies" / "bc" / seed).mkdir(parents=True)
@@ -106,12 +147,17 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     keep("idm", "idm", [[1, 0, 0]])
     keep("bc", "log", [[1, 1, 1], [1, 1, 0]])
     keep(benchmark.BOX, "log", [[0, 0, 0]])
+    with pytest.raises(SystemExit, match="drive the expert"):
+        benchmark.compute_results()
+    keep("expert", "log", [[1, 1, 1]])
     found = benchmark.compute_results()
     assert found["planners"]["bc"]["seeds"] == 2
     np.testing.assert_allclose(found["planners"]["bc"]["log"]["accuracy"]["mean"], 5 / 6)
     assert list(found["reactive"]) == ["idm"]
     np.testing.assert_allclose(found["reactive"]["idm"]["accuracy"]["mean"], -1 / 3)
-    assert list(found["differences"]["log"]) == ["bc - idm"] and not found["differences"]["idm"]
+    assert (
+        list(found["differences"]["log"]) == ["expert - idm", "bc - idm"] and not found["differences"]["idm"]
+    )
     np.testing.assert_allclose(found["differences"]["log"]["bc - idm"]["accuracy"]["mean"], 1 / 6)
     # One of the three episodes is at fault, and 1 m is driven in all.
     fault = found["planners"]["idm"]["log"][benchmark.KM_PER_FAULT]
@@ -122,23 +168,6 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     shown = benchmark.page_tables(found)
     assert [line.split(" | ")[:2] for line in shown["idm"][2:]] == [["| `idm`", "1"]]
     assert shown["random"][2].startswith(f"| {benchmark.BOX} | `log` | 0.5")
-    reached = {
-        "differences": {
-            "log": {
-                "ppo - pdm": {"accuracy": of(0.05), "at_fault_collision": of(0.005), "vmax_score": of(0.015)}
-            }
-        },
-        "planners": {"ppo": {"log": {"success": of(0.86), "accuracy": of(0.97)}}},
-    }
-    rows = [line.strip("| ").split(" | ") for line in benchmark.goals_table(reached)[2:]]
-    assert [(row[0].rpartition(": ")[2], row[-1]) for row in rows] == [
-        ("accuracy", "aim"), ("success", "**no**"),
-        ("accuracy", "aim"), ("vmax_score", "goal"), ("at_fault_collision", "**no**"),
-    ]  # fmt: skip
-    driven, expert = (
-        benchmark.Episodes({"distance": np.array(d)}, np.zeros(2), {}) for d in ([[3.0, 1]], [[2.0, 0]])
-    )
-    np.testing.assert_array_equal(benchmark.distance_ratio(driven, expert), [[1.5, np.nan]])
     # A training that is no preset is in the table of its comparison only.
     for name in ("encoder_mlp", "encoder_lq"):
         (tmp_path / "policies" / name / "seed-0").mkdir(parents=True)

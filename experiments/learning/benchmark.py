@@ -35,8 +35,9 @@ from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 from experiments.learning.tables import interval, label, table
-from experiments.repository import DOCS, RESULTS, STATE, fetch
+from experiments.repository import DOCS, RESULTS, ROOT, STATE, fetch
 
+CONFIGS = ROOT / "configs"
 #: Weights of all seeds of the learned planners, and episodes of all planners.
 POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
 #: Episodes of the same planners and scenarios with the definitions before decisions 0011 and 0012.
@@ -69,7 +70,7 @@ CHANGED_METRICS = {
     "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
 }  # fmt: skip
 #: Goals, set before training: what, entry of the result, end of its interval, whether larger is better, the value to
-#: reach, and the value to aim for, if any.
+#: reach, and the value to aim for (None: none).
 GOALS = (
     ("`ppo`, from scratch", ("planners", "ppo", "log", "accuracy"), "mean", True, 0.93, 0.97),
     ("`ppo`, from scratch", ("planners", "ppo", "log", "success"), "mean", True, 0.87, 0.95),
@@ -95,7 +96,7 @@ GOALS = (
     ("`ppo`", ("planners", "ppo", "log", "log_lead"), "mean", False, 0.5, None),
     ("`sac`", ("planners", "sac", "log", "distance_ratio"), "mean", False, 1.08, None),
     ("`sac`", ("planners", "sac", "log", "log_lead"), "mean", False, 0.5, None),
-    ("`self_play`", ("planners", "self_play", "log", "km_per_fault"), "low", True, 0.0, 10.0),
+    ("`self_play`", ("planners", "self_play", "log", "km_per_fault"), "low", True, None, 10.0),
 )  # fmt: skip
 #: Tags for the breakdown of accuracy, and the file with the tags of the scenarios.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
@@ -103,6 +104,8 @@ TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 FAILURE_METRICS = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
 #: Kilometres driven per episode with an at-fault collision.
 KM_PER_FAULT = "km_per_fault"
+#: Names of all columns.
+NAMES = COLUMNS | {KM_PER_FAULT: "km per fault"}
 
 Metrics = dict[str, np.ndarray[Any, Any]]
 
@@ -129,8 +132,9 @@ def learned_planners() -> dict[str, list[Path]]:
 
 def preset_planners() -> dict[str, list[Path]]:
     """Return the folders of all seeds of the presets."""
-    compared = {name for names in COMPARISONS.values() for name in names} - {"ppo"}
-    return {name: folders for name, folders in learned_planners().items() if name not in compared}
+    return {
+        name: folders for name, folders in learned_planners().items() if (CONFIGS / f"{name}.yaml").is_file()
+    }
 
 
 def load_planners(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
@@ -270,9 +274,10 @@ def compute_results() -> dict[str, Any]:
     tests = {episodes.about["test"] for episodes in all_episodes.values()}
     if len(tests) != 1:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
-    if expert := all_episodes.get(("expert", "log")):
-        for episodes in all_episodes.values():
-            episodes.values["distance_ratio"] = distance_ratio(episodes, expert)
+    if ("expert", "log") not in all_episodes:
+        raise SystemExit("drive the expert in log traffic, too: distances are relative to its")
+    for episodes in all_episodes.values():
+        episodes.values["distance_ratio"] = distance_ratio(episodes, all_episodes["expert", "log"])
     planners: dict[str, Any] = {}
     for (name, kind), episodes in all_episodes.items():
         metrics = (*COLUMNS, *FAILURE_METRICS) if name in (BOX, "expert") else COLUMNS
@@ -364,14 +369,14 @@ def goals_table(result: Mapping[str, Any]) -> list[str]:
             for name, bound in (("aim", aim), ("goal", goal))
             if bound is not None
         }
-        # An interval that touches 0 shows no difference.
+        # An interval that touches the bound does not exclude it.
         reached = [
             name for name, margin in margins.items() if margin > 0 or (margin == 0 and not is_interval)
         ]
         words = ("above", "below") if is_interval else ("at least", "at most")
         rows.append([
-            f"{what}: {({**COLUMNS, KM_PER_FAULT: 'km per fault'})[keys[-1]]}",
-            f"{'interval ' if is_interval else ''}{words[not is_more_better]} {goal:g}",
+            f"{what}: {NAMES[keys[-1]]}",
+            "" if goal is None else f"{'interval ' * is_interval}{words[not is_more_better]} {goal:g}",
             "" if aim is None else f"{aim:g}",
             interval(measured, signed=keys[0] != "planners", digits=4),
             [*reached, "**no**"][0],
@@ -386,7 +391,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
         (name for name in planners if name != BOX and "log" in planners[name]),
         key=lambda name: -planners[name]["log"]["vmax_score"]["mean"],
     )
-    headings = ("planner", "seeds", *COLUMNS.values(), "km per fault")
+    headings = ("planner", "seeds", *NAMES.values())
     tables = {
         kind: table(
             headings,
