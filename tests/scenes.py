@@ -8,7 +8,7 @@ import numpy as np
 
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, with_ego
 from drivax.scenario.schema import CAPACITIES, STEPS, AgentKind, Flag, LightState, RoadKind
 from drivax.tasks.observations import ObservationConfig
 
@@ -109,6 +109,20 @@ def bank_of(*recordings):
     scenarios = [assemble(recording, SMALL) for recording in recordings]
     assert not any(scenario.overflow for scenario in scenarios)
     return ScenarioBank.from_scenarios(scenarios, trim=False)
+
+
+def further_egos(recordings, capacity, egos):
+    """Scenarios with up to ``egos`` egos, those with each further one as the recorded ego, and its index and number."""
+    scenarios = [assemble(recording, capacity.with_egos(egos)) for recording in recordings]
+    alone, places = [], []
+    for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
+        for number, slot in enumerate(scenario.ego_slot.tolist(), start=1):
+            if slot >= 0:
+                (row,) = np.flatnonzero(recording.tracks.track_id == scenario.agent_id[slot])
+                own = with_ego(replace(recording, route_lanes=()), int(row))
+                alone.append(assemble(own, capacity))
+                places.append((index, number))
+    return scenarios, alone, np.array(places)
 
 
 def moved(recording, angle, dx, dy):

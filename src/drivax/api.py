@@ -235,7 +235,8 @@ def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> curat
     Args:
         method: Name of a method, for example ``kinematic``.
         data: The set, or its folder.
-        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``, ``training``.
+        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``egos``,
+            ``progress``, ``training``.
 
     Raises:
         DataError: The method cannot score this set.

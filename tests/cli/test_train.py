@@ -99,7 +99,7 @@ def test_scoring_for_training_shows_progress(place, monkeypatch, capsys):
     told = capsys.readouterr()
     assert "scoring: 2 scenarios in" in told.err and told.out == "wrote a-run\n"
 
-    def fail(config, data, say):
+    def fail(config, data, say, egos):
         say(3, 7)
         raise UsageError("no training today", cure="stop here")
 

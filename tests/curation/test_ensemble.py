@@ -171,6 +171,39 @@ def test_member_learns_from_all_folds_but_its_own(ensemble, data, weighted):
 
 
 @pytest.mark.slow
+def test_member_excludes_all_egos_of_its_fold(tmp_path):
+    capacity = SMALL.with_egos(2)
+    with ScenarioWriter(tmp_path / "set", capacity) as writer:
+        for row in range(3):
+            recording = straight_road([car(speed=8.0 + row), car(x=-20.0, speed=7.0 + row)])
+            writer.add(assemble(replace(recording, scenario_id=str(row), segment=str(row)), capacity))
+    data, config = ScenarioSet.open(tmp_path / "set"), replace(TINY, total_steps=640)
+    trained = train_ensemble(config, data, egos="moving")
+    environment, bank = trained.learner.environment, ScenarioBank.from_scenarios(data)
+    experience, _ = experience_of(config, environment, bank)
+    assert experience.usable.shape == (6, 91) and np.asarray(experience.usable).any(axis=1).all()
+    (scenario,) = np.flatnonzero(trained.fold == 1)
+    action = experience.expert.action.at[2 * scenario + 1].set(0.9)  # of the further ego
+    altered = replace(experience, expert=replace(experience.expert, action=action))
+    after = fit(config, trained.learner, altered, trained.fold)
+    same = jax.tree.map(
+        lambda old, new: np.asarray(jax.vmap(jnp.array_equal)(old, new)), trained.parameters, after
+    )
+    assert np.all(jax.tree.leaves(same), axis=0).tolist() == [False, True, False]
+    table = ensemble_table(trained, data)
+    assert table.egos == 2 and table.steps.shape == (6, 91) and table.scenarios.shape == (3,)
+    predictions = trained.predictions(data)
+    np.testing.assert_array_equal(predictions.known, experience.usable)
+    unseen = np.arange(6) // 2 == scenario
+    error = predictions.error(trained.deviation, np.where(unseen, 1, -1))
+    expected = (predictions.action[unseen][:, :, 1] - predictions.expert[unseen]) / trained.deviation
+    np.testing.assert_allclose(error[unseen], (expected**2).sum(axis=-1), rtol=1e-5)
+    own = predictions.error(trained.deviation, np.repeat(trained.fold, 2))[predictions.known]
+    by_hand = scipy.stats.spearmanr(table.steps[predictions.known], own).statistic
+    assert table.config["error_rank_correlation"] == pytest.approx(by_hand)
+
+
+@pytest.mark.slow
 def test_stacked_and_sequential_updates_agree(ensemble, data):
     environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
     experience, _ = experience_of(TINY, environment, bank)

@@ -13,16 +13,15 @@ from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, sample_steps
-from drivax.learning.loop import train
+from drivax.learning.loop import _divide, train
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.select.splits import hold_out
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from scenes import car, straight_road
+from scenes import car, further_egos, straight_road
 
 SMALL = replace(CAPACITIES["default"], name="small", agents=40, parked=24)
 EGOS = 4
@@ -39,16 +38,9 @@ def worlds():
         straight_road([car(0, 0, 0, 10), car(-20, 0, 0, 9), car(10, 3.7, 0, 12, steps=range(6, 41))]),
         straight_road([car(0, 0, 0, 10), car(30, 0)]),
     ]
-    scenarios = [assemble(recording, SMALL.with_egos(EGOS)) for recording in recordings]
-    alone, rows = [], []
-    for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
-        for number, slot in enumerate(scenario.ego_slot.tolist()):
-            if slot >= 0:
-                (row,) = np.flatnonzero(recording.tracks.track_id == scenario.agent_id[slot])
-                alone.append(assemble(with_ego(replace(recording, route_lanes=()), int(row)), SMALL))
-                rows.append(index * EGOS + number + 1)
+    scenarios, alone, places = further_egos(recordings, SMALL, EGOS)
     banks = (ScenarioBank.from_scenarios(each, trim=False) for each in (scenarios, alone))
-    return *banks, np.array(rows)
+    return *banks, places @ [EGOS, 1]
 
 
 def test_scenarios_and_their_egos_are_drawn_uniformly(worlds):
@@ -131,8 +123,36 @@ def test_weights_of_a_scenario_apply_to_all_its_egos(worlds):
     }  # fmt: skip
     share = 9 / 13  # three egos of weight 3, four of weight 1
     assert abs((step == 20).mean() - share) < 5 * np.sqrt(share * (1 - share) / 4000)
-    with pytest.raises(UsageError, match=r"weights of shape \(12, 91\) for 3 scenarios"):
-        ExperienceConfig().of(MOVING, bank, np.ones((12, 91)))
+
+
+def test_egos_may_have_weights_of_their_own(worlds):
+    bank, weights = worlds[0], np.zeros((3 * EGOS, worlds[0].steps))
+    weights[EGOS + 1, 20], weights[2, 30] = 3.0, 1.0
+    experience = ExperienceConfig(mask_clipped=False).of(MOVING, bank, weights)
+    row, step = map(np.asarray, sample_steps(experience.critic, jax.random.key(0), (4000,)))
+    assert set(zip(row.tolist(), step.tolist(), strict=True)) == {(EGOS + 1, 20), (2, 30)}
+    assert abs((step == 20).mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / 4000)
+    with pytest.raises(
+        UsageError, match=r"weights of shape \(9, 91\) for 3 scenarios, or their 12 logs, of 91"
+    ):
+        ExperienceConfig().of(MOVING, bank, weights[:9])
+    with pytest.raises(UsageError, match=r"weights of shape \(12, 91\) for 3 scenarios of 91 steps"):
+        ExperienceConfig().of(RECORDED, bank, weights)
+    weights[6, 20] = -1.0
+    with pytest.raises(UsageError, match=r"the weight of step 20 of ego 2 of scenario 1 is -1\.0"):
+        ExperienceConfig().of(MOVING, bank, weights)
+
+
+def test_held_out_scenarios_take_the_weights_of_their_egos_along(data_of_egos):
+    weights = np.arange(3 * 8)[:, None] + np.zeros(data_of_egos.capacity.steps)
+    config, held_out = TrainConfig(task=TASK, egos="moving"), hold_out(data_of_egos.entries)
+    assert sorted([*held_out.training, *held_out.validation]) == [0, 1, 2] and len(held_out.validation) == 1
+    _, kept, _ = _divide(config, data_of_egos, weights, held_out)
+    assert kept[:, 0].tolist() == [8 * row + ego for row in held_out.training for ego in range(8)]
+    _, kept, _ = _divide(config, data_of_egos, weights[:3], held_out)
+    assert kept[:, 0].tolist() == held_out.training
+    with pytest.raises(UsageError, match="for 3 scenarios of"):
+        _divide(replace(config, egos="recorded"), data_of_egos, weights, held_out)
 
 
 def test_sets_without_further_egos_are_refused(data, tmp_path):

@@ -12,8 +12,6 @@ import pytest
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import ConstantSpeed, IdmPlanner, logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAPACITIES
 from drivax.simulator.ahead import has_route
 from drivax.simulator.simulator import Simulator
@@ -21,7 +19,7 @@ from drivax.simulator.types import FACTS, ON_REQUEST
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from scenes import RED, car, straight_road
+from scenes import RED, car, further_egos, straight_road
 
 SMALL = replace(CAPACITIES["default"], name="small", agents=40, parked=24, routes=6)
 EGOS = 4
@@ -50,16 +48,10 @@ def worlds():
         generate_recording(0, 8),
         straight_road([car(0, 0, 0, 10), car(-20, 0, 0, 9), car(10, 3.7, 0, 12)], RED, light_x=25.0),
     ]
-    scenarios = [assemble(recording, SMALL.with_egos(EGOS)) for recording in recordings]
-    places, alone = [], []
-    for index, (recording, scenario) in enumerate(zip(recordings, scenarios, strict=True)):
-        for slot, last in zip(scenario.ego_slot.tolist(), scenario.ego_last_step.tolist(), strict=True):
-            if slot >= 0:
-                (row,) = np.flatnonzero(recording.tracks.track_id == scenario.agent_id[slot])
-                alone.append(assemble(with_ego(replace(recording, route_lanes=()), int(row)), SMALL))
-                places.append((index, slot, last))
+    scenarios, alone, places = further_egos(recordings, SMALL, EGOS)
+    egos = [(scenarios[index].ego_slot[k - 1], scenarios[index].ego_last_step[k - 1]) for index, k in places]
     banks = (ScenarioBank.from_scenarios(each, trim=False) for each in (scenarios, alone))
-    return *banks, np.array(places)
+    return *banks, np.column_stack([places[:, 0], egos])
 
 
 @jax.jit

@@ -13,6 +13,7 @@ from drivax.curation.methods import METHODS
 from drivax.errors import UsageError
 from drivax.escaping import escape_controls, show
 from drivax.files import check_output
+from drivax.learning.driving import Egos
 
 if TYPE_CHECKING:
     from drivax.curation.methods import Request
@@ -70,6 +71,8 @@ class Curate:
     """Scores of the same set and METHOD, to combine their components again without scoring."""
     like: Path | None = None
     """Scores of the same set, for random_matched to permute."""
+    egos: Egos = "recorded"
+    """Vehicles to score: the recorded ego, or any moving vehicle with a route (of a set made with --egos)."""
     seed: int | None = None
     """Seed of random_matched and of an ensemble (default: 0)."""
     config: Path | None = None
@@ -105,7 +108,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
             )
         check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
-        table = score_with_progress(args.method, Request(data, args.like, args.seed or 0, config))
+        request = Request(data, args.like, args.seed or 0, config, egos=args.egos)
+        table = score_with_progress(args.method, request)
     else:
         table = read_scores(args.again, data)
         if table.method != args.method:
@@ -144,6 +148,8 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
         ignored_values["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
         ignored_values["--seed"] = args.seed
+    if again or args.method == "random_matched":
+        ignored_values["--egos"] = None if args.egos == "recorded" else args.egos
     if args.all_windows and args.export is None:
         raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
     ignored_flags = [flag for flag, value in ignored_values.items() if value is not None]
@@ -188,14 +194,15 @@ def _print_statistics(table: ScoreTable, out: Path) -> None:
 
     low, median, high, maximum = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
     first = escape_controls(table.scenario_ids[table.order[0]])
-    show(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
+    logs = "" if table.egos == 1 else f" with {int(table.valid.any(axis=1).sum()):,} egos"
+    show(f"{out}: {len(table.scenario_ids):,} scenarios{logs}, {table.method}")
     if "error_rank_correlation" in table.config:
         show(
             f"  rank correlation of scores and errors over steps: {table.config['error_rank_correlation']:.2f}"
         )
     show(f"  scores: 5 % {low:.3f}, median {median:.3f}, 95 % {high:.3f}, largest {maximum:.3f} ({first})")
     for scale in ("step", "scenario"):
-        draws = draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable)
+        draws = draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable, table.egos)
         show(
             f"  weights by {scale}: effective sample {draws.effective:.0%} of the steps, "
             f"{draws.effective_scenarios:.0%} of the scenarios"

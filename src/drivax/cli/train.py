@@ -17,6 +17,7 @@ from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.learning.config import TrainConfig
+from drivax.learning.driving import Egos
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import use_all_cores, widen_pool
@@ -135,7 +136,7 @@ def _arm_data(args: Train, name: str, config: TrainConfig, data: ScenarioSet) ->
     arm = load_study("longtail").arms[name]
     _check_arm(args, arm, config)
     usable = usable_steps(config, data, args.trust_code)
-    return arm.weigh(data, partial(_table, args, data), args.weighting, usable, config.seed)
+    return arm.weigh(data, partial(_table, args, config.egos, data), args.weighting, usable, config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
@@ -163,13 +164,13 @@ def _algorithm(config: TrainConfig) -> str:
     return settings.kind_of(type(config.algorithm)) + (" with imitation" if imitates else "")
 
 
-def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
+def _table(args: Train, egos: Egos, data: ScenarioSet, method: str) -> ScoreTable:
     """Return the scores of an arm's method, read from --scores if given."""
     from drivax.cli.curate import score_with_progress
     from drivax.curation.methods import Request, check_current
 
     if args.scores is None:
-        return score_with_progress(method, Request(data))
+        return score_with_progress(method, Request(data, egos=egos))
     table = read_scores(args.scores, data)
     # `Arm.weigh` refuses scores of another method.
     if table.method == method:

@@ -25,7 +25,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.config import check_learnable
-from drivax.learning.driving import Driving
+from drivax.learning.driving import Driving, Egos
 from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
@@ -109,28 +109,28 @@ class EnsembleConfig:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions of the members at every step of a set, and the expert's actions, in units of the action space.
+    """Predictions of the members at every step of M logs, and the expert's actions, in units of the action space.
 
     ``action`` holds the modes of the K members. ``known`` marks usable steps (``ExpertSteps``) with an action within
     the bounds. ``information`` is the mutual information of action and member in nats; None for ``loss: mse``.
     """
 
-    action: Float[Numbers, "N T K D"]
-    expert: Float[Numbers, "N T D"]
-    known: Bool[Numbers, "N T"]
-    information: Float[Numbers, "N T"] | None
+    action: Float[Numbers, "M T K D"]
+    expert: Float[Numbers, "M T D"]
+    known: Bool[Numbers, "M T"]
+    information: Float[Numbers, "M T"] | None
 
-    def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "N T D"]:
+    def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "M T D"]:
         """Return the unbiased variance among members, relative to the variance of the expert's actions."""
         variance = [self.action[block].astype(np.float64).var(axis=2, ddof=1) for block in self._blocks()]
         return np.concatenate(variance) / deviation**2
 
     def error(
-        self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " N"] | None
-    ) -> Float[Numbers, "N T"]:
+        self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " M"] | None
+    ) -> Float[Numbers, "M T"]:
         """Return the squared error relative to the variance of the expert's actions, summed over the dimensions.
 
-        The prediction is that of member ``fold``, which excluded the scenario, or the mean of all members (-1 or None).
+        The prediction is that of member ``fold``, which excluded the log, or the mean of all members (-1 or None).
         """
         members = np.full(len(self.action), -1) if fold is None else fold
         errors = []
@@ -180,7 +180,7 @@ class Ensemble:
             return values
 
         expert = environment.expert_steps(bank)
-        values = jax.lax.map(predict, jnp.arange(len(bank)), batch_size=_LOG_BATCH)
+        values = jax.lax.map(predict, jnp.arange(len(expert.usable)), batch_size=_LOG_BATCH)
         return {**values, "expert": expert.action, "known": expert.usable & ~expert.clipped}
 
 
@@ -227,15 +227,17 @@ def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> 
     return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank])
 
 
-def train_ensemble(config: EnsembleConfig, data: ScenarioSet, log: Progress | None = None) -> Ensemble:
-    """Train an ensemble; ``log`` is called with (iterations done, iterations).
+def train_ensemble(
+    config: EnsembleConfig, data: ScenarioSet, log: Progress | None = None, egos: Egos = "recorded"
+) -> Ensemble:
+    """Train an ensemble on the logs of ``egos``; ``log`` is called with (iterations done, iterations).
 
     Raises:
         UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
         DataError: No step is usable for training.
         DivergenceError: A loss or a parameter is not finite.
     """
-    environment = Driving(Simulator(config.task))
+    environment = Driving(Simulator(config.task), egos=egos)
     clusters = np.array(recordings_of(data.entries))
     training_scenarios = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
@@ -304,6 +306,7 @@ def fit(
         DivergenceError: A loss or a parameter is not finite.
     """
     environment, cloning = require_log(learner.environment), config.cloning
+    fold = np.repeat(fold, experience.expert.egos)
     if batched is None:
         batched = jax.default_backend() != "cpu"
     steps_per_member = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))

@@ -75,8 +75,8 @@ class KinematicConfig:
         """Return the components of every step of a log."""
         return {
             "urgency": _urgency(self, log),
-            "braking": jnp.clip(_required_braking(bank, log) / self.full_braking_mps2, 0.0, 1.0),
-            "volatility": _volatility(self, log, bank.last_step[log.context.row[0]]),
+            "braking": jnp.clip(_required_braking(log) / self.full_braking_mps2, 0.0, 1.0),
+            "volatility": _volatility(self, log, bank.last_step[log.row]),
             "off_road": _edge_nearness(self, bank, log),
             "lane_deviation": _lane_deviation(self, bank, log),
             "density": crowding(log, self.crowd),
@@ -95,38 +95,39 @@ def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]
 
     def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
         low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
-        ttc_s = time_to_collision(frame, jnp.int32(0), ignored)
+        ttc_s = time_to_collision(frame, log.slot, ignored)
         share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
         return jnp.where(motion[3] >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
 
 
-def _required_braking(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
+def _required_braking(log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
-        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
-        return _braking_at_step(bank, log.index, frame, counts, along_m, speed)
+        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) != log.slot)
+        return _braking_at_step(log, frame, counts, along_m, speed)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
 def _braking_at_step(
-    bank: ScenarioBank, index: Any, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
+    log: LoggedScenario, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
     speed_mps: Float[Array, ""],
 ) -> Float[Array, ""]:  # fmt: skip
-    """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's logged path.
+    """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's path.
 
-    An agent is on the path if its box overlaps a strip of ego's width along the logged route, on ego's level, up to
-    about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if
+    An agent is on the path if its box overlaps a strip of ego's width along it, on ego's level, up to about 75 m ahead.
+    Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if
     no agent is on the path, or if ego does not approach it. A gap below 0.1 m, or an overlap, counts as 0.1 m.
 
-    ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the logged route.
+    ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the path.
     """
-    ego_box, xy = frame.box[0], frame.box[:, :2]
+    ego_box, xy = frame.box[log.slot], frame.box[:, :2]
 
     def project_at(offset_m: float) -> Any:
         centre_m = along_m + offset_m
-        return jax.vmap(lambda point: queries.project_on_route(bank, index, point, centre_m, logged=True))(xy)
+        paths, points, only = log.path[None], log.path_points[None], jnp.int32(0)
+        return jax.vmap(lambda point: queries.project_on_path(paths, points, only, point, centre_m))(xy)
 
     # Outside its window a projection is an end point, so use the nearer projection.
     near, far = map(project_at, _WINDOWS_M)
@@ -137,7 +138,7 @@ def _braking_at_step(
     cos = jnp.sum(frame.box[:, 2:4] * projections.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     half_length, half_width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= queries.LEVEL_M)
+    counts = counts & (jnp.abs(frame.z - frame.z[log.slot]) <= queries.LEVEL_M)
     on_path = projections.distance_m < jnp.abs(sin) * half_length + jnp.abs(cos) * half_width + ego_box[5] / 2
     gap = projections.along_m - along_m - (jnp.abs(cos) * half_length + sin * half_width) - ego_box[4] / 2
     gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
@@ -193,7 +194,7 @@ def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: LoggedScena
         outside_m = queries.offroad_distance(bank, log.index, box[:2], corners(box), on_road, ground)
         return jnp.max(jnp.clip(1.0 + outside_m / config.edge_m, 0.0, 1.0))
 
-    return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
+    return jax.vmap(at_step)(log.frame.box[:, log.slot], log.ground_m)
 
 
 def _lane_deviation(config: KinematicConfig, bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
@@ -264,9 +265,9 @@ def _interaction(config: PublishedConfig, log: LoggedScenario) -> Float[Array, "
     """Return the largest product of distance and closing speed, ``-dp . dv``, over its scale, within 0 and 1."""
 
     def at_step(frame: Frame, velocity: Array) -> Array:
-        offset, relative_velocity = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
+        offset, relative_velocity = frame.box[:, :2] - frame.box[log.slot, :2], frame.velocity - velocity
         product = -jnp.sum(offset * relative_velocity, axis=-1)
-        counts = frame.valid & (jnp.arange(len(product)) > 0)
+        counts = frame.valid & (jnp.arange(len(product)) != log.slot)
         return jnp.max(jnp.where(counts, jnp.clip(product / config.interaction_m2ps, 0.0, 1.0), 0.0))
 
     return jax.vmap(at_step)(log.frame, log.velocity)

@@ -1,4 +1,4 @@
-"""Logged scenarios, and score functions over whole scenario sets."""
+"""Logs of egos, and score functions over whole scenario sets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.queries import project_on_route
+from drivax.scenario.bank.queries import project_on_path
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.record import record
 from drivax.scenario.store import ScenarioSet
@@ -31,14 +31,16 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """Log of one scenario; an unobserved ego has its last observed motion, or at the start its first.
+    """Log of one ego of a scenario; while unobserved, it has its last observed motion, or at the start its first.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
         motion, velocity: x, y (m), heading (rad) and speed (m/s) of ego, and its logged velocity (m/s).
         valid: Whether ego is observed.
         ignored: Agents that overlap ego when they appear, until they separate; metrics ignore them, too.
-        along_m, ground_m: Arc length of ego along the logged route, and height of the ground under ego.
+        path, path_points: Points 1 m apart of ego's path (``RouteColumn``), and their number. It is the logged path of
+            a recorded ego, and the route of a further one, whose logged path has no such points.
+        along_m, ground_m: Arc length of ego along its path, and height of the ground under ego.
     """
 
     context: AgentContext
@@ -47,6 +49,8 @@ class LoggedScenario:
     valid: Bool[Array, " T"]
     frame: Frame
     ignored: Bool[Array, "T S"]
+    path: Float[Array, "R 7"]
+    path_points: Int[Array, ""]
     along_m: Float[Array, " T"]
     ground_m: Float[Array, " T"]
 
@@ -55,21 +59,37 @@ class LoggedScenario:
         """Index of the scenario in the bank."""
         return self.context.index[0]
 
+    @property
+    def row(self) -> Int[Array, ""]:
+        """Row of ego in the bank."""
+        return self.context.row[0]
 
-def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
-    """Return the log of one scenario."""
-    ego = bank.agents[index, :, 0]
-    valid, steps = ego[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
+    @property
+    def slot(self) -> Int[Array, ""]:
+        """Slot of ego among the agents."""
+        return self.context.slot[0]
+
+
+def read_log(bank: ScenarioBank, row: Int[Array, ""]) -> LoggedScenario:
+    """Return the log of the ego of a row of the bank; without an ego no step is valid."""
+    index, slot, steps = bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0), jnp.arange(bank.steps)
+    ego = bank.agents[index, :, slot]
+    valid = (ego[:, AgentColumn.VALID] > 0) & (steps <= bank.last_step[row]) & (bank.ego_slot(row) >= 0)
     last_valid = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
-    contexts = jax.vmap(lambda step: _context(bank, index, step))(last_valid)
+    contexts = jax.vmap(lambda step: _context(bank, row, step))(last_valid)
     motion = jax.vmap(lambda context: logged_motion(bank, context, 0))(contexts)
-    contexts = jax.vmap(partial(_context, bank, index))(steps, motion)
+    contexts = jax.vmap(partial(_context, bank, row))(steps, motion)
 
     def frame_at(context: AgentContext) -> Frame:
         return frame_of(bank, index, context.step, bank.agents[index, context.step], alone(context), 0)
 
     frame = jax.vmap(frame_at)(contexts)
-    overlapping = jax.vmap(lambda agents: overlaps(agents, jnp.int32(0)))(frame)
+    overlapping = jax.vmap(lambda agents: overlaps(agents, slot))(frame)
+    path, path_points = bank.log_routes[index], bank.log_route_points[index]
+    if bank.most_egos > 1:
+        is_recorded = bank.ego_number(row) == 0
+        path = jnp.where(is_recorded, path, bank.routes[row])
+        path_points = jnp.where(is_recorded, path_points, bank.route_points[row])
     return LoggedScenario(
         context=contexts,
         motion=motion,
@@ -77,17 +97,20 @@ def read_log(bank: ScenarioBank, index: Int[Array, ""]) -> LoggedScenario:
         valid=valid,
         frame=frame,
         ignored=_ignored_agents(overlapping, frame.valid),
-        along_m=_along_route(bank, index, motion[:, :2]),
-        ground_m=frame.z[:, 0] - bank.height_m(index, 0) / 2,
+        path=path,
+        path_points=path_points,
+        along_m=_along_path(path, path_points, motion[:, :2]),
+        ground_m=frame.z[:, slot] - bank.height_m(index, slot) / 2,
     )
 
 
-def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
+def _context(bank: ScenarioBank, row: Any, step: Any, motion: Any = None) -> AgentContext:
     """Return the context of ego at a step, with ``motion`` (zeros by default) at all steps of its history."""
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
-    z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
-    row = bank.row_of(index, 0) if bank.most_egos > 1 else None
-    return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, (), row)
+    index, slot = bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0)
+    z, zero = bank.agents[index, step, slot, AgentColumn.Z], jnp.zeros(())
+    route = row if bank.most_egos > 1 else None
+    return AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, (), route)
 
 
 def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
@@ -102,13 +125,16 @@ def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) 
     return jax.lax.scan(step, (no_agents, no_agents), (overlapping, valid))[1]
 
 
-def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 2"]) -> Float[Array, " T"]:
-    """Return ego's arc length along the logged route at every step, m; it never decreases."""
+def _along_path(
+    path: Float[Array, "R 7"], points: Int[Array, ""], xy: Float[Array, "T 2"]
+) -> Float[Array, " T"]:
+    """Return ego's arc length along its path at every step, m; it never decreases."""
 
     def step(along_m: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         # Search only as far as the car can have moved, as the simulator does.
         point, distance_m = inputs
-        projection = project_on_route(bank, index, point, along_m, 1.5 * distance_m + 2.0, logged=True)
+        ahead_m = 1.5 * distance_m + 2.0
+        projection = project_on_path(path[None], points[None], jnp.int32(0), point, along_m, ahead_m)
         along_m = jnp.maximum(along_m, projection.along_m)
         return along_m, along_m
 
@@ -116,27 +142,36 @@ def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 
     return jax.lax.scan(step, jnp.zeros(()), (xy, distance_m))[1]
 
 
-@partial(jax.jit, static_argnums=0)
-def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
-    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a bank: ``{name: [N, T, ...]}``."""
-    return jax.vmap(lambda index: score(bank, read_log(bank, index)))(jnp.arange(len(bank)))
+@partial(jax.jit, static_argnums=(0, 2))
+def score_bank(score: Any, bank: ScenarioBank, egos: int = 1) -> dict[str, Array]:
+    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to the logs of a bank: ``{name: [M, T, ...]}``.
+
+    These are the logs of the first ``egos`` egos of each scenario (1, or all of the bank), in the order of the bank.
+    """
+    rows = jnp.arange(len(bank) * egos) * (bank.most_egos // egos)
+    return jax.lax.map(lambda row: score(bank, read_log(bank, row)), rows, batch_size=len(bank))
 
 
-def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:
-    """Return ``{name: [N, T, ...]}``, the step scores of every log of a set, computed in batches.
+def score_steps(
+    data: ScenarioSet, score: Any, progress: Progress | None = None, egos: int = 1
+) -> dict[str, Numbers]:
+    """Return ``{name: [M, T, ...]}``, the step scores of the logs of a set, computed in batches.
 
-    ``score`` is a hashable function ``(bank, log) -> {name: [T, ...]}``.
+    ``score`` and ``egos`` are as for :func:`score_bank`.
 
     Raises:
         DataError: A scenario has no future.
     """
-    return map_batches(data, lambda bank: score_bank(score, bank), progress)
+    return map_batches(data, lambda bank: score_bank(score, bank, egos), progress)
 
 
 def map_batches(
     data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
 ) -> dict[str, Numbers]:
-    """Apply a function to banks of one shape, up to ``BATCH`` scenarios each; return results by name, ``[N, ...]``."""
+    """Apply a function to banks of one shape, up to ``BATCH`` scenarios each; return results by name, ``[M, ...]``.
+
+    The function returns equally many values for each scenario, in the order of the scenarios.
+    """
     sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]
@@ -146,12 +181,21 @@ def map_batches(
         result = function(ScenarioBank.from_scenarios(scenarios, trim=sizes))
         # Stack the next bank while this one is computed; at most one result is pending.
         jax.block_until_ready(batches[-1:])
-        batches.append({name: values[:count] for name, values in result.items()})
+        batches.append(
+            {name: values[: len(values) * count // len(scenarios)] for name, values in result.items()}
+        )
         if progress is not None:
             progress(first + count, len(data))
     return {name: np.concatenate([np.asarray(batch[name]) for batch in batches]) for name in batches[0]}
 
 
-def valid_steps(data: ScenarioSet) -> Bool[Numbers, "N T"]:
-    """Return the mask of steps at which ego is observed."""
-    return np.stack([np.asarray(scenario.record["agent_valid"][:, 0], bool) for scenario in data])
+def valid_steps(data: ScenarioSet, egos: int = 1) -> Bool[Numbers, "M T"]:
+    """Return the mask of steps at which ego is observed, for the recorded egos or all ``egos`` of each scenario."""
+    masks = []
+    for scenario in data:
+        observed = scenario.record["agent_valid"].astype(bool)
+        masks.append(observed[:, 0])
+        if egos > 1:
+            for slot, last in zip(scenario.record["ego_slot"], scenario.record["ego_last_step"], strict=True):
+                masks.append(observed[:, slot] & (slot >= 0) & (np.arange(len(observed)) <= last))
+    return np.stack(masks)

@@ -21,6 +21,7 @@ from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity,
 from drivax.curation.scores import Combination, ScoreTable, read_scores
 from drivax.curation.weights import permute_scores
 from drivax.errors import DataError, UsageError, did_you_mean
+from drivax.learning.driving import Egos, count_egos
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
@@ -54,6 +55,8 @@ class Request:
         config: Settings of the method, of the type of ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
+        egos: Vehicles to score: the recorded ego of each scenario, or all vehicles with a route and a goal (``moving``,
+            of a set made with ``--egos``).
     """
 
     data: ScenarioSet
@@ -62,6 +65,16 @@ class Request:
     config: Any = None
     progress: Progress | None = None
     training: Progress | None = None
+    egos: Egos = "recorded"
+
+    @property
+    def most_egos(self) -> int:
+        """Number of logs to score per scenario.
+
+        Raises:
+            UsageError: ``egos`` is moving, but the set has no further egos.
+        """
+        return count_egos(self.egos, self.data.capacity.egos)
 
 
 @dataclass(frozen=True)
@@ -146,17 +159,17 @@ def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> Non
 
 def make_table(
     name: str, config: Any, data: ScenarioSet, components: Mapping[str, np.ndarray[Any, Any]],
-    details: Mapping[str, Any] = MappingProxyType({}),
+    details: Mapping[str, Any] = MappingProxyType({}), egos: int = 1,
 ) -> ScoreTable:  # fmt: skip
     """Return the score table of a set from the components of every step, in [0, 1].
 
     ``config`` are the settings of the method ``name``; ``details`` are further plain values for the table's
-    configuration.
+    configuration. ``egos`` is the number of logs per scenario.
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
-    valid = valid_steps(data)
+    valid = valid_steps(data, egos)
     zeros, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
-    table = ScoreTable(name, values, data.hash, ids, valid, zeros, zeros[:, 0], components)
+    table = ScoreTable(name, values, data.hash, ids, valid, zeros, np.zeros(len(ids)), components, egos)
     return table.recombine(METHODS[name].combination(config))
 
 
@@ -180,7 +193,9 @@ def ensemble_table(
     """
     predictions = ensemble.predictions(data, progress)
     is_training_set = data.hash == ensemble.set_hash
-    is_unseen = ensemble.fold < 0 if is_training_set else np.ones(len(data), bool)
+    egos = len(predictions.known) // len(data)
+    fold = np.repeat(ensemble.fold, egos) if is_training_set else None
+    is_unseen = np.ones(len(predictions.known), bool) if fold is None else fold < 0
     groups = [group for group in (~is_unseen, is_unseen) if group.any()]
     scales: list[Any] = [scale] * len(groups)
     if predictions.information is not None:
@@ -188,19 +203,19 @@ def ensemble_table(
     else:
         disagreement = predictions.disagreement(ensemble.deviation)
         if scale is None:
-            total, valid = disagreement.sum(axis=-1), valid_steps(data)
+            total, valid = disagreement.sum(axis=-1), valid_steps(data, egos)
             scales = [float(np.percentile(total[group][valid[group]], _SCALE_PERCENTILE)) for group in groups]
         components = _disagreement_components(disagreement, groups, scales)
-    error = predictions.error(ensemble.deviation, ensemble.fold if is_training_set else None)
+    error = predictions.error(ensemble.deviation, fold)
     details = {"trained_on": ensemble.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
-    table = make_table("ensemble", ensemble.config, data, components, details)
+    table = make_table("ensemble", ensemble.config, data, components, details, egos)
     is_known = predictions.known & groups[-1][:, None]
     correlation = {"error_rank_correlation": rank_correlation(table.steps[is_known], error[is_known])}
     return replace(table, config={**table.config, **correlation})
 
 
 def _disagreement_components(
-    disagreement: Float[np.ndarray[Any, Any], "N T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " N"]],
+    disagreement: Float[np.ndarray[Any, Any], "M T D"], groups: Sequence[Bool[np.ndarray[Any, Any], " M"]],
     scales: Sequence[float],
 ) -> dict[str, Any]:  # fmt: skip
     """Return ``d / (d + scale)`` for each dimension of the action and for their sum, with one scale per group."""
@@ -225,28 +240,29 @@ def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
 
 
 def _heuristic(name: str, request: Request) -> ScoreTable:
-    components = score_steps(request.data, request.config, request.progress)
-    return make_table(name, request.config, request.data, components)
+    components = score_steps(request.data, request.config, request.progress, request.most_egos)
+    return make_table(name, request.config, request.data, components, egos=request.most_egos)
 
 
 def _rarity(name: str, request: Request) -> ScoreTable:
-    expert = score_steps(request.data, ExpertActions(), request.progress)
+    expert = score_steps(request.data, ExpertActions(), request.progress, request.most_egos)
     components = {"rarity": rarity_steps(request.config, expert["action"], expert["known"])}
-    return make_table(name, request.config, request.data, components)
+    return make_table(name, request.config, request.data, components, egos=request.most_egos)
 
 
 def _ensemble(_: str, request: Request) -> ScoreTable:
-    ensemble = train_ensemble(request.config, request.data, request.training)
+    ensemble = train_ensemble(request.config, request.data, request.training, request.egos)
     return ensemble_table(ensemble, request.data, request.progress)
 
 
 def _uniform(name: str, request: Request) -> ScoreTable:
-    steps = np.ones((len(request.data), request.data.capacity.steps))
-    return make_table(name, None, request.data, {"all": steps})
+    steps = np.ones((len(request.data) * request.most_egos, request.data.capacity.steps))
+    return make_table(name, None, request.data, {"all": steps}, egos=request.most_egos)
 
 
 def _oracle(name: str, request: Request) -> ScoreTable:
-    return make_table(name, None, request.data, {"all": event_steps(request.data).astype(np.float64)})
+    steps = np.repeat(event_steps(request.data).astype(np.float64), request.most_egos, axis=0)
+    return make_table(name, None, request.data, {"all": steps}, egos=request.most_egos)
 
 
 def event_steps(data: ScenarioSet) -> Bool[np.ndarray, "N T"]:

@@ -21,8 +21,9 @@ from drivax.reading import explain_damage, parse_json, read_arrays
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files, note_edited, refuse_edited
 
-Steps = Float[np.ndarray[Any, Any], "N T"]
-Valid = Bool[np.ndarray[Any, Any], "N T"]
+#: Of M logs: one of each of N scenarios, or one of each of their egos.
+Steps = Float[np.ndarray[Any, Any], "M T"]
+Valid = Bool[np.ndarray[Any, Any], "M T"]
 Scenarios = Float[np.ndarray[Any, Any], " N"]
 
 
@@ -34,7 +35,7 @@ class Combination:
         weights: Non-negative weight of each component; only their ratios matter.
         scenario: Aggregator of steps: ``max``, ``mean``, ``std``, ``p0`` to ``p100`` (percentile) or ``topN`` (mean of
             the N largest). A string aggregates the combined score. A mapping gives each component its aggregator, and
-            the results are weighted.
+            the results are weighted. A scenario with several egos has the largest of their scores.
     """
 
     weights: Mapping[str, float]
@@ -60,10 +61,12 @@ class Combination:
                 cure = did_you_mean(name, sorted(available))
                 raise UsageError(f"unknown component {name!r}", cure=cure)
 
-    def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
+    def combine(
+        self, components: Mapping[str, Steps], valid: Valid, egos: int = 1
+    ) -> tuple[Steps, Scenarios]:
         """Return the scores of steps and of scenarios, in [0, 1].
 
-        Invalid steps score 0 and are ignored in scenario scores.
+        Invalid steps score 0 and are ignored in scenario scores. Each scenario has ``egos`` consecutive logs.
 
         Raises:
             UsageError: A component with a weight or an aggregator is missing.
@@ -74,11 +77,12 @@ class Combination:
         # Rounding may make a mean of ones exceed 1.
         steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
-            return steps, aggregate(steps, valid, self.scenario)
-        scenarios = np.zeros(len(steps))
-        for name, share in shares.items():
-            scenarios += share * aggregate(components[name], valid, self.scenario[name])
-        return steps, np.minimum(scenarios, 1.0)
+            logs = aggregate(steps, valid, self.scenario)
+        else:
+            logs = np.zeros(len(steps))
+            for name, share in shares.items():
+                logs += share * aggregate(components[name], valid, self.scenario[name])
+        return steps, np.minimum(logs, 1.0).reshape(-1, egos).max(axis=1)
 
 
 def _parse_aggregator(name: str) -> tuple[str, int]:
@@ -92,8 +96,8 @@ def _parse_aggregator(name: str) -> tuple[str, int]:
     return kind, number
 
 
-def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
-    """Aggregate the valid steps of every scenario; 0 if there are none.
+def aggregate(steps: Steps, valid: Valid, name: str) -> Float[np.ndarray[Any, Any], " M"]:
+    """Aggregate the valid steps of every log; 0 if there are none.
 
     Percentiles interpolate linearly (NumPy's default); ``std`` is the population standard deviation.
     """
@@ -113,9 +117,9 @@ def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
         return np.where(is_largest, sorted_scores, 0.0).sum(axis=1) / np.maximum(is_largest.sum(axis=1), 1)
     position = (divisor - 1) * (number / 100.0)
     low = np.floor(position).astype(int)
-    high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
+    high, log = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
     fraction = position - low
-    return sorted_scores[scenario, low] * (1.0 - fraction) + sorted_scores[scenario, high] * fraction
+    return sorted_scores[log, low] * (1.0 - fraction) + sorted_scores[log, high] * fraction
 
 
 SCORES_VERSION = 3
@@ -135,10 +139,12 @@ class ScoreTable:
 
     Attributes:
         method, config: Name and configuration of the method; ``combination`` holds the arguments of :meth:`recombine`.
-        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the ids of its scenarios.
-        valid: Whether ego is observed; other steps score 0.
+        set_hash, scenario_ids: ``ScenarioSet.hash`` of the data, and the ids of its N scenarios.
+        valid: Whether ego is observed at the steps of M logs; other steps score 0.
         steps, scenarios: Scores, in [0, 1].
         components: Components of the step scores by name, in [0, 1].
+        egos: Logs per scenario: 1, that of the recorded ego, or one for each ego of the set, the recorded one first.
+            Scenarios with fewer egos have logs without valid steps.
     """
 
     method: str
@@ -149,6 +155,7 @@ class ScoreTable:
     steps: Steps
     scenarios: Scenarios
     components: Mapping[str, Steps] = field(default_factory=dict)
+    egos: int = 1
 
     @property
     def drawable(self) -> Valid:
@@ -164,8 +171,9 @@ class ScoreTable:
 
         Scores are compared in float32, the precision of files, so that stored tables have the same order.
         """
-        steps, scenarios = (scores.astype(np.float32) for scores in (self.steps, self.scenarios))
-        return np.lexsort((-aggregate(steps.astype(np.float64), self.valid, "mean"), -scenarios))
+        shape, scenarios = (len(self.scenarios), -1), self.scenarios.astype(np.float32)
+        steps = self.steps.astype(np.float32).astype(np.float64).reshape(shape)
+        return np.lexsort((-aggregate(steps, self.valid.reshape(shape), "mean"), -scenarios))
 
     @property
     def combination(self) -> Combination:
@@ -181,7 +189,7 @@ class ScoreTable:
 
     def recombine(self, combination: Combination) -> ScoreTable:
         """Return the table with another combination of the same components."""
-        steps, scenarios = combination.combine(self.components, self.valid)
+        steps, scenarios = combination.combine(self.components, self.valid, self.egos)
         config = {**self.config, "combination": asdict(combination)}
         return replace(self, config=config, steps=steps, scenarios=scenarios)
 
@@ -200,7 +208,7 @@ def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
     _check_range(table, None, "report this as a defect of drivax")
     header: dict[str, Any] = {
         "version": SCORES_VERSION, "method": table.method, "config": dict(table.config), "set_hash": table.set_hash,
-        "drivax_version": metadata.version("drivax"), "edited": edited_files(),
+        "egos": table.egos, "drivax_version": metadata.version("drivax"), "edited": edited_files(),
     }  # fmt: skip
     arrays = {
         "scenario_id": np.array(table.scenario_ids),
@@ -223,7 +231,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
     if not file.is_file():
         cure = "write it with `drivax curate METHOD --data SET --out FILE`"
         raise DataError("score table not found", file=file, cure=cure)
-    arrays = read_arrays(file, _RERUN, _MOST_BYTES + len(data) * _MOST_COLUMNS * data.capacity.steps * 4)
+    most_logs = len(data) * data.capacity.egos
+    arrays = read_arrays(file, _RERUN, _MOST_BYTES + most_logs * _MOST_COLUMNS * data.capacity.steps * 4)
     with explain_damage(file, _RERUN, "not a score table, or damaged"):
         if (size := arrays["header"].nbytes) > 4 * _MOST_HEADER:  # 4 bytes per character
             raise ValueError(f"a header of {size // 4:,} characters")
@@ -231,7 +240,8 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         _check_source(header["version"], header["set_hash"], file, data)
         digest = _digest(header, arrays)
         ids = tuple(str(name) for name in arrays.pop("scenario_id"))
-        _check_shapes(ids, arrays, file, data)
+        egos = header.get("egos", 1)  # tables of earlier versions score recorded egos
+        _check_shapes(ids, arrays, egos, file, data)
         if header.get("sha256", digest) != digest:
             refuse_edited(file, "changed since drivax wrote it")
         edited = header.get("edited", [])
@@ -242,7 +252,7 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         component_names = [name for name in arrays if name.startswith(_COMPONENT)]
         components = {name.removeprefix(_COMPONENT): arrays[name] for name in component_names}
         method, config, set_hash = (header[name] for name in ("method", "config", "set_hash"))
-        table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components)
+        table = ScoreTable(method, config, set_hash, ids, valid, steps, scenarios, components, egos)
     _check_range(table, file, _RERUN)
     return table
 
@@ -268,10 +278,14 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
         raise DataError(problem, file=file, cure=cure)
 
 
-def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, data: ScenarioSet) -> None:
+def _check_shapes(
+    ids: tuple[str, ...], arrays: Mapping[str, Any], egos: Any, file: Path, data: ScenarioSet
+) -> None:
+    if egos not in (1, data.capacity.egos):
+        raise ValueError(f"{egos} egos per scenario")
     expected_ids = tuple(entry["scenario_id"] for entry in data.entries)
-    shape = (len(expected_ids), data.capacity.steps)
-    shapes = {name: shape[:1] if name == "scenario_score" else shape for name in arrays}
+    scenarios, logs = (len(expected_ids),), (len(expected_ids) * egos, data.capacity.steps)
+    shapes = {name: scenarios if name == "scenario_score" else logs for name in arrays}
     if ids != expected_ids or any(values.shape != shapes[name] for name, values in arrays.items()):
         raise DataError("does not score every scenario and step of its set", file=file, cure=_RERUN)
 
@@ -280,5 +294,5 @@ def _check_range(table: ScoreTable, file: Path | None, cure: str) -> None:
     for scores in (table.steps, table.scenarios[:, None], *table.components.values()):
         invalid = np.flatnonzero(~((scores >= 0) & (scores <= 1)).all(axis=1))
         if invalid.size:
-            record = table.scenario_ids[int(invalid[0])]
+            record = table.scenario_ids[int(invalid[0]) * len(table.scenario_ids) // len(scores)]
             raise DataError("has a score outside [0, 1]", file=file, record=record, cure=cure)

@@ -59,8 +59,9 @@ def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioS
     part_of = subset.manifest["source"]["part_of"]
     part_of = {name: value for name, value in part_of.items() if name not in ("method", "config")}
     ids = tuple(table.scenario_ids[index] for index in order)
-    scores = {name: getattr(table, name)[order] for name in ("valid", "steps", "scenarios")}
-    components = {name: component[order] for name, component in table.components.items()}
+    logs = (np.array(order)[:, None] * table.egos + np.arange(table.egos)).reshape(-1)
+    scores = {"valid": table.valid[logs], "steps": table.steps[logs], "scenarios": table.scenarios[order]}
+    components = {name: component[logs] for name, component in table.components.items()}
     config = {**table.config, "part_of": part_of}
     return replace(
         table, config=config, set_hash=subset.hash, scenario_ids=ids, components=components, **scores

@@ -60,30 +60,45 @@ PUBLISHED = WeightConfig(normalise="none", floor=0.01, temperature=1.0, most=flo
 
 
 def sampling_weights(
-    table: ScoreTable, config: WeightConfig, scale: Scale, usable: Bool[Array, "N T"] | None = None
-) -> Float[Array, "N T"]:
-    """Return the weight of every step: mean 1 over drawable steps, 0 elsewhere.
+    table: ScoreTable, config: WeightConfig, scale: Scale, usable: Bool[Array, "L T"] | None = None
+) -> Float[Array, "M T"]:
+    """Return the weight of every step of the logs in a table: mean 1 over drawable steps, 0 elsewhere.
 
     At the scale ``scenario``, all steps of a scenario have the same weight. Drawable steps are ``usable``
-    (:func:`drivax.learning.loop.usable_steps`), by default ``ScoreTable.drawable``.
+    (:func:`drivax.learning.loop.usable_steps`), by default ``ScoreTable.drawable``. If training drives all egos and the
+    table has only the recorded ones, a step is drawable if any ego of its scenario can use it.
 
     Raises:
-        UsageError: No step is drawable, or all weights are 0.
+        UsageError: No step is drawable, all weights are 0, or the table has egos that training does not drive.
     """
-    drawable = table.drawable if usable is None else usable
+    drawable = _drawable(table, usable)
     if not drawable.any():
         raise UsageError("no step can be drawn", cure="check the set")
     weights = np.zeros(drawable.shape)
     if scale == "step":
         weights[drawable] = _score_weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
-        has_steps = drawable.any(axis=1)
-        mass = drawable[has_steps].sum(axis=1).astype(np.float64)
-        weight = _score_weights(table.scenarios[has_steps], mass, config)
-        weights[has_steps] = np.where(drawable[has_steps], weight[:, None], 0.0)
+        mass = drawable.reshape(len(table.scenarios), -1).sum(axis=1)
+        scenario_weights = np.zeros(len(mass))
+        scenario_weights[mass > 0] = _score_weights(
+            table.scenarios[mass > 0], mass[mass > 0].astype(np.float64), config
+        )
+        weights = np.where(drawable, np.repeat(scenario_weights, table.egos)[:, None], 0.0)
     if not weights.any():
         raise UsageError("every score is 0, so all weights are 0", cure="set floor, or normalise: quantile")
     return weights / weights[drawable].mean()
+
+
+def _drawable(table: ScoreTable, usable: Bool[Array, "L T"] | None) -> Bool[Array, "M T"]:
+    """Return the mask of drawable steps of the logs in a table."""
+    if usable is None or len(usable) == len(table.steps):
+        return table.drawable if usable is None else usable
+    if table.egos > 1:
+        cure = "train with --egos moving, or score with --egos recorded"
+        raise UsageError(
+            f"scores of {table.egos} egos per scenario, training drives the recorded one", cure=cure
+        )
+    return np.asarray(usable.reshape(len(table.steps), -1, usable.shape[1]).any(axis=1))
 
 
 def _score_weights(
@@ -139,27 +154,31 @@ class DrawStatistics:
     concentration: float
 
 
-def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) -> DrawStatistics:
-    """Return statistics of weights over drawable steps."""
+def draw_statistics(
+    weights: Float[Array, "M T"], drawable: Bool[Array, "M T"], egos: int = 1
+) -> DrawStatistics:
+    """Return statistics of weights over drawable steps; each scenario has ``egos`` consecutive logs."""
     values = weights[drawable]
-    has_steps = drawable.any(axis=1)
+    scenario_sums = weights.sum(axis=1).reshape(-1, egos).sum(axis=1)
+    has_steps = drawable.any(axis=1).reshape(-1, egos).any(axis=1)
     sorted_values = np.sort(values)[::-1]
     return DrawStatistics(
         effective=effective_size(values) / values.size,
-        effective_scenarios=effective_size(weights.sum(axis=1)[has_steps]) / int(has_steps.sum()),
+        effective_scenarios=effective_size(scenario_sums[has_steps]) / int(has_steps.sum()),
         tilt=float(np.quantile(values, 0.99) / values.mean()),
         largest=float(sorted_values[0] / values.mean()),
         concentration=float(sorted_values[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
     )
 
 
-def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
+def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "L T"] | None = None) -> ScoreTable:
     """Return the matched random control of a table: each scenario gets the shifted scores of a random scenario.
 
     Shifts are cyclic. This keeps the distribution of scores over steps, within scenarios, and among scenarios;
     exactly, if all scenarios have the same number of usable steps (longer sequences are cut, shorter ones repeated).
     Permuting single steps would spread large scores over all scenarios, so that the control would sample more
-    scenarios. ``usable`` is as in :func:`sampling_weights`; all other steps keep their scores.
+    scenarios. The logs of a scenario's egos form one sequence. ``usable`` is as in :func:`sampling_weights`; all other
+    steps keep their scores.
 
     Raises:
         UsageError: ``seed`` is negative.
@@ -167,14 +186,16 @@ def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | No
     if seed < 0:
         raise UsageError(f"seed is {seed}", cure="use 0 or more")
     rng = np.random.default_rng(seed)
-    drawable = table.drawable if usable is None else usable
-    steps, scenarios = table.steps.copy(), table.scenarios.copy()
+    shape = (len(table.scenarios), -1)
+    drawable = _drawable(table, usable).reshape(shape)
+    before, scenarios = table.steps.reshape(shape), table.scenarios.copy()
+    steps = before.copy()
     indices = np.flatnonzero(drawable.any(axis=1))
     for index, source in zip(indices, rng.permutation(indices), strict=True):
-        scores = table.steps[source, drawable[source]]
+        scores = before[source, drawable[source]]
         scores = np.roll(scores, rng.integers(len(scores)))
         steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
         scenarios[index] = table.scenarios[source]
     config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
     table = replace(table, method="random_matched", config=config, components={})
-    return replace(table, steps=steps, scenarios=scenarios)
+    return replace(table, steps=steps.reshape(table.steps.shape), scenarios=scenarios)

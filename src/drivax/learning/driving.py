@@ -35,6 +35,18 @@ Egos = Literal["recorded", "moving"]
 _BATCH = 64
 
 
+def count_egos(egos: Egos, most: int) -> int:
+    """Return the number of egos per scenario: 1, or ``most`` if any of them counts.
+
+    Raises:
+        UsageError: ``egos`` is moving, but scenarios have no further egos.
+    """
+    if egos == "moving" and most == 1:
+        cure = "convert or generate the set with --egos 8"
+        raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
+    return 1 if egos == "recorded" else most
+
+
 @dataclass(frozen=True)
 class Driving:
     """A simulator whose episodes start in scenarios drawn with replacement.
@@ -243,7 +255,7 @@ class Driving:
 
         All agents follow the log, because only then is the outcome of the expert's actions known.
         """
-        egos = 1 if self.egos == "recorded" else data.most_egos
+        egos = count_egos(self.egos, data.most_egos)
         rows = jnp.arange(len(data) * egos)
         rollouts = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(rows), _BATCH))
         # Zeros before the current step and at the last step, which has no successor.

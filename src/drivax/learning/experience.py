@@ -36,7 +36,7 @@ _MAX_UINT32 = 2**32 - 1
 
 @dataclass(frozen=True)
 class WeightedSet:
-    """Scenarios to train on, with sampling weights ``[scenario, step]`` of at least 0."""
+    """Scenarios to train on, with sampling weights of at least 0, ``[M, T]`` (:meth:`ExperienceConfig.of`)."""
 
     scenarios: ScenarioSet
     weights: np.ndarray
@@ -81,23 +81,28 @@ def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIn
     return position // sampler.steps, position % sampler.steps
 
 
-def check_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return weights ``[N, T]`` in double precision.
+def check_weights(weights: np.ndarray, scenarios: int, steps: int, egos: int) -> np.ndarray:
+    """Return weights of scenarios or of their ``egos`` logs as ``[N, 1 or egos, T]`` in double precision.
 
     Raises:
         UsageError: The shape is wrong, or a weight is negative, NaN or above 1e100.
     """
     weights = np.asarray(weights)
-    if weights.shape != shape:
-        problem = f"weights of shape {weights.shape} for {shape[0]} scenarios of {shape[1]} steps"
+    if weights.shape not in ((scenarios, steps), (scenarios * egos, steps)):
+        logs = "" if egos == 1 else f", or their {scenarios * egos} logs,"
+        problem = f"weights of shape {weights.shape} for {scenarios} scenarios{logs} of {steps} steps"
         raise UsageError(problem, cure="make weights for every step of this scenario set")
+    weights = weights.astype(np.float64).reshape(scenarios, -1, steps)
     # The bound keeps sums of squares finite.
     invalid = np.argwhere(~((weights >= 0.0) & (weights <= 1e100)))
     if len(invalid):
-        scenario, step = invalid[0]
-        problem = f"the weight of step {step} of scenario {scenario} is {weights[scenario, step]}"
+        scenario, ego, step = invalid[0]
+        of_ego = "" if weights.shape[1] == 1 else f"ego {ego} of "
+        problem = (
+            f"the weight of step {step} of {of_ego}scenario {scenario} is {weights[scenario, ego, step]}"
+        )
         raise UsageError(problem, cure="use numbers from 0 to 1e100")
-    return weights.astype(np.float64)
+    return weights
 
 
 @record
@@ -182,9 +187,10 @@ class ExperienceConfig:
     weighted: Literal["all", "policy"] = "all"
 
     def of(self, environment: Environment, data: Any, weights: np.ndarray | None = None) -> Experience:
-        """Return the experience in an environment's data, drawn by ``weights`` ``[N, T]`` or uniformly.
+        """Return the experience in an environment's data, drawn by ``weights`` or uniformly.
 
-        Weights of a scenario apply to all of its logs.
+        Weights are those of the steps of all M logs, ``[M, T]``, or of all N scenarios, ``[N, T]``; those of a scenario
+        apply to all of its logs.
 
         Raises:
             UsageError: There is no expert, or the weights do not fit the data.
@@ -200,8 +206,9 @@ class ExperienceConfig:
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)
-        weights = check_weights(weights, (usable.shape[0] // expert.egos, usable.shape[1]))
-        by_weight = sampler(np.asarray(usable) * np.repeat(weights, expert.egos, axis=0))
+        (logs, steps), egos = usable.shape, expert.egos
+        weights = check_weights(weights, logs // egos, steps, egos)
+        by_weight = sampler((np.asarray(usable).reshape(-1, egos, steps) * weights).reshape(logs, steps))
         if self.weighted == "all":
             return Experience(data, expert, usable, uniform, by_weight)
         return Experience(data, expert, usable, uniform, uniform, by_weight)

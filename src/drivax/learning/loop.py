@@ -18,7 +18,7 @@ from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.driving import Driving
+from drivax.learning.driving import Driving, count_egos
 from drivax.learning.experience import WeightedSet, check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
@@ -181,7 +181,9 @@ def _divide(
     """
     if isinstance(validation, HoldOut) and validation.recordings:
         if weights is not None:
-            weights = check_weights(weights, (len(data), data.capacity.steps))[validation.training]
+            egos = count_egos(config.egos, data.capacity.egos)
+            weights = check_weights(weights, len(data), data.capacity.steps, egos)[validation.training]
+            weights = weights.reshape(-1, data.capacity.steps)
         return data.take(validation.training), weights, data.take(validation.validation)
     if isinstance(validation, ScenarioSet):
         check_lengths(data, validation)
@@ -192,7 +194,7 @@ def _divide(
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
-    """Return the mask ``[N, T]`` of the logged steps that training on a weighted set can draw, for any ego.
+    """Return the mask ``[M, T]`` of the logged steps that training on a weighted set can draw, for each ego it drives.
 
     ``trust`` is as for :func:`train`.
 
@@ -201,8 +203,7 @@ def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = 
     """
     environment, bank = _environment(config, data, trust)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
-    usable = np.asarray(experience.usable).reshape(len(data), -1, bank.steps)
-    return np.asarray(usable.any(axis=1))
+    return np.asarray(experience.usable)
 
 
 def hashes(validation: ScenarioSet | HoldOut | None, weights: np.ndarray | None) -> dict[str, Any]:
@@ -256,9 +257,7 @@ def _environment(
         UsageError: ``egos`` is moving, but the set has no further egos.
     """
     environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
-    if config.egos == "moving" and bank.most_egos == 1:
-        cure = "convert or generate the set with --egos 8"
-        raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
+    count_egos(config.egos, bank.most_egos)
     return environment, environment.prepare(bank)
 
 

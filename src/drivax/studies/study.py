@@ -70,7 +70,7 @@ class Job:
     study: Study
     arm: str
     seed: int
-    usable: Bool[np.ndarray, "N T"]
+    usable: Bool[np.ndarray, "M T"]
     edited: bool = False
 
     def training_set(self) -> WeightedSet:
@@ -217,12 +217,13 @@ def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) ->
 def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
     """Return the score tables of the training set by method; compute those that have no file."""
     data, tables = ScenarioSet.open(study.sets.train), {}
+    egos = study.train_config(study.definition.baselines[0], 0).egos
     for method in dict.fromkeys(arm.method for arm in study.arms.values()):
         file = study.scores(method)
         config = study.config.ensemble if method == "ensemble" else None
         if not file.is_file():
             log(f"scoring by {method}")
-            write_scores(curate(method, Request(data, config=config)), file)
+            write_scores(curate(method, Request(data, config=config, egos=egos)), file)
         tables[method] = read_scores(file, data)
         check_current(tables[method], config, file)
     return tables
@@ -406,7 +407,7 @@ def _episodes(study: Study, name: str) -> Episodes:
 
 def _results(
     study: Study, test: ScenarioSet, strata: Strata, tables: Mapping[str, ScoreTable],
-    usable: Bool[np.ndarray, "N T"],
+    usable: Bool[np.ndarray, "M T"],
 ) -> dict[str, Any]:  # fmt: skip
     """Return the contents of ``results.json``, except ``conditions``, ``detectable`` and ``edited``."""
     definition, metrics, data = study.definition, study.definition.metrics, ScenarioSet.open(study.sets.train)
@@ -431,7 +432,10 @@ def _results(
         },
         "claims": [result.plain() for result in decide_claims(study.claims, episodes, strata)],
         "rates": {name: rates(values, strata, metrics) for name, values in episodes.items()},
-        "draws": {name: asdict(draw_statistics(weights[name], usable)) for name in study.arms},
+        "draws": {
+            name: asdict(draw_statistics(weights[name], usable, len(usable) // len(data)))
+            for name in study.arms
+        },
         "rankings": compare_rankings(tables, recordings_of(data.entries)),
         "rule_cost": rule_cost(_episodes(study, study.rule_evaluation), episodes[baseline], strata, metrics),
         "validations": _validations(study, baseline),

@@ -84,10 +84,14 @@ def findings(scenario: Scenario) -> str:
 
 
 def criticality_html(table: ScoreTable, row: int) -> str:
-    """Return a chart of a scenario's criticality and its components over time, with the scenario's score."""
-    valid = table.valid[row]
+    """Return a chart of a scenario's criticality and its components over time, with the scenario's score.
+
+    The chart is about the recorded ego.
+    """
+    log = row * table.egos
+    valid = table.valid[log]
     time = np.flatnonzero(valid) * DT_S
-    series = {"score": table.steps[row]} | {name: scores[row] for name, scores in table.components.items()}
+    series = {"score": table.steps[log]} | {name: scores[log] for name, scores in table.components.items()}
     lines = {
         name.replace("_", " "): (stroke(index), np.column_stack([time, scores[valid]]))
         for index, (name, scores) in enumerate(series.items())

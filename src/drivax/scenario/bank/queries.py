@@ -425,16 +425,21 @@ class RouteHit:
 
 
 def project_on_route(
-    bank: ScenarioBank, row: Integer, xy: Vector, near_m: Scalar,
-    ahead_m: float | Scalar = 33.0, logged: bool = False,
-) -> RouteHit:  # fmt: skip
+    bank: ScenarioBank, row: Integer, xy: Vector, near_m: Scalar, ahead_m: float | Scalar = 33.0
+) -> RouteHit:
     """Project a point on the route of a row, from 6 m behind to ``ahead_m`` ahead of its last known arc length.
 
     ``near_m`` is that arc length; ``ahead_m``, of which 33 m count at most, keeps a car off the other leg of a hairpin.
-    The window stays within the array of points: near the end of the array it begins further behind. With ``logged`` the
-    point is projected on the logged path of the recorded ego of scenario ``row``.
+    The window stays within the array of points: near the end of the array it begins further behind.
     """
-    routes, points = (bank.log_routes, bank.log_route_points) if logged else (bank.routes, bank.route_points)
+    return project_on_path(bank.routes, bank.route_points, row, xy, near_m, ahead_m)
+
+
+def project_on_path(
+    routes: Float[Array, "M R 7"], points: Int[Array, " M"], row: Integer, xy: Vector, near_m: Scalar,
+    ahead_m: float | Scalar = 33.0,
+) -> RouteHit:  # fmt: skip
+    """Project a point as :func:`project_on_route`, on one of several paths (:class:`RouteColumn`) of ``points``."""
     count = routes.shape[1]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
