@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -295,6 +297,35 @@ def test_trusted_policy_is_evaluated_and_resumed(folder, data, capsys):
     train(TrainConfig(), data, run, trust=trust, **resume)
     # The user's own configuration names both modules.
     train(small_config(task=OWN["task"]), data, run, **resume)
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["doctor", "generate set --scenarios 5 --workers 2", "inspect set", "generate set --scenarios 1"],
+)
+def test_commands_import_nothing_from_the_current_folder(command, tmp_path):
+    """Modules there have the names of those that commands and their child processes import first."""
+    if command.startswith("inspect"):
+        generate(tmp_path / "set", 1, 0, Generation(workers=0))
+    for name in (
+        "jax",
+        "json",
+        "multiprocessing",
+        "numpy",
+        "drivax",
+        "signal",
+        "os",
+        "encodings",
+        "sitecustomize",
+    ):
+        code = f"import os; os.mkdir({str(tmp_path / f'ran-{name}')!r}); raise ImportError('a module of the folder')"
+        (tmp_path / f"{name}.py").write_text(code)
+    program = Path(sys.executable).with_name("drivax")
+    result = subprocess.run(
+        [program, *command.split()], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert not [*tmp_path.glob("ran-*")]
+    assert result.returncode == 0, result.stderr
 
 
 def test_policies_of_the_zoo_need_no_trust():

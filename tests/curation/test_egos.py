@@ -1,5 +1,6 @@
 """Scores of further egos: those of the same vehicles as recorded egos, in tables, subsets and weights."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -26,10 +27,17 @@ SMALL = replace(CAPACITIES["default"], name="small", agents=40, parked=24)
 
 @pytest.fixture(scope="module")
 def worlds(tmp_path_factory):
-    """A set whose scenarios have 4, 3 and 1 egos, that of the 5 further ones as recorded egos, and their rows."""
+    """A set whose scenarios have 4, 4 and 1 egos, that of the 6 further ones as recorded egos, and their rows."""
     recordings = [
         generate_recording(0, 8),
-        straight_road([car(0, 0, 0, 10), car(-25, -0.5, 0, 13), car(10, 3.7, 0, 12, steps=range(6, 41))]),
+        straight_road(
+            [
+                car(0, 0, 0, 10),
+                car(-25, -0.5, 0, 13),
+                car(10, 3.7, 0, 12, steps=range(6, 41)),
+                car(-38, 0, 0, 9),
+            ]
+        ),
         straight_road([car(0, 0, 0, 10), car(30, 0)]),
     ]
     recordings = [replace(each, scenario_id=f"drive-{row}") for row, each in enumerate(recordings)]
@@ -52,7 +60,7 @@ def table(worlds):
 def test_scores_are_those_of_a_recorded_ego(worlds, score):
     data, alone, rows = worlds
     valid, own_valid = valid_steps(data, EGOS), valid_steps(alone)
-    assert valid.any(axis=1).reshape(-1, EGOS).sum(axis=1).tolist() == [4, 3, 1]
+    assert valid.any(axis=1).reshape(-1, EGOS).sum(axis=1).tolist() == [4, 4, 1]
     values, own_values = score_steps(data, score, egos=EGOS), score_steps(alone, score)
     recorded = score_steps(data, score)
     for name, own in own_values.items():
@@ -63,15 +71,15 @@ def test_scores_are_those_of_a_recorded_ego(worlds, score):
             assert observed[steps].all() and steps[-1] <= last <= 90
             # Filters and actions look ahead, beyond the end of a log that leaves the map.
             steps = steps if last == 90 else steps[:-15]
-            # In the built-in world, distant agents are those near the recorded ego, and routes are not logged paths.
-            if row > EGOS or name not in ("braking", "density", "interaction"):
+            # In the built-in world, distant agents are those near the recorded ego.
+            if row > EGOS or name not in ("density", "interaction"):
+                # Routes follow lanes, logged paths sway.
+                tolerance = 0.04 if row < EGOS and name == "braking" else 0.005
                 np.testing.assert_allclose(
-                    values[name][row, steps], own_steps[steps], atol=0.02, err_msg=name
+                    values[name][row, steps], own_steps[steps], atol=tolerance, err_msg=name
                 )
     if isinstance(score, KinematicConfig):
-        assert (
-            min(np.ptp(own) for own in own_values.values()) > 0.05
-        )  # the comparison is of more than constants
+        assert all(np.ptp(own) > 0.05 for own in own_values.values())  # more than constants are compared
 
 
 def test_a_scenario_is_as_critical_as_its_most_critical_ego(worlds, table):
@@ -101,9 +109,15 @@ def test_tables_of_all_egos_round_trip(worlds, table, tmp_path):
     with pytest.raises(DataError, match="does not score every scenario and step of its set"):
         write_scores(replace(table, egos=1), tmp_path / "one.npz")
         read_scores(tmp_path / "one.npz", data)
-    with pytest.raises(DataError, match=r"not a score table, or damaged .*3 egos per scenario"):
-        write_scores(replace(table, egos=3), tmp_path / "three.npz")
-        read_scores(tmp_path / "three.npz", data)
+    with np.load(tmp_path / "all.npz") as stored:
+        arrays = dict(stored)
+    header = json.loads(str(arrays.pop("header")))
+    del header["sha256"]
+    for egos in (3, 4.0, "4", None, [4]):
+        text = np.array(json.dumps({**header, "egos": egos}))
+        np.savez_compressed(tmp_path / "wrong.npz", allow_pickle=False, header=text, **arrays)
+        with pytest.raises(DataError, match=r"not a score table, or damaged .* egos per scenario"):
+            read_scores(tmp_path / "wrong.npz", data)
     with pytest.raises(UsageError, match=r"only the recorded ego of each scenario has a route; .* --egos 8"):
         curate("kinematic", Request(alone, egos="moving"))
     bad = table.steps.copy()
@@ -188,7 +202,7 @@ def test_commands_score_all_egos(worlds, tmp_path, capsys):
     call = ["curate", "kinematic", "--data", str(worlds[0].path)]
     every, again = (str(tmp_path / name) for name in ("every.npz", "again.npz"))
     assert main([*call, "--out", every, "--egos", "moving"]) == 0
-    assert "3 scenarios with 8 egos, kinematic" in capsys.readouterr().out
+    assert "3 scenarios (9 egos in all), kinematic" in capsys.readouterr().out
     assert main([*call, "--out", again, "--again", every, "--weights", "urgency", "1"]) == 0
     table = read_scores(tmp_path / "again.npz", worlds[0])
     assert table.egos == EGOS

@@ -72,7 +72,7 @@ class Curate:
     like: Path | None = None
     """Scores of the same set, for random_matched to permute."""
     egos: Egos = "recorded"
-    """Vehicles to score: the recorded ego, or any moving vehicle with a route (of a set made with --egos)."""
+    """Vehicles to score: the recorded ego, or all egos of a set made with --egos (moving)."""
     seed: int | None = None
     """Seed of random_matched and of an ensemble (default: 0)."""
     config: Path | None = None
@@ -194,8 +194,8 @@ def _print_statistics(table: ScoreTable, out: Path) -> None:
 
     low, median, high, maximum = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
     first = escape_controls(table.scenario_ids[table.order[0]])
-    logs = "" if table.egos == 1 else f" with {int(table.valid.any(axis=1).sum()):,} egos"
-    show(f"{out}: {len(table.scenario_ids):,} scenarios{logs}, {table.method}")
+    egos = "" if table.egos == 1 else f" ({int(table.valid.any(axis=1).sum()):,} egos in all)"
+    show(f"{out}: {len(table.scenario_ids):,} scenarios{egos}, {table.method}")
     if "error_rank_correlation" in table.config:
         show(
             f"  rank correlation of scores and errors over steps: {table.config['error_rank_correlation']:.2f}"

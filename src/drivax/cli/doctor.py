@@ -112,7 +112,7 @@ def _is_installed(module: str) -> bool:
 def devices(timeout_s: float = 60.0) -> str:
     """Return the devices of JAX, or its error."""
     try:
-        command = [sys.executable, "-c", _LIST_DEVICES]
+        command = [sys.executable, "-P", "-c", _LIST_DEVICES]  # imports nothing from the current folder
         result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])

@@ -126,8 +126,8 @@ def _braking_at_step(
 
     def project_at(offset_m: float) -> Any:
         centre_m = along_m + offset_m
-        paths, points, only = log.path[None], log.path_points[None], jnp.int32(0)
-        return jax.vmap(lambda point: queries.project_on_path(paths, points, only, point, centre_m))(xy)
+        paths, points, first = log.path[None], log.path_points[None], jnp.int32(0)
+        return jax.vmap(lambda point: queries.project_on_path(paths, points, first, point, centre_m))(xy)
 
     # Outside its window a projection is an end point, so use the nearer projection.
     near, far = map(project_at, _WINDOWS_M)

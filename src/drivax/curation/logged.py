@@ -39,7 +39,7 @@ class LoggedScenario:
         valid: Whether ego is observed.
         ignored: Agents that overlap ego when they appear, until they separate; metrics ignore them, too.
         path, path_points: Points 1 m apart of ego's path (``RouteColumn``), and their number. It is the logged path of
-            a recorded ego, and the route of a further one, whose logged path has no such points.
+            a recorded ego, and the route of a further one, for which no such points of its logged path are stored.
         along_m, ground_m: Arc length of ego along its path, and height of the ground under ego.
     """
 
@@ -86,10 +86,14 @@ def read_log(bank: ScenarioBank, row: Int[Array, ""]) -> LoggedScenario:
     frame = jax.vmap(frame_at)(contexts)
     overlapping = jax.vmap(lambda agents: overlaps(agents, slot))(frame)
     path, path_points = bank.log_routes[index], bank.log_route_points[index]
+    along_m = _along_path(path, path_points, motion[:, :2])
     if bank.most_egos > 1:
+        further = bank.routes[row], bank.route_points[row], bank.log_progress[row]
         is_recorded = bank.ego_number(row) == 0
-        path = jnp.where(is_recorded, path, bank.routes[row])
-        path_points = jnp.where(is_recorded, path_points, bank.route_points[row])
+        path, path_points, along_m = (
+            jnp.where(is_recorded, own, other)
+            for own, other in zip((path, path_points, along_m), further, strict=True)
+        )
     return LoggedScenario(
         context=contexts,
         motion=motion,
@@ -99,7 +103,7 @@ def read_log(bank: ScenarioBank, row: Int[Array, ""]) -> LoggedScenario:
         ignored=_ignored_agents(overlapping, frame.valid),
         path=path,
         path_points=path_points,
-        along_m=_along_path(path, path_points, motion[:, :2]),
+        along_m=along_m,
         ground_m=frame.z[:, slot] - bank.height_m(index, slot) / 2,
     )
 
@@ -128,7 +132,7 @@ def _ignored_agents(overlapping: Bool[Array, "T S"], valid: Bool[Array, "T S"]) 
 def _along_path(
     path: Float[Array, "R 7"], points: Int[Array, ""], xy: Float[Array, "T 2"]
 ) -> Float[Array, " T"]:
-    """Return ego's arc length along its path at every step, m; it never decreases."""
+    """Return the recorded ego's arc length along its logged path at every step, m; it never decreases."""
 
     def step(along_m: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         # Search only as far as the car can have moved, as the simulator does.
@@ -190,7 +194,7 @@ def map_batches(
 
 
 def valid_steps(data: ScenarioSet, egos: int = 1) -> Bool[Numbers, "M T"]:
-    """Return the mask of steps at which ego is observed, for the recorded egos or all ``egos`` of each scenario."""
+    """Return the mask of steps at which ego is observed, for the recorded ego or all ``egos`` of each scenario."""
     masks = []
     for scenario in data:
         observed = scenario.record["agent_valid"].astype(bool)

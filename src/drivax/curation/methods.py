@@ -55,8 +55,7 @@ class Request:
         config: Settings of the method, of the type of ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
-        egos: Vehicles to score: the recorded ego of each scenario, or all vehicles with a route and a goal (``moving``,
-            of a set made with ``--egos``).
+        egos: Vehicles to score: the recorded ego of each scenario, or all egos of a set made with ``--egos`` (moving).
     """
 
     data: ScenarioSet

@@ -281,7 +281,7 @@ def _check_source(version: object, set_hash: object, file: Path, data: ScenarioS
 def _check_shapes(
     ids: tuple[str, ...], arrays: Mapping[str, Any], egos: Any, file: Path, data: ScenarioSet
 ) -> None:
-    if egos not in (1, data.capacity.egos):
+    if type(egos) is not int or egos not in (1, data.capacity.egos):
         raise ValueError(f"{egos} egos per scenario")
     expected_ids = tuple(entry["scenario_id"] for entry in data.entries)
     scenarios, logs = (len(expected_ids),), (len(expected_ids) * egos, data.capacity.steps)

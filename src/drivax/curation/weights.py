@@ -188,11 +188,11 @@ def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "L T"] | No
     rng = np.random.default_rng(seed)
     shape = (len(table.scenarios), -1)
     drawable = _drawable(table, usable).reshape(shape)
-    before, scenarios = table.steps.reshape(shape), table.scenarios.copy()
-    steps = before.copy()
+    original, scenarios = table.steps.reshape(shape), table.scenarios.copy()
+    steps = original.copy()
     indices = np.flatnonzero(drawable.any(axis=1))
     for index, source in zip(indices, rng.permutation(indices), strict=True):
-        scores = before[source, drawable[source]]
+        scores = original[source, drawable[source]]
         scores = np.roll(scores, rng.integers(len(scores)))
         steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
         scenarios[index] = table.scenarios[source]

@@ -36,7 +36,7 @@ _BATCH = 64
 
 
 def count_egos(egos: Egos, most: int) -> int:
-    """Return the number of egos per scenario: 1, or ``most`` if any of them counts.
+    """Return the number of egos per scenario: 1 for recorded egos, ``most`` for moving ones.
 
     Raises:
         UsageError: ``egos`` is moving, but scenarios have no further egos.

@@ -31,7 +31,7 @@ from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
 from drivax.scenario.select.splits import Shares, parse_shares
 from drivax.scenario.store import ScenarioWriter, check_set_space
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_many
-from drivax.tracking.workers import worker_pool
+from drivax.tracking.workers import environment, worker_pool
 
 #: NumPy's module with the table of CPU features, and the environment variable that disables features.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
@@ -61,17 +61,8 @@ def portable_workers() -> Iterator[None]:
     # NumPy splits the variable at commas, too. "Prescott": OpenBLAS's kernels for the oldest x86-64 processors.
     disabled = os.environ.get(_FEATURES, "").replace(",", " ").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
-    settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
-    before = {name: os.environ.get(name) for name in settings}
-    os.environ.update(settings)
-    try:
+    with environment(**{_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}):
         yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @dataclass(frozen=True)

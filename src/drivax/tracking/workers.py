@@ -24,6 +24,9 @@ _INTERRUPT_S = 0.3
 #: A worker that has not ended in this time after SIGTERM is killed (s).
 _STOP_S = 10.0
 
+#: Python starts workers with ``-c``, and would import their first modules from the current folder.
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -47,7 +50,7 @@ class WorkerPool(ProcessPoolExecutor):
 
     def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
         """Submit a call; a worker that is started for it receives Ctrl-C only after it has set up its signals."""
-        with _block(signal.SIGINT):
+        with _block(signal.SIGINT), environment(**_SAFE_PATH):
             return super().submit(*arguments, **options)
 
     def _stop(self) -> None:
@@ -73,7 +76,7 @@ def worker_pool(workers: int, cores: Sequence[int] | None = None) -> WorkerPool:
     core_queue: Any = None
     try:
         # A closed terminal must not end Python's resource tracker, the process that removes semaphores.
-        with _block(signal.SIGHUP):
+        with _block(signal.SIGHUP), environment(**_SAFE_PATH):
             resource_tracker.ensure_running()
         if cores is not None:
             core_queue = context.SimpleQueue()
@@ -112,6 +115,21 @@ def one_core_each(
         futures = {pool.submit(call, task): task for task in tasks}
         for future in as_completed(futures):
             yield futures[future], future.result()
+
+
+@contextlib.contextmanager
+def environment(**variables: str) -> Iterator[None]:
+    """Set environment variables in this process and in those that it starts, and restore them at the end."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 @contextlib.contextmanager

@@ -439,7 +439,10 @@ def project_on_path(
     routes: Float[Array, "M R 7"], points: Int[Array, " M"], row: Integer, xy: Vector, near_m: Scalar,
     ahead_m: float | Scalar = 33.0,
 ) -> RouteHit:  # fmt: skip
-    """Project a point as :func:`project_on_route`, on one of several paths (:class:`RouteColumn`) of ``points``."""
+    """Project a point as :func:`project_on_route`, on a row of M paths (:class:`RouteColumn`).
+
+    ``points`` are the numbers of points of the paths.
+    """
     count = routes.shape[1]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
