@@ -60,6 +60,7 @@ def test_content(wheel: Path, repository: Path):
     # `make native` may have left a library, which only wheels of one platform contain.
     sources = {str(path.relative_to(package.parent)) for path in files if path.suffix != ".so"}
     assert sources <= names
+    assert not [name for name in names if name.endswith(".so")]
     presets = {f"drivax/configs/{path.relative_to(repository / 'configs')}"
                for path in (repository / "configs").rglob("*.yaml")}  # fmt: skip
     assert presets <= names

@@ -320,6 +320,7 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     [
         (LAUGHS, "line 5: more than 50,000 values"),
         ("a: &a [*a]", "line 1: a value that contains itself"),
+        (f"a: &a {'x' * 900_000}\nb: [{','.join(['*a'] * 40_000)}]", "line 2: more than 50,000 values"),
         ("[" * 10_000, "more than 64 levels"),
         ("a: " + "9" * 5000, "digits"),
         ("a: !!timestamp x", "invalid"),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivax.api import evaluate
 from drivax.cli import main
 from drivax.errors import DataError
 from drivax.evaluation.comparison import compare
@@ -27,6 +28,7 @@ from drivax.report.pages.comparison import comparison_text
 from drivax.report.runs import read_runs
 from drivax.seal import SEAL, allow_edited, check_seal, edited_files, seal, unseal
 from drivax.studies.definition import StudyConfig
+from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder, policy_folder, zoo
 
@@ -402,3 +404,14 @@ def test_resumed_training_deletes_what_its_end_did_not(tmp_path):
     with TrainingLog(run, "score", keep=1, patience=0) as log:
         log.start(200)
         assert log.checkpoints.steps() == [200]
+
+
+def test_python_marks_evaluations_of_edited_policies(tmp_path):
+    policy = shutil.copytree(policy_folder("zoo:aggressive"), tmp_path / "policy")
+    data = tmp_path / "set"
+    generate(data, 1, 0, Generation(workers=0))
+    assert evaluate(policy, data).planner == "policy"
+    info = json.loads((policy / "run.json").read_text())
+    (policy / "run.json").write_text(json.dumps({**info, "edited": ["a/config.yaml"]}))
+    seal(policy, "run.json")
+    assert evaluate(policy, data).planner == "policy (edited)"

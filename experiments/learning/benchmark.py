@@ -69,8 +69,8 @@ CHANGED_METRICS = {
     "at_fault_collision": "at fault", "offroad": "off-road", "comfortable": "comfort",
     "speed_compliance": "speed compliance", "vmax_score": "vmax score", "nuplan_score": "nuplan score",
 }  # fmt: skip
-#: Goals, set before training: what, entry of the result, end of its interval, whether larger is better, the value to
-#: reach, and the value to aim for (None: none).
+#: Goals, whose values were set before training: what, entry of the result, end of its interval, whether larger is
+#: better, the value to reach, and the value to aim for (None: none).
 GOALS = (
     ("`ppo`, from scratch", ("planners", "ppo", "log", "accuracy"), "mean", True, 0.93, 0.97),
     ("`ppo`, from scratch", ("planners", "ppo", "log", "success"), "mean", True, 0.87, 0.95),

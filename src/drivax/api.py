@@ -24,6 +24,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import note_edits
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import Start
 from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
@@ -104,6 +105,7 @@ def as_traffic(traffic: str | Traffic, trust: Sequence[str] = ()) -> Traffic:
     return make_traffic(traffic) if traffic in TRAFFIC else learning.find_traffic(traffic, trust)
 
 
+@note_edits()
 def evaluate(
     planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
     traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
@@ -206,6 +208,7 @@ def convert(src: str | Path, out: str | Path, **options: Any) -> datasets.Conver
     return datasets.convert(src, out, datasets.Conversion(**options), audit=audit)
 
 
+@note_edits()
 def compare(
     a: str | Path, b: str | Path, plan: ComparisonPlan | None = None, data: Path | None = None,
     **settings: Any,
@@ -229,6 +232,7 @@ def compare(
     return compare_evaluations(plan, first, second, entries)
 
 
+@note_edits()
 def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> curation.ScoreTable:
     """Score how critical each step and scenario of a set is.
 

@@ -95,6 +95,13 @@ def allow_edited(is_allowed: bool = True) -> Iterator[None]:
         _block.reset(token)
 
 
+@contextlib.contextmanager
+def note_edits() -> Iterator[None]:
+    """Note the edited files behind earlier runs in the block, unless an outer block does."""
+    with contextlib.nullcontext() if _block.get() is not None else allow_edited(False):
+        yield
+
+
 def is_edited_allowed() -> bool:
     """Return whether edited files are used (:func:`allow_edited`)."""
     return (block := _block.get()) is not None and block.is_allowed

@@ -15,12 +15,14 @@ from pathlib import Path
 import pytest
 
 from datasets.samples import womd_scenario as wire
+from drivax import kernels
 from drivax.cli import doctor, main
 from drivax.datasets.conversion import convert
 from drivax.datasets.doctor import Part, _notes, diagnose, gaps
 from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import Description
 from drivax.errors import DataError, UsageError
+from drivax.tracking.run_folder import zoo
 
 FORMATS = {
     "av2_motion": "Argoverse 2 Motion Forecasting",
@@ -333,8 +335,10 @@ def test_machine(capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
-    for words in ("python", "jax", "cpu", "zoo:aggressive", "cores", "memory", "GB free here", "womd (Waymo"):
+    for words in ("python", "jax", "cpu", "cores", "memory", "GB free here", "womd (Waymo", *zoo()):
         assert words in out
+    line = next(line for line in out.splitlines() if line.startswith("native kernels"))
+    assert " ".join(line.split()[2:]) in " ".join(kernels.state().split())
 
 
 def test_a_missing_extra_names_its_pip_line(monkeypatch):

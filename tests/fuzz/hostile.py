@@ -203,6 +203,7 @@ def payloads() -> Iterator[tuple[str, bytes | Callable[[Path], None]]]:
         ).encode(),
         "yaml laughs": _laughs().encode(),
         "yaml itself": b"a: &a [*a]\n",
+        "yaml text": b"x: &a " + b"x" * 890_000 + b"\ntask: [" + b"*a," * 49_900 + b"]\n",
         "yaml code": f"a: !!python/object/apply:os.mkdir ['{CANARY}']".encode(),
         "yaml deep": b"[" * deep,
         "yaml deep block": b"".join(b" " * n + b"a:\n" for n in range(900)),

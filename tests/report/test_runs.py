@@ -74,6 +74,13 @@ def test_actions_are_nan_in_runs_without_them(runs, scenarios):
     assert np.isnan(drive.action).all(), "a run of before there were any"
 
 
+def test_episodes_begin_within_their_scenario(runs, scenarios):
+    _start(200)(runs[2])
+    choice = EpisodeGroup("hand", "hand-03", (3,), "offroad")
+    with pytest.raises(DataError, match="record hand-03: the episode begins at step 200 of 91"):
+        rollouts_of(read_runs([runs[2]])[0], choice, scenarios[3])
+
+
 def _remove(name):
     return lambda folder: (folder / name).unlink()
 
@@ -103,9 +110,29 @@ def _lacks(folder):
     np.savez(folder / "trajectories.npz", **arrays)
 
 
+def _start(step):
+    def change(folder):
+        with np.load(folder / "trajectories.npz") as stored:
+            arrays = dict(stored)
+        np.savez(folder / "trajectories.npz", **(arrays | {"start": arrays["start"] * 0 + step}))
+
+    return change
+
+
+def _bomb(folder):
+    """Packed, the rows of zeros take a thousandth."""
+    with np.load(folder / "trajectories.npz") as stored:
+        arrays = dict(stored)
+    others = np.zeros((len(arrays["start"]), 80, 5_000, 3), np.int16)
+    np.savez_compressed(folder / "trajectories.npz", **arrays, others=others)
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
+        (_start(-1), "trajectories.npz: cannot be read (an episode begins at step -1)"),
+        (_start(40_000), "trajectories.npz: cannot be read (an episode begins at step 40000)"),
+        (_bomb, "more than the "),
         (_remove("run.json"), "not a run folder: no run.json"),
         (_remove("episodes.csv"), "episodes.csv: file not found"),
         (_remove("trajectories.npz"), "trajectories.npz: file not found"),

@@ -5,20 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.datasets.conversion import Conversion
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.bank.columns import LaneRow, LightRow
 from drivax.scenario.bank.queries import in_corridor
 from drivax.scenario.bank.scenario_bank import PER_EGO, ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.manifest import field_table
 from drivax.scenario.recording import with_ego
-from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag
-from drivax.scenario.store import ScenarioSet, ScenarioWriter, field_table
+from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag, find_impossible
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import generate_recording
 from scenes import RED, car, straight_road
@@ -176,3 +179,25 @@ def test_conversion_and_generation_store_further_egos(tmp_path):
     for options in (Generation(egos=9), Conversion(egos=9)):
         with pytest.raises(UsageError, match="egos is 9; use 1 to 8"):
             options.check()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps", 0), ("steps", 32_000), ("current_step", -1), ("current_step", 30_000), ("dt_s", 0.0),
+        ("dt_s", np.nan), ("segment_blocks", (0, 2, 5, 1 << 30)), ("segment_blocks", (0, 5, 2, 7)),
+        ("segment_blocks", (-1, 2, 5, 7)), ("route_lane", -32_768), ("route_points", 32_000), ("light_lane", 500),
+        ("road_rows", -3), ("ego_slot", 4_000), ("ego_last_step", 9_000), ("ego_route_lane", -9),
+    ],
+)  # fmt: skip
+def test_records_that_no_scenario_has_are_refused(tmp_path: Path, name: str, value: Any):
+    """Such a set has valid checksums: someone made it. Arrays are sized and indexed by these numbers."""
+    scenario = assemble(straight_road([car(), car(20.0)]), SMALL.with_egos(2))
+    record = scenario.record.copy()
+    assert find_impossible(record) is None
+    record[name] = value
+    with ScenarioWriter(tmp_path / "set", scenario.capacity) as writer:
+        writer.add(replace(scenario, record=record))
+    for verify in (True, False):
+        with pytest.raises(DataError, match=f"record 0: {name} "):
+            ScenarioSet.open(tmp_path / "set", verify=verify)[0]

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
+from drivax.scenario.manifest import manifest_entry
 from drivax.scenario.schema import CAPACITIES, Flag
 from drivax.scenario.select.selection import FINDINGS, OVERFLOWS, Selection, vocabulary
-from drivax.scenario.store import manifest_entry
 from scenes import GREEN, car, straight_road
 
 ENTRY = {

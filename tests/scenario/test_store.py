@@ -12,6 +12,7 @@ import time
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ import pytest
 from drivax.datasets.export.writer import write_part
 from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
+from drivax.scenario import manifest as manifest_module
 from drivax.scenario import store
 from drivax.scenario.schema import (
     SCHEMA_VERSION,
@@ -40,7 +42,7 @@ SMALL = Capacity(
 
 
 def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
-    """A scenario whose every field holds random bytes of its dtype, the same for the same number."""
+    """A scenario whose fields hold random numbers, as far as a scenario can; the same for the same number."""
     rng = np.random.default_rng(number)
     dtype = record_dtype(capacity)
     record = np.zeros((), dtype)
@@ -58,6 +60,10 @@ def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
     record["segment"] = f"segment-{number // 2}".encode()
     record["flags"] = int(Flag.LIGHTS | Flag.ROUTE)
     record["segment_blocks"] = (0, 2, 5, 7)
+    record["steps"], record["current_step"], record["dt_s"], record["road_rows"] = capacity.steps, 1, 0.1, 1
+    record["route_points"] %= capacity.route_points
+    for name in ("route_lane", "light_lane"):
+        record[name] %= capacity.lanes
     source = SourceCounts(5, number, number // 2, {"lane": 3}, 40, 1, {"dangling_links": 2})
     return Scenario(record, capacity, source, {"agents": 2}, {"collision": False}, {"domain": "urban"})
 
@@ -456,7 +462,7 @@ def test_manifest_on_disks_that_state_no_blocks(blocks: int, size: int):
     manifest, shard = (
         os.stat_result((0,) * 6 + (5000,) + (0,) * 3, {"st_blocks": number}) for number in (blocks, 0)
     )
-    assert store._size_on_disk(manifest, [shard]) == size
+    assert manifest_module._size_on_disk(manifest, [shard]) == size
 
 
 def exchange(first: Path, second: Path) -> None:
@@ -569,6 +575,8 @@ def test_damaged_manifest(scenario_set: Path, content: str):
         ({"fields": []}, "field table"),
         ({"capacity": {"agnets": 3}}, "manifest is damaged"),
         ({"scenarios": [{"scenario_id": "x"}]}, "manifest is damaged"),
+        ({"record_bytes": None}, "record_bytes, drivax_version, source are missing or of another type"),
+        ({"source": []}, "record_bytes, drivax_version, source are missing or of another type"),
         ({"shards": [{"file": "shard-00000.npy"}]}, "manifest is damaged"),
         ({"shards": []}, "lists 7 scenarios but its shards contain 0"),
     ],
@@ -579,13 +587,27 @@ def test_manifest_of_another_kind(scenario_set: Path, changes: dict[str, object]
         ScenarioSet.open(scenario_set)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("tags", {"domain": 3}), ("flags", [["x"]]), ("source", {"steps": "9"}), ("source", {"steps": 1e99})],
+)
+def test_entries_of_other_types_are_refused(scenario_set: Path, name: str, value: Any):
+    entries = json.loads((scenario_set / "manifest.json").read_text())["scenarios"]
+    entries[4][name] = entries[4][name] | value if name == "source" else value
+    edit_manifest(scenario_set, scenarios=entries)
+    with pytest.raises(DataError, match=r"manifest is damaged \(.*scenario 4 has "):
+        ScenarioSet.open(scenario_set)
+
+
 def test_errors_are_one_line(scenario_set: Path):
     (scenario_set / "seal.json").unlink()
     (scenario_set / "manifest.json").write_text('{\n"a":\n')
     with pytest.raises(DataError) as error:
         ScenarioSet.open(scenario_set)
     file, message = scenario_set / "manifest.json", str(error.value)
-    assert message.startswith(f"{file}: manifest is damaged (") and message.endswith(f"; {store.AGAIN}")
+    assert message.startswith(f"{file}: manifest is damaged (") and message.endswith(
+        f"; {manifest_module.AGAIN}"
+    )
     assert "\n" not in message
 
 

@@ -101,11 +101,14 @@ def _print(inspections: list[Inspection]) -> None:
     terminal.print(tables.overview(inspection).rich())
     terminal.print()
     audit = tables.audit_table(inspection)
-    terminal.print("audit: not done" if audit is None else audit.rich())
+    if audit is None:
+        show("audit: not done")
+    else:
+        terminal.print(audit.rich())
     terminal.print()
     terminal.print(tables.scenarios_table(inspection).rich())
     if len(inspection) > tables.MAX_LISTED:
-        terminal.print(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
+        show(f"{len(inspection) - tables.MAX_LISTED:,} more; --json lists all")
 
 
 def _check_flags(args: Inspect) -> None:
@@ -161,7 +164,6 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
 def _print_observations(statistics: ObservationStatistics) -> None:
     from drivax.report import inspection as tables
 
-    terminal = console()
-    terminal.print(tables.observation_overview(statistics))
-    terminal.print()
-    terminal.print(tables.observation_table(statistics).rich())
+    show(tables.observation_overview(statistics))
+    show()
+    console().print(tables.observation_table(statistics).rich())

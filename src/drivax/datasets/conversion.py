@@ -33,11 +33,12 @@ from drivax.files import count_text
 from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
+from drivax.scenario.manifest import manifest_entry
 from drivax.scenario.recording import STRIDE, Recording, windows
 from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Capacity, Scenario, record_dtype
 from drivax.scenario.select.selection import Selection
 from drivax.scenario.select.splits import Shares, parse_shares
-from drivax.scenario.store import ScenarioWriter, manifest_entry
+from drivax.scenario.store import ScenarioWriter
 from drivax.tracking.workers import worker_pool
 
 _Result = TypeVar("_Result")

@@ -17,9 +17,9 @@ from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with
 from drivax.errors import DataError, UsageError
 from drivax.files import check_space, count_text, format_bytes, free_bytes
 from drivax.reading import read_json
+from drivax.scenario.manifest import MANIFEST, read_manifest
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
-from drivax.scenario.store import MANIFEST, read_manifest
 from drivax.seal import SEAL, check_seal, require_entries
 
 #: Most files of a format that are inspected; they stand for the others.

@@ -13,7 +13,7 @@ from drivax.datasets.womd.messages import parse
 from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError, explain_system
 from drivax.reading import read_json
-from drivax.scenario.store import AGAIN, MANIFEST
+from drivax.scenario.manifest import AGAIN, MANIFEST
 
 #: Kinds of files by their first bytes (of a tar archive those from ``_TAR_BYTE`` on), and cures.
 _TAR, _TAR_BYTE = b"ustar", 257

@@ -21,6 +21,7 @@ from drivax.errors import DataError
 from drivax.escaping import csv_text
 from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, read_arrays, read_csv, read_json
+from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import check_seal, edited_files, mark_edited, refuse_edited, require_entries, seal
 from drivax.stats.clusters import recordings
@@ -52,8 +53,9 @@ _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
 #: Memory limit of a table, in cells of 8 bytes (1 GB in total): the largest table, of 1.7 million episodes, takes up to
 #: 126 million. A key takes two cells (in a list, then in a tuple), a distinct text ``_TEXT_CELLS``.
 _MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
-#: Size limits of ``trajectories.npz``, bytes: fixed part, and per episode (more than any capacity needs).
-_MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
+#: Size limits of ``trajectories.npz``, bytes: fixed part, and per episode (more than any capacity needs). Beyond the
+#: fixed part, it unpacks to at most this multiple of its size (motions to less than 3 times).
+_MOST_BYTES, _MOST_EPISODE_BYTES, _MOST_RATIO = 16 << 20, 1 << 20, 50
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
@@ -91,6 +93,18 @@ class Trajectories:
     start: Int64[Array, " episode"]
     events: Mapping[str, Int64[Array, " episode"]]
     others: Int16[Array, "episode step A 3"] | None = None
+
+    def begin(self, row: int, scenario: Scenario) -> int:
+        """Return the step at which an episode begins.
+
+        Raises:
+            DataError: It is beyond the end of the scenario.
+        """
+        start, steps = int(self.start[row]), int(scenario.steps)
+        if start >= steps:
+            problem = f"the episode begins at step {start} of {steps}"
+            raise DataError(problem, record=scenario.id, cure=_RERUN)
+        return start
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,13 +409,17 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
     """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
     check_seal(path)
-    archive = read_arrays(path, _RERUN, _MOST_BYTES + len(scenario_ids) * _MOST_EPISODE_BYTES)
+    packed = path.stat().st_size if path.is_file() else 0
+    most = _MOST_BYTES + min(len(scenario_ids) * _MOST_EPISODE_BYTES, _MOST_RATIO * packed)
+    archive = read_arrays(path, _RERUN, most)
     with explain_damage(path, _RERUN, "cannot be read"):
         ids = [_text(value) for value in archive["scenario_id"]]
         ego = archive["ego"].astype(np.float32)
         action = (archive["action"] if "action" in archive else ego[:, 1:, :0]).astype(np.float32)
         start = archive["start"].astype(np.int64)
         events = {name: archive[f"{name}_step"].astype(np.int64) for name in EVENTS}
+        if start.size and not 0 <= start.min() <= start.max() < 1 << 15:
+            raise ValueError(f"an episode begins at step {start.min() if start.min() < 0 else start.max()}")
         others = None if log_traffic else archive["others"]
     if not _has_consistent_shapes(len(ids), ego, action, (start, *events.values()), others):
         raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)

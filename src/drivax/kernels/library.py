@@ -110,7 +110,7 @@ def in_use() -> bool:
 
 
 def without_kernels() -> contextlib.AbstractContextManager[None]:
-    """Trace programs of this thread without native kernels, for export and for comparisons."""
+    """Trace programs of this thread without native kernels: for other machines, and for comparisons."""
     return _allowed(False)
 
 

@@ -37,6 +37,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, check_lengths
+from drivax.seal import note_edits
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints, is_part
 from drivax.tracking.progress import Progress
@@ -94,6 +95,7 @@ class TrainOptions:
             raise UsageError(f"{self.seeds} seeds", cure="use 1 or more")
 
 
+@note_edits()
 def train(
     config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
     validation: ScenarioSet | Literal["held_out"] | None = "held_out", **options: Any,

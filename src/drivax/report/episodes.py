@@ -171,7 +171,7 @@ def rollouts_of(runs: Sequence[EpisodeTable], group: EpisodeGroup, scenario: Sce
 def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
     """Return an episode as steps of the scenario: as logged before its start, NaN after its end."""
     trajectories = run.trajectories
-    steps, start = int(scenario.steps), int(trajectories.start[row])
+    steps, start = int(scenario.steps), trajectories.begin(row, scenario)
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_motion(scenario)[:start]
     motion = trajectories.ego[row, : steps - start]

@@ -297,6 +297,25 @@ def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) 
     return np.concatenate(values).reshape(len(values), *values[0].shape)  # faster than np.stack
 
 
+def find_impossible(record: Any) -> str | None:
+    """Return why no scenario has the numbers of a record, or None: those that arrays are sized or indexed by."""
+    steps, agents = record["agent_valid"].shape
+    lanes, points = len(record["lane_id"]), record["route_lane"].shape[-1]
+    bounds = {
+        "steps": (1, steps), "current_step": (0, int(record["steps"]) - 1),
+        "road_rows": (0, len(record["road_length"])), "segment_blocks": (0, len(record["segment_lane"])),
+        "route_points": (0, points), "route_lane": (-1, lanes - 1),
+        "light_lane": (-1, lanes - 1), "ego_slot": (-1, agents - 1), "ego_last_step": (-1, steps - 1),
+        "ego_route_points": (0, points), "ego_route_lane": (-1, lanes - 1),
+    }  # fmt: skip
+    for name, (least, most) in bounds.items():
+        if name in record.dtype.names and (record[name].min() < least or record[name].max() > most):
+            return f"{name} is not {least} to {most}"
+    if not 0.0 < record["dt_s"] < 10.0:
+        return f"dt_s is {record['dt_s']}"
+    return "segment_blocks decrease" if (np.diff(record["segment_blocks"]) < 0).any() else None
+
+
 @dataclass(frozen=True)
 class SourceCounts:
     """Counts of the source before capping and cropping; ``drivax inspect`` shows them."""

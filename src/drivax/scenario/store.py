@@ -18,8 +18,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import math
-import os
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,7 +25,6 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from io import BufferedIOBase
 from itertools import chain
-from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -47,32 +44,37 @@ from drivax.files import (
     sync_and_close,
     write_json,
 )
-from drivax.reading import DAMAGE, MOST_TEXT, explain_damage, parse_json, read_array_header, read_bytes
+from drivax.reading import DAMAGE, explain_damage, read_array_header
+from drivax.scenario.manifest import (
+    AGAIN,
+    MANIFEST,
+    check_entries,
+    crc_name,
+    field_table,
+    manifest_entry,
+    plain,
+    read_manifest,
+    shard_name,
+)
 from drivax.scenario.schema import (
     NAMES,
     SCHEMA_VERSION,
     Capacity,
     Scenario,
     SourceCounts,
+    find_impossible,
     record_dtype,
     stored_name,
 )
 from drivax.scenario.select.splits import Shares, write_splits
-from drivax.seal import check_seal, require_entries, seal
+from drivax.seal import seal
 
-MANIFEST = "manifest.json"
-#: The cure for a set that cannot be repaired.
-AGAIN = "convert or generate the set again"
 #: Bytes at the beginning of a record that hold its names.
 _PAGE = 4096
-#: Bytes of the largest manifest that is read (some 500,000 scenarios); sparse shards may claim any size.
-_MOST_MANIFEST = 1 << 30
 #: Scenarios that an iteration reads at a time, and that a thread reads in one task.
 _BATCH, _PART = 64, 8
 #: Held while a shard is mapped, so that threads map it only once.
 _MAP_LOCK = threading.Lock()
-#: Types of the values of a manifest entry.
-_ENTRY = {**dict.fromkeys(NAMES, str), "flags": list, "overflow": dict, "audit": dict, "tags": dict}
 _Bytes = np.ndarray[Any, Any]
 
 
@@ -143,7 +145,7 @@ class ScenarioWriter:
         """Return whether a closed shard is undamaged and full; a last shard of fewer records is written again."""
         with contextlib.suppress(DataError, *DAMAGE):
             shard, entries = summary["shard"], summary["scenarios"]
-            _check_entries([*self._shards, shard], entries)
+            check_entries([*self._shards, shard], entries)
             if shard["count"] == len(entries) == self._shard_size:
                 Shard(self._partial.content, shard, self._buffer.dtype, entries).check_digest()
                 return True
@@ -434,11 +436,13 @@ class Shard:
     def record(self, row: int, verify: bool) -> _Bytes:
         """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
         data = self._map() if self._data is None else self._data
-        if verify and not self._intact[row]:
-            if zlib.crc32(data[row].data) != int(self._crcs[row]):
+        if not self._intact[row]:
+            if verify and zlib.crc32(data[row].data) != int(self._crcs[row]):
                 raise self._damage_error("checksum mismatch, the record is damaged", row)
             self._check_names(row, data[row])
-            self._intact[row] = True
+            if problem := find_impossible(data[row].view(self._dtype)[0]):
+                raise self._damage_error(problem, row)
+            self._intact[row] = verify
         return data[row]
 
     def check_digest(self) -> None:
@@ -482,93 +486,6 @@ def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
     return entry["dataset"], entry["scenario_id"]
 
 
-def manifest_entry(scenario: Scenario) -> dict[str, Any]:
-    """Return the manifest entry of a scenario."""
-    return {
-        **{name: scenario.text(name) for name in NAMES},
-        "flags": [str(flag.name) for flag in scenario.has],
-        "segments": int(scenario.record["segment_blocks"][3]),
-        "source": plain(dataclasses.asdict(scenario.source)),
-        "overflow": plain(scenario.overflow),
-        "audit": plain(scenario.audit),
-        "tags": plain(scenario.tags),
-    }
-
-
-def field_table(capacity: Capacity) -> list[dict[str, Any]]:
-    """Return name, dtype, shape and byte offset of every field of a record."""
-    return [
-        {"name": name, "dtype": field[0].base.str, "shape": list(field[0].shape), "offset": field[1]}
-        for name, field in (record_dtype(capacity).fields or {}).items()
-    ]
-
-
-def read_manifest(path: Path) -> dict[str, Any]:
-    """Read the manifest of the set at ``path``."""
-    file = path / MANIFEST
-    restore_folder(path)
-    if not path.is_dir():
-        problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
-        raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
-    if not file.is_file():
-        cure = f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}"
-        raise DataError("no manifest.json, so this is not a complete scenario set", file=path, cure=cure)
-    check_seal(file)
-    # A manifest is shorter than the records that it lists.
-    most = _size_on_disk(file.stat(), [shard.stat() for shard in path.glob("shard-*.npy") if shard.is_file()])
-    text = read_bytes(file, AGAIN, min(max(MOST_TEXT, most), _MOST_MANIFEST))
-    with explain_damage(file, AGAIN, "manifest is damaged"):
-        manifest = parse_json(text)
-        version = manifest["schema_version"]
-    if version != SCHEMA_VERSION:
-        is_newer = isinstance(version, int) and version > SCHEMA_VERSION
-        problem = f"schema version {version}, this drivax reads {SCHEMA_VERSION}"
-        raise DataError(problem, file=file, cure="upgrade drivax" if is_newer else AGAIN)
-    with explain_damage(file, AGAIN, "manifest is damaged"):
-        _check_manifest(manifest, file)
-        is_sealed = any("crc_sha256" in shard for shard in manifest["shards"])
-    if is_sealed:  # Sets of earlier versions have neither these digests nor a seal.
-        require_entries(path, MANIFEST)
-    return manifest
-
-
-def _size_on_disk(manifest: os.stat_result, shards: Sequence[os.stat_result]) -> int:
-    """Return the bytes that shards take on the disk: holes of sparse files take none."""
-    # Some network disks report no blocks, not even for the manifest: use the sizes of files there.
-    return sum(shard.st_blocks * 512 if manifest.st_blocks else shard.st_size for shard in shards)
-
-
-def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
-    _check_entries(manifest["shards"], manifest["scenarios"])
-    if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
-        raise DataError("field table is not this version's", file=file, cure=AGAIN)
-
-
-def _check_entries(shards: Sequence[Mapping[str, Any]], scenarios: Sequence[Mapping[str, Any]]) -> None:
-    """Check the names, types and counts of shards and of scenarios."""
-    most = len(scenarios)
-    for number, shard in enumerate(shards):
-        name, count, digest = itemgetter("file", "count", "sha256")(shard)
-        if name != shard_name(number) or type(count) is not int or not 0 <= count <= most:
-            raise ValueError(f"shard {number} is {name!r} with {count!r} of {most} records")
-        if not isinstance(digest, str):
-            raise ValueError(f"shard {number} has no checksum")
-    for number, entry in enumerate(scenarios):
-        SourceCounts(**entry["source"])
-        if any(type(entry[name]) is not kind for name, kind in _ENTRY.items()):
-            raise ValueError(f"scenario {number} has a value of another type")
-
-
-def shard_name(number: int) -> str:
-    """Return the file name of a shard."""
-    return f"shard-{number:05d}.npy"
-
-
-def crc_name(shard: str) -> str:
-    """Return the file name of the checksums of a shard file."""
-    return shard.removesuffix(".npy") + ".crc.npy"
-
-
 def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
     """Write the ``.npy`` header of ``count`` records; its length does not depend on ``count``."""
     # numpy pads headers so that a growing first axis never changes their length (numpy.lib.format).
@@ -581,18 +498,3 @@ def read_header(file: BufferedIOBase, path: Path) -> tuple[tuple[int, ...], np.d
     with explain_damage(path, AGAIN, "header is damaged, not a .npy shard"):
         shape, _, dtype = read_array_header(file)
         return shape, dtype
-
-
-def plain(value: Any) -> Any:
-    """Return a value as strict JSON: NumPy scalars unpacked, paths as text, NaN and infinities as null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value

@@ -26,8 +26,9 @@ from drivax.plugins import check_arguments, check_protocol, dotted_name, find_na
 from drivax.reading import DAMAGE
 
 _UNIONS = (Union, types.UnionType)
-#: Largest numbers of characters, nested levels and values (aliases expanded) of a YAML text.
-_MOST_CHARACTERS, _MOST_LEVELS, _MOST_VALUES = 1 << 20, 64, 50_000
+#: Largest numbers of characters, nested levels and values (aliases expanded) of a YAML text; 100 characters of a text
+#: count as another value, so that messages and checks of names stay short.
+_MOST_CHARACTERS, _MOST_LEVELS, _MOST_VALUES, _TEXT_VALUE = 1 << 20, 64, 50_000, 100
 #: Accepted types of values for each scalar type, and its name in messages.
 _SCALARS: dict[Any, tuple[Any, str]] = {
     bool: (bool, "true or false"),
@@ -447,6 +448,8 @@ class _Loader(yaml.SafeLoader):
             if id(node) not in self._counts:
                 self._refuse("a value that contains itself", event)
             self._count = before + self._counts[id(node)]
+        elif isinstance(event, yaml.ScalarEvent):
+            self._count += len(event.value) // _TEXT_VALUE
         self._counts[id(node)] = self._count - before
         if self._count > _MOST_VALUES:
             self._refuse(f"more than {_MOST_VALUES:,} values", event)
