@@ -1,6 +1,7 @@
 """Pages of results show what is stored, and nothing else."""
 
 import json
+import re
 import types
 
 import numpy as np
@@ -11,6 +12,7 @@ from drivax.learning import TrainConfig
 from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import load_study
 from drivax.tasks.actions import Route
+from drivax.tracking.run_folder import policy_folder, zoo
 from experiment_scripts import load_script
 
 
@@ -112,13 +114,24 @@ def test_distances_are_relative_to_those_of_the_expert(script):
     np.testing.assert_array_equal(benchmark.distance_ratio(driven, expert), [[1.5, np.nan]])
 
 
-def test_planners_along_the_route_are_marked(script, stored):
-    on_route = {
-        name
-        for name in stored("learning")["training"]
-        if isinstance(settings.load(TrainConfig, name, []).task.actions, Route)
-    }
-    assert on_route == set(script("learning.tables").ON_ROUTE)
+def test_planners_along_the_route_are_marked(script, stored, repository):
+    tables, learning = script("learning.tables"), stored("learning")
+
+    def plans_along_route(name, *overrides):
+        return isinstance(settings.load(TrainConfig, name, overrides).task.actions, Route)
+
+    on_route = {name for name in learning["training"] if plans_along_route(name)}
+    assert on_route == set(tables.ON_ROUTE)
+    in_zoo = {name for name in zoo() if plans_along_route(policy_folder(name) / "config.yaml")}
+    assert {name for name in zoo() if tables.label(name).endswith("(route)")} == in_zoo
+    for page in ("learning", "benchmark", "real-files"):
+        text = (repository / "docs" / "results" / f"{page}.md").read_text()
+        # The table of changed definitions has presets of before.
+        blocks = re.findall(r"<!-- \w+\.py: (?!changes|end).*?-->(.*?)<!-- \w+\.py: end -->", text, re.S)
+        rows = [line for block in blocks for line in block.splitlines() if line.startswith("|")]
+        assert len(rows) > 10
+        for row in rows:
+            assert all(f"`{name}` (route)" in row for name in on_route if f"`{name}`" in row), row
 
 
 @pytest.mark.slow
@@ -422,12 +435,15 @@ def test_learning_tables(script, learning):
     rows = [line.split(" | ") for line in lines("reached")]
     assert [row[0] for row in rows[2:]] == ["| `ppo` (route)", "| `idm`", "| `bc`"]
     assert rows[2][1] == "0.850 [0.840, 0.860]" and rows[3][6] == "-"
-    assert lines("differences")[2] == "| ppo - idm | +0.150 [+0.140, +0.160] | +0.005 [-0.005, +0.015] |"
-    assert lines("training")[3] == "| `ppo` | 2 | 1,500 |"
+    assert (
+        lines("differences")[2]
+        == "| `ppo` (route) - `idm` | +0.150 [+0.140, +0.160] | +0.005 [-0.005, +0.015] |"
+    )
+    assert lines("training")[3] == "| `ppo` (route) | 2 | 1,500 |"
     heads, _, mlp, lq, difference = (line.split(" | ") for line in lines("comparison", "encoders"))
     assert heads[:4] == ["| training", "seeds", "core time (s)", "`success`"]
     assert mlp[:4] == ["| `mlp`", "2", "90", "0.500 [0.490, 0.510]"] and lq[2] == "1,800"
-    assert (difference[0], difference[3]) == ("| `lq` - `mlp`", "+0.100 [+0.090, +0.110]")
+    assert (difference[0], difference[3]) == ("| `lq` (route) - `mlp`", "+0.100 [+0.090, +0.110]")
     assert lines("speed")[2] == "| ppo | 9,000 | 25% | 75% |"
     shown = lines("curves", "ppo", "bc")
     assert shown[0] == "![Learning curves of ppo](curve-ppo.png)" and "2 seeds" in shown[2]

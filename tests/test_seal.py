@@ -415,3 +415,12 @@ def test_python_marks_evaluations_of_edited_policies(tmp_path):
     (policy / "run.json").write_text(json.dumps({**info, "edited": ["a/config.yaml"]}))
     seal(policy, "run.json")
     assert evaluate(policy, data).planner == "policy (edited)"
+
+
+def test_planners_along_the_route_are_marked(tmp_path):
+    generate(tmp_path / "set", 1, 0, Generation(workers=0))
+    run = tmp_path / "run"
+    assert main(["evaluate", "--planner", "zoo:sac", "--data", str(tmp_path / "set"), "--out", str(run)]) == 0
+    table = EpisodeTable.read(run)
+    assert table.name == table.planner == table.keys["planner"][0] == "sac (route)"
+    assert "sac (route)" in planners_table([table], ["success"]).csv()

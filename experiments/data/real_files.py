@@ -30,6 +30,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import windows
 from drivax.scenario.schema import STEPS, Scenario
 from drivax.tracking.run_folder import versions, zoo
+from experiments.learning.tables import label
 from experiments.repository import DOCS, RESULTS
 
 RESULT = RESULTS / "real_files.json"
@@ -102,7 +103,7 @@ def tables(result: dict[str, Any]) -> str:
         lines += [
             f"In `{kind}` traffic:",
             "",
-            f"| source | scenario | {' | '.join(f'`{p}`' for p in planners)} |",
+            f"| source | scenario | {' | '.join(map(label, planners))} |",
         ]
         lines.append("|---|---|" + "---|" * len(planners))
         for row, about in enumerate(scenarios):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -34,7 +35,7 @@ from drivax.stats.seeds import difference_interval, seeds_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
-from experiments.learning.tables import interval, label, table
+from experiments.learning.tables import interval, label, label_pair, table
 from experiments.repository import DOCS, RESULTS, ROOT, STATE, fetch
 
 CONFIGS = ROOT / "configs"
@@ -375,7 +376,8 @@ def goals_table(result: Mapping[str, Any]) -> list[str]:
         ]
         words = ("above", "below") if is_interval else ("at least", "at most")
         rows.append([
-            f"{what}: {NAMES[keys[-1]]}",
+            re.sub(r"`(\w+)`", lambda name: label(name[1]), what)
+            + f": {NAMES[keys[-1]]}",
             "" if goal is None else f"{'interval ' * is_interval}{words[not is_more_better]} {goal:g}",
             "" if aim is None else f"{aim:g}",
             interval(measured, signed=keys[0] != "planners", digits=4),
@@ -417,7 +419,7 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
     tables["differences"] = table(
         ("difference", "traffic", *(COLUMNS[metric] for metric in DIFFERENCE_METRICS)),
         [
-            (pair, f"`{kind}`", *format_cells(row, DIFFERENCE_METRICS, signed=True))
+            (label_pair(pair), f"`{kind}`", *format_cells(row, DIFFERENCE_METRICS, signed=True))
             for kind, pairs in result["differences"].items()
             for pair, row in pairs.items()
         ],

@@ -25,8 +25,18 @@ COLUMNS = (
 CURVES = ("success", "vmax_score")
 #: Columns of the tables of trainings that differ in one setting.
 COMPARED = ("success", "accuracy", "at_fault_collision", "offroad", "vmax_score")
-#: Planners that plan along the given route and do not steer, marked in the tables.
+#: Planners that plan along the given route and do not steer, marked in the tables: presets, and variants of ``ppo``.
 ON_ROUTE = ("ppo", "self_play", "sac", "bc_sac", "bc_ppo")
+VARIANTS = (
+    "ppo_21m",
+    "encoder_mlp",
+    "encoder_lq",
+    "encoder_entity",
+    "weights",
+    "constraints",
+    "lq",
+    "selfplay",
+)
 _BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
 
 Result = dict[str, Any]
@@ -65,7 +75,12 @@ def format_block(kind: str, names: list[str], learning: Result, training: Result
 
 def label(name: str) -> str:
     """Return the name of a planner in tables, with a mark if it plans along the route."""
-    return f"`{name}` (route)" if name in ON_ROUTE else f"`{name}`"
+    return f"`{name}` (route)" if name.removeprefix("zoo:") in (*ON_ROUTE, *VARIANTS) else f"`{name}`"
+
+
+def label_pair(pair: str) -> str:
+    """Return the text of a difference ``A - B`` with labels."""
+    return " - ".join(label(name) for name in pair.split(" - "))
 
 
 def results_table(learning: Result) -> list[str]:
@@ -79,7 +94,7 @@ def results_table(learning: Result) -> list[str]:
 def differences_table(learning: Result) -> list[str]:
     """Return a table with a row per pair of planners."""
     rows = [
-        [pair, *(interval(intervals[column], signed=True) for column in CURVES)]
+        [label_pair(pair), *(interval(intervals[column], signed=True) for column in CURVES)]
         for pair, intervals in learning["differences"].items()
     ]
     return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
@@ -88,7 +103,7 @@ def differences_table(learning: Result) -> list[str]:
 def times_table(learning: Result) -> list[str]:
     """Return a table of the training time of each preset."""
     rows = [
-        [f"`{name}`", str(training["seeds"]), f"{training['seconds']:,}"]
+        [label(name), str(training["seeds"]), f"{training['seconds']:,}"]
         for name, training in learning["training"].items()
     ]
     return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
@@ -100,14 +115,14 @@ def comparison_table(trainings: Mapping[str, Any]) -> list[str]:
     rows = []
     for name, training in trainings.items():
         rows.append([
-            f"`{name}`", str(training["seeds"]), f"{training['seconds']:,}",
+            label(name), str(training["seeds"]), f"{training['seconds']:,}",
             *(interval(training["results"][metric]) for metric in COMPARED),
         ])  # fmt: skip
     for name, training in trainings.items():
         if name != first:
             differences = training["differences"]
             cells = (interval(differences[metric], signed=True) for metric in COMPARED)
-            rows.append([f"`{name}` - `{first}`", "", "", *cells])
+            rows.append([label_pair(f"{name} - {first}"), "", "", *cells])
     return table(["training", "seeds", "core time (s)", *(f"`{metric}`" for metric in COMPARED)], rows)
 
 

@@ -44,6 +44,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.table import Cell, Column, Table
+from drivax.tasks.actions import Route
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress as ProgressBar
 from drivax.tracking.run_folder import RunFolder, policy_training_sets
@@ -59,6 +60,9 @@ HEADLINE = {
     "offroad": "off-road", "red_light": "red light", "progress_ratio": "progress", "comfortable": "comfort",
     "vmax_score": "vmax",
 }  # fmt: skip
+#: End of the name of a planner in the action space ``route``, in all tables: it plans along the route, and does not
+#: steer.
+ROUTE_MARK = " (route)"
 Names = Sequence[Mapping[str, str]]
 Progress = Callable[[int, int], None]
 
@@ -355,7 +359,9 @@ class _Evaluation:
         """Tabulate episodes; ``errors`` are the planner's exceptions by identity and step."""
         _check_finite(episodes, names)
         n, traffic = len(names), self.simulator.traffic.name
-        planner = mark_edited(self.planner.name, edited_files())
+        is_route = isinstance(getattr(self.simulator.task, "actions", None), Route)
+        planner = self.planner.name + ROUTE_MARK * is_route
+        planner = mark_edited(planner, edited_files())
         values, crash_step = episodes.metrics, np.asarray(episodes.crashed)
         actions = until_crash(np.asarray(episodes.actions), crash_step, self.start_step)
         in_log = self.start_step + np.arange(actions.shape[1]) < values["last_step"].value[:, None]
