@@ -489,6 +489,19 @@ def test_speed_page_shows_stored_times_of_commands(script, stored):
     assert f"{commands.BEGIN}\n\n{table}\n\n{commands.END}" in commands.PAGE.read_text()
 
 
+def test_pages_show_the_stored_demo(script, stored):
+    demo = script("demo")
+    for page in demo.PAGES:
+        text = page.read_text()
+        assert demo.fill(text, stored("demo")) == text and demo.BEGIN.format("planners") in text
+    by_planner = {one["planner"]: one["metrics"] for one in stored("demo")["summaries"]}
+    assert "policy (route)" in by_planner
+    differences = stored("demo")["policy_minus"]
+    # What the pages say.
+    assert differences["constant_speed"]["success"]["low"] > 0 < differences["idm"]["vmax_score"]["low"]
+    assert differences["idm"]["success"]["low"] < 0 < differences["idm"]["success"]["high"]
+
+
 def test_robustness_page_shows_stored_outcomes(script, stored):
     robustness = script("robustness")
     table = robustness.table(stored("kills"), stored("soak"))

@@ -169,6 +169,7 @@ jax.config.update('jax_num_cpu_devices', len(os.sched_getaffinity(0)))
 """
         + _BANK
         + """
+from drivax.studies import bench
 program = bench.compile_program(ScenarioBank.from_scenarios(first(1024)), bench.BenchConfig())
 def call():
     jax.block_until_ready(program.run())
