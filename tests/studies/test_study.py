@@ -320,7 +320,7 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert (
         results["about"]["test"] == 4 and results["about"]["rare"] == 2
     )  # as many without an event as with one
-    assert list(results["rates"]) == ["expert", "idm", "pdm", *results["draws"]]
+    assert list(results["rates"]) == ["expert", "constant_speed", "idm", "pdm", *results["draws"]]
     assert list(results["draws"]) == ["baseline", "bc", "heuristic", "random_matched"]
     assert results["draws"]["bc"]["effective"] == 1.0
     page = (out / "report.html").read_text()
