@@ -126,6 +126,15 @@ def test_small_files_that_become_large_are_refused(tmp_path, form, options, word
     assert caught.value.file == path and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("end", [b"\x40\x78\x2e", b"\xff\xff\xff\x7e", b"\xff\xff\xff\xff\x00\x00\x40", b""])
+def test_ends_of_a_stream_are_not_lengths(tmp_path, end):
+    """Arrow would take the first four bytes as the length of a message, here up to 2 GB, and allocate it."""
+    path = tmp_path / "a.feather"
+    path.write_bytes(b"\x80\x04\x8e" + bytes(7) + end)
+    with memory_below(5e6), pytest.raises(DataError, match=r"is not a valid table \(a message of odd length"):
+        read_table(path, COLUMNS)
+
+
 def test_columns_are_checked_by_their_place(tmp_path):
     path = small_file_of_150_mb(tmp_path / "a.parquet", compression="zstd", use_dictionary=False)
     head, found, rest = path.read_bytes().rpartition(b"\x04name")

@@ -84,7 +84,9 @@ def _extent(column: Mapping[tuple[int, int], Any]) -> tuple[int, int]:
 def check_messages(source: Any) -> None:
     """Refuse a feather file with too many rows or unpacked bytes; leave ``source`` at the start of its stream."""
     budget, position = _Budget(), _STREAM
-    while position + 8 <= source.size():
+    while left := source.size() - position:
+        if left < 8:  # Arrow would take what is there as a length, and allocate it
+            raise ValueError("a message of odd length")
         source.seek(position)
         mark, length = struct.unpack("<II", source.read(8))
         if mark != _CONTINUES or length > _LONGEST_HEADER:
