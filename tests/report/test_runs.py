@@ -119,20 +119,11 @@ def _start(step):
     return change
 
 
-def _bomb(folder):
-    """Packed, the rows of zeros take a thousandth."""
-    with np.load(folder / "trajectories.npz") as stored:
-        arrays = dict(stored)
-    others = np.zeros((len(arrays["start"]), 80, 5_000, 3), np.int16)
-    np.savez_compressed(folder / "trajectories.npz", **arrays, others=others)
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (_start(-1), "trajectories.npz: cannot be read (an episode begins at step -1)"),
         (_start(40_000), "trajectories.npz: cannot be read (an episode begins at step 40000)"),
-        (_bomb, "more than the "),
         (_remove("run.json"), "not a run folder: no run.json"),
         (_remove("episodes.csv"), "episodes.csv: file not found"),
         (_remove("trajectories.npz"), "trajectories.npz: file not found"),

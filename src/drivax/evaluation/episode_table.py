@@ -53,9 +53,8 @@ _MOST_ROW_BYTES, _MOST_TABLE_BYTES = 1 << 10, 512 << 20
 #: Memory limit of a table, in cells of 8 bytes (1 GB in total): the largest table, of 1.7 million episodes, takes up to
 #: 126 million. A key takes two cells (in a list, then in a tuple), a distinct text ``_TEXT_CELLS``.
 _MOST_CELLS, _TEXT_CELLS = 128 << 20, 16
-#: Size limits of ``trajectories.npz``, bytes: fixed part, and per episode (more than any capacity needs). Beyond the
-#: fixed part, it unpacks to at most this multiple of its size (motions to less than 3 times).
-_MOST_BYTES, _MOST_EPISODE_BYTES, _MOST_RATIO = 16 << 20, 1 << 20, 50
+#: Size limits of ``trajectories.npz``, bytes: fixed part, and per episode (more than any capacity needs).
+_MOST_BYTES, _MOST_EPISODE_BYTES = 16 << 20, 1 << 20
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
@@ -409,9 +408,7 @@ def _read_crashes(path: Path) -> tuple[Crash, ...]:
 def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
     """Read ``trajectories.npz`` in the order of ``scenario_ids``; repeated ids are matched by their order."""
     check_seal(path)
-    packed = path.stat().st_size if path.is_file() else 0
-    most = _MOST_BYTES + min(len(scenario_ids) * _MOST_EPISODE_BYTES, _MOST_RATIO * packed)
-    archive = read_arrays(path, _RERUN, most)
+    archive = read_arrays(path, _RERUN, _MOST_BYTES + len(scenario_ids) * _MOST_EPISODE_BYTES)
     with explain_damage(path, _RERUN, "cannot be read"):
         ids = [_text(value) for value in archive["scenario_id"]]
         ego = archive["ego"].astype(np.float32)

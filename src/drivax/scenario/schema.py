@@ -314,6 +314,8 @@ def find_impossible(record: Any) -> str | None:
         }  # fmt: skip
     for name, (least, most) in bounds.items():
         values = record[name]
+        if not values.size:
+            continue
         # Lists are faster than small arrays, of which most have less than 20 numbers.
         numbers = values.ravel().tolist() if values.size < 20 else (values.min(), values.max())
         if min(numbers) < least or max(numbers) > most:
