@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.learning.tables import interval, table
-from experiments.repository import DOCS, RESULTS, ROOT
+from experiments.repository import DOCS, RESULTS, ROOT, fill_places
 
 PAGES = (DOCS / "results" / "demo.md", ROOT / "README.md")
 COLUMNS = {
     "success": "success", "accuracy": "accuracy", "at_fault_collision": "at-fault collision",
     "offroad": "off the road", "vmax_score": "V-Max score",
 }  # fmt: skip
-BEGIN, END = "<!-- demo.py: {} -->", "<!-- demo.py: end -->"
 
 
 def blocks(result: dict[str, Any]) -> dict[str, list[str]]:
@@ -43,12 +42,7 @@ def blocks(result: dict[str, Any]) -> dict[str, list[str]]:
 
 def fill(text: str, result: dict[str, Any]) -> str:
     """Return the text of a page with the tables in their places."""
-    for name, lines in blocks(result).items():
-        if (begin := BEGIN.format(name)) in text:
-            before, rest = text.split(begin)
-            shown = "\n".join(lines)
-            text = f"{before}{begin}\n\n{shown}\n\n{END}{rest.partition(END)[2]}"
-    return text
+    return fill_places(text, "demo.py", blocks(result))
 
 
 def main() -> None:

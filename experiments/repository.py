@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import tarfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -29,6 +30,18 @@ def fetch(path: str, out: Path) -> Path:
         with tarfile.open(fileobj=io.BytesIO(archive)) as archive_file:
             archive_file.extractall(out, filter="data")
     return out
+
+
+def fill_places(text: str, script: str, tables: Mapping[str, Sequence[str]]) -> str:
+    """Return a page with the lines of each table between the comments ``script: NAME`` and ``script: end``, if any."""
+    end = f"<!-- {script}: end -->"
+    for name, lines in tables.items():
+        begin = f"<!-- {script}: {name} -->"
+        before, found, rest = text.partition(begin)
+        if found:
+            content = "\n".join(lines)
+            text = f"{before}{begin}\n\n{content}\n\n{end}{rest.split(end, 1)[1]}"
+    return text
 
 
 def save_picture(figure: Figure, out: Path) -> None:

@@ -493,7 +493,7 @@ def test_pages_show_the_stored_demo(script, stored):
     demo = script("demo")
     for page in demo.PAGES:
         text = page.read_text()
-        assert demo.fill(text, stored("demo")) == text and demo.BEGIN.format("planners") in text
+        assert demo.fill(text, stored("demo")) == text and "<!-- demo.py: planners -->" in text
     by_planner = {one["planner"]: one["metrics"] for one in stored("demo")["summaries"]}
     assert "policy (route)" in by_planner
     differences = stored("demo")["policy_minus"]

@@ -36,7 +36,7 @@ from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
 from experiments.learning.tables import interval, label, label_pair, table
-from experiments.repository import DOCS, RESULTS, ROOT, STATE, fetch
+from experiments.repository import DOCS, RESULTS, ROOT, STATE, fetch, fill_places
 
 CONFIGS = ROOT / "configs"
 #: Weights of all seeds of the learned planners, and episodes of all planners.
@@ -481,12 +481,7 @@ def format_change(change: Mapping[str, float]) -> str:
 
 def fill_page(text: str, tables: Mapping[str, Sequence[str]]) -> str:
     """Return the page with the lines of each table in its place."""
-    for name, lines in tables.items():
-        begin, end = f"<!-- benchmark.py: {name} -->", "<!-- benchmark.py: end -->"
-        before, rest = text.split(begin)
-        content = "\n".join(lines)
-        text = f"{before}{begin}\n\n{content}\n\n{end}{rest.split(end, 1)[1]}"
-    return text
+    return fill_places(text, "benchmark.py", tables)
 
 
 def main() -> None:

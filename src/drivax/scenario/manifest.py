@@ -103,10 +103,10 @@ def check_entries(shards: Sequence[Mapping[str, Any]], scenarios: Sequence[Mappi
         if not isinstance(digest, str):
             raise ValueError(f"shard {number} has no checksum")
     for number, entry in enumerate(scenarios):
-        texts = (*entry["tags"], *entry["tags"].values(), *entry["flags"])
-        steps = entry["source"]["steps"]
-        if any(type(entry[name]) is not kind for name, kind in _ENTRY.items()) or {*map(type, texts)} - {str}:
+        is_typed = all(type(entry[name]) is kind for name, kind in _ENTRY.items())
+        if not is_typed or {*map(type, (*entry["tags"].values(), *entry["flags"]))} - {str}:
             raise ValueError(f"scenario {number} has a value of another type")
+        steps = entry["source"]["steps"]
         if type(steps) is not int or not 0 <= steps < 1 << 31:
             raise ValueError(f"scenario {number} has {steps!r} steps in its source")
         SourceCounts(**entry["source"])

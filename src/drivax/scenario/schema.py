@@ -319,7 +319,7 @@ def find_impossible(record: Any) -> str | None:
         # Lists are faster than small arrays, of which most have less than 20 numbers.
         numbers = values.ravel().tolist() if values.size < 20 else (values.min(), values.max())
         if min(numbers) < least or max(numbers) > most:
-            return f"{name} is not {least} to {most}"
+            return f"{name} has a number outside {least} to {most}"
     if not 0.0 < time_step < 10.0:
         return f"dt_s is {time_step}"
     return None if blocks == sorted(blocks) else f"segment_blocks are {blocks}"
