@@ -188,6 +188,9 @@ def test_conversion_and_generation_store_further_egos(tmp_path):
         ("dt_s", np.nan), ("segment_blocks", (0, 2, 5, 1 << 30)), ("segment_blocks", (0, 5, 2, 7)),
         ("segment_blocks", (-1, 2, 5, 7)), ("route_lane", -32_768), ("route_points", 32_000), ("light_lane", 500),
         ("road_rows", -3), ("ego_slot", 4_000), ("ego_last_step", 9_000), ("ego_route_lane", -9),
+        ("segment_lane", 10), ("segment_feature", 30_000), ("lane_successor", -2), ("lane_left", 50),
+        ("stop_lane", 50), ("grid_edge", -1), ("grid_lane", 30_000), ("agent_kind", 6), ("segment_kind", 21),
+        ("agent_xy", np.nan), ("route_z", np.inf), ("segment_b", 1e30), ("agent_valid", False),
     ],
 )  # fmt: skip
 def test_records_that_no_scenario_has_are_refused(tmp_path: Path, name: str, value: Any):

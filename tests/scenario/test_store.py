@@ -52,7 +52,7 @@ def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
         if kind == "f":
             record[name] = rng.normal(size=shape)
         elif kind in "iu":
-            record[name] = rng.integers(0, 100, size=shape)
+            record[name] = rng.integers(0, 2, size=shape)  # within the bounds of all fields
         elif kind == "b":
             record[name] = rng.random(shape) < 0.5
     record["scenario_id"] = f"scenario-{number}".encode()
@@ -61,9 +61,7 @@ def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
     record["flags"] = int(Flag.LIGHTS | Flag.ROUTE)
     record["segment_blocks"] = (0, 2, 5, 7)
     record["steps"], record["current_step"], record["dt_s"], record["road_rows"] = capacity.steps, 1, 0.1, 1
-    record["route_points"] %= capacity.route_points
-    for name in ("route_lane", "light_lane"):
-        record[name] %= capacity.lanes
+    record["lane_length"] = 1.0
     source = SourceCounts(5, number, number // 2, {"lane": 3}, 40, 1, {"dangling_links": 2})
     return Scenario(record, capacity, source, {"agents": 2}, {"collision": False}, {"domain": "urban"})
 

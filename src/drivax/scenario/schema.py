@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import enum
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -297,31 +298,57 @@ def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) 
     return np.concatenate(values).reshape(len(values), *values[0].shape)  # faster than np.stack
 
 
+#: Least and largest numbers.
+_AGENT_KINDS, _ROAD_KINDS, _LIGHT_STATES = (0, 5), (-1, 20), (-1, 8)
+
+
+@cache
+def _float_names(dtype: np.dtype[Any]) -> tuple[str, ...]:
+    """Return the names of the fields of floating-point numbers."""
+    return tuple(name for name, field in (dtype.fields or {}).items() if field[0].base.kind == "f")
+
+
 def find_impossible(record: Any) -> str | None:
-    """Return why no scenario has the numbers of a record, or None: those that arrays are sized or indexed by."""
+    """Return why no scenario has the numbers of a record, or None.
+
+    Integers that arrays are sized or indexed by are within bounds, and all other numbers are finite.
+    """
     steps, agents = record["agent_valid"].shape
-    points, last_lane = record["route_lane"].shape[-1], len(record["lane_id"]) - 1
+    points, segments = record["route_lane"].shape[-1], len(record["segment_lane"])
+    last_light = len(record["light_lane"]) - 1
+    lane = (-1, int((record["lane_length"] > 0).nonzero()[0].max(initial=-1)))
     blocks, time_step = record["segment_blocks"].tolist(), float(record["dt_s"])
     bounds = {
         "steps": (1, steps), "current_step": (0, int(record["steps"]) - 1),
-        "road_rows": (0, len(record["road_length"])), "segment_blocks": (0, len(record["segment_lane"])),
-        "route_points": (0, points), "route_lane": (-1, last_lane), "light_lane": (-1, last_lane),
+        "road_rows": (0, len(record["road_length"])), "segment_blocks": (0, segments), "route_points": (0, points),
+        "grid_edge": (0, segments), "grid_lane": (0, segments), "segment_lane": lane, "route_lane": lane,
+        "light_lane": lane, "stop_lane": lane, "lane_successor": lane, "lane_predecessor": lane, "lane_left": lane,
+        "lane_right": lane, "lane_light": (-1, last_light), "segment_feature": (-1, len(record["feature_id"]) - 1),
+        "agent_kind": _AGENT_KINDS, "parked_kind": _AGENT_KINDS, "light_state": _LIGHT_STATES,
+        "lane_kind": _ROAD_KINDS, "segment_kind": _ROAD_KINDS, "feature_kind": _ROAD_KINDS, "road_kind": _ROAD_KINDS,
     }  # fmt: skip
     if "ego_slot" in record.dtype.fields:
         bounds |= {
             "ego_slot": (-1, agents - 1), "ego_last_step": (-1, steps - 1),
-            "ego_route_points": (0, points), "ego_route_lane": (-1, last_lane),
+            "ego_route_points": (0, points), "ego_route_lane": lane,
         }  # fmt: skip
     for name, (least, most) in bounds.items():
         values = record[name]
         if not values.size:
             continue
         # Lists are faster than small arrays, of which most have less than 20 numbers.
-        numbers = values.ravel().tolist() if values.size < 20 else (values.min(), values.max())
+        numbers = values.ravel().tolist() if values.size < 20 else (int(values.min()), int(values.max()))
         if min(numbers) < least or max(numbers) > most:
             return f"{name} has a number outside {least} to {most}"
+    with np.errstate(over="ignore"):
+        for name in _float_names(record.dtype):
+            values = record[name].ravel()
+            if not math.isfinite(values @ values):  # the fastest test; numbers beyond 10^19 are as impossible
+                return f"{name} has a number that is not finite"
     if not 0.0 < time_step < 10.0:
         return f"dt_s is {time_step}"
+    if not record["agent_valid"].any():
+        return "agent_valid has no agent"
     return None if blocks == sorted(blocks) else f"segment_blocks are {blocks}"
 
 
