@@ -14,10 +14,10 @@ from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
 from drivax.learning import loop, training_log
 from drivax.learning.config import TrainConfig
-from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.training_log import patience_exceeded, rank
+from drivax.learning.training_set import TrainingSet
 from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.select import splits
@@ -222,7 +222,7 @@ def test_unsuccessful_scenarios_are_split_by_reason():
 
 
 def test_weights_need_an_offline_algorithm(data, config, tmp_path):
-    weighted = WeightedSet(data, np.ones((3, 91)))
+    weighted = TrainingSet(data, np.ones((3, 91)))
     with pytest.raises(UsageError, match="ToyConfig does not draw logged steps by weight"):
         train(config, weighted, tmp_path / "run", validation=None)
     assert not (tmp_path / "run").exists()
@@ -342,10 +342,10 @@ def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypa
     monkeypatch.setattr(loop, "training_data", note)
     weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
     with pytest.raises(Stop):
-        train(config, WeightedSet(data, weights), tmp_path / "run")
+        train(config, TrainingSet(data, weights), tmp_path / "run")
     ((bank, training_weights),) = calls
     np.testing.assert_array_equal(training_weights, weights[:2])
     jax.tree.map(np.testing.assert_array_equal, bank, ScenarioBank.from_scenarios(data[:2]))
     with pytest.raises(UsageError, match=r"weights of shape \(2, 91\) for 3 scenarios"):
-        train(config, WeightedSet(data, weights[:2]), tmp_path / "run")
+        train(config, TrainingSet(data, weights[:2]), tmp_path / "run")
     assert not (tmp_path / "run").exists()

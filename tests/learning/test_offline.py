@@ -12,14 +12,16 @@ from scipy import special
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
+from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.config import TrainConfig
-from drivax.learning.experience import ExperienceConfig, WeightedSet
+from drivax.learning.experience import ExperienceConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.replay import Transitions
+from drivax.learning.training_set import TrainingSet
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.planner import Planner
@@ -34,6 +36,7 @@ NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 COUNT, ACTIONS = 16, 3
 CQL = CqlConfig(network=NETWORK, batch=COUNT, actions=ACTIONS, gamma=0.9, penalty=2.0)
 IQL = IqlConfig(network=NETWORK, batch=COUNT, gamma=0.9)
+AWAC = AwacConfig(network=NETWORK, batch=COUNT, gamma=0.9)
 TD3_BC = Td3BcConfig(network=NETWORK, batch=COUNT, gamma=0.9)
 
 
@@ -225,6 +228,37 @@ def test_iql_against_numpy(batch, policy_batch):
     assert logs["largest_q"] == pytest.approx(np.abs(result["q"]).max(), rel=1e-4)
 
 
+def test_awac_against_numpy(batch, policy_batch):
+    learner, trained, target = build_learner(replace(AWAC, inverse_temperature=2.0, largest_weight=1.05))
+    (next_keys, policy_keys), keys = step_keys(2)
+    total, logs = losses(learner, trained, target, batch, policy_batch, keys)
+
+    @jax.jit
+    def outputs(trained):
+        following = learner.distribution(trained["policy"], batch.next_observation)
+        there = learner.distribution(trained["policy"], policy_batch[0])
+        then, own = jnp.tanh(draw_raw(following, next_keys)), jnp.tanh(draw_raw(there, policy_keys))
+        return {
+            "target": learner.q_values(target["critic"], batch.next_observation, then),
+            "q": learner.q_values(trained["critic"], batch.observation, batch.action),
+            "logged": learner.q_values(trained["critic"], *policy_batch),
+            "own": learner.q_values(trained["critic"], policy_batch[0], own),
+            "log_prob": there.log_prob(jnp.arctanh(policy_batch[1])),
+        }
+
+    result = to_numpy(outputs(trained))
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["target"].min(axis=0))
+    critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
+    advantage = result["logged"].min(axis=0) - result["own"].min(axis=0)
+    weights = np.minimum(np.exp(2.0 * advantage), 1.05)
+    policy = -(weights * result["log_prob"]).mean()
+    assert 0.0 < logs["weights_cut"] == (weights == 1.05).mean() < 1.0
+    assert logs["critic"] == pytest.approx(critic, rel=1e-4)
+    assert logs["advantage"] == pytest.approx(advantage.mean(), rel=1e-3)
+    assert logs["policy"] == pytest.approx(policy, rel=1e-4)
+    assert total == pytest.approx(critic + policy, rel=1e-4)
+
+
 def test_td3_bc_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3))
     _, keys = step_keys(1)
@@ -256,7 +290,7 @@ def test_td3_bc_against_numpy(batch, policy_batch):
 
 
 @pytest.mark.parametrize(
-    "config", [replace(CQL, gap=1.5, imitation=0.5), IQL, TD3_BC], ids=["cql", "iql", "td3"]
+    "config", [replace(CQL, gap=1.5, imitation=0.5), IQL, AWAC, TD3_BC], ids=["cql", "iql", "awac", "td3"]
 )
 def test_every_loss_reaches_its_own_parameters_only(config, batch, policy_batch):
     learner, trained, target = build_learner(config)
@@ -401,6 +435,7 @@ RESUMED = {
     "td3_bc": replace(TD3_BC, updates=3, normalise=True),
     "cql": replace(CQL, updates=3, gap=1.0, imitation=1.0),
     "iql": replace(IQL, updates=3, records=ExperienceConfig(weighted="policy")),
+    "awac": replace(AWAC, updates=3),
 }
 
 
@@ -456,7 +491,7 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
         "evaluate_every": 2,
     }
     config = settings.load(TrainConfig, values)
-    run = train(config, WeightedSet(data, np.ones((3, 91))), tmp_path / "run", validation=data)
+    run = train(config, TrainingSet(data, np.ones((3, 91))), tmp_path / "run", validation=data)
     rows = [row for row in read_rows(run.metrics) if "validation/mean_q" in row]
     assert len(rows) == 2 and all("validation/vmax_score" in row for row in rows)
     assert rows[0]["sampler/policy_effective"] > 100

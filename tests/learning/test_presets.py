@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from drivax import settings
+from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
@@ -15,7 +16,14 @@ from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
 from drivax.learning.config import TrainConfig
 from drivax.tasks.observations import PRESETS
 
-OFFLINE = {"bc": BcConfig, "cql": CqlConfig, "cql_bc": CqlConfig, "iql": IqlConfig, "td3_bc": Td3BcConfig}
+OFFLINE = {
+    "bc": BcConfig,
+    "cql": CqlConfig,
+    "cql_bc": CqlConfig,
+    "iql": IqlConfig,
+    "awac": AwacConfig,
+    "td3_bc": Td3BcConfig,
+}
 KINDS = {"bc": BcConfig, "sac": SacConfig, "ppo": PpoConfig, "bc_sac": BcSacConfig, "bc_ppo": BcPpoConfig}
 
 

@@ -200,7 +200,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
     for pair in pairs:
         own, control = (
             draw_statistics(
-                ARMS[name].weigh(data, tables.__getitem__, WeightConfig(), usable, seed=3).weights,
+                ARMS[name].weigh(data, tables.__getitem__, WeightConfig(), usable, seed=3),
                 usable,
             )
             for name in pair
@@ -208,7 +208,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
         assert control.effective == pytest.approx(own.effective, rel=0.02), pair
         assert control.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     for name, share in (("oracle", 0.115), ("oracle_strong", 0.3)):
-        weights = ARMS[name].weigh(data, tables.__getitem__, WeightConfig(), usable).weights
+        weights = ARMS[name].weigh(data, tables.__getitem__, WeightConfig(), usable)
         during = weights[tables["oracle"].steps > 0].sum() / weights.sum()
         # Uniform draws also hit events.
         assert during == pytest.approx(share + (1 - share) * (tables["oracle"].steps > 0)[usable].mean())

@@ -73,6 +73,7 @@ COMMANDS = {
     "inspect": Command("summarise, audit and verify scenario sets"),
     "view": Command("browse and play a scenario set on one HTML page"),
     "curate": Command("score how critical each scenario of a set is", overrides=True),
+    "record": Command("record drives of planners to learn from offline", overrides=True),
     "train": Command("train a planner from a configuration file", overrides=True),
     "evaluate": Command("evaluate a planner on a scenario set", overrides=True),
     "judge": Command("evaluate a run again by the rules of another program"),

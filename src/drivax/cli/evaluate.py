@@ -75,10 +75,10 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     select_metrics(metrics)
     if _DEVKIT in args.metrics:
         import_extra("shapely")
-    requested_task = _requested_task(overrides)
+    own_task = requested_task(overrides)
     data = ScenarioSet.open(args.data)
     first = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
-    planner, task = find_planner(args.planner, first.bank, args.sample, requested_task, args.trust_code)
+    planner, task = find_planner(args.planner, first.bank, args.sample, own_task, args.trust_code)
     task = replace(task, conditions=fix_conditions(task.conditions, parse_values(args.condition)))
     config = record_of(EvaluationConfig, args, task=task, metrics=metrics)
     results = run_evaluation(
@@ -95,7 +95,7 @@ def run(args: Evaluate, overrides: Sequence[str] = ()) -> int:
     return 0
 
 
-def _requested_task(overrides: Sequence[str]) -> Task | None:
+def requested_task(overrides: Sequence[str]) -> Task | None:
     """Return the task of ``--task.KEY VALUE`` arguments, or None without any."""
     if not overrides:
         return None

@@ -18,9 +18,9 @@ from drivax.errors import UsageError
 from drivax.escaping import show
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Egos
-from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import use_all_cores, widen_pool
+from drivax.learning.training_set import TrainingSet, read_drives
 from drivax.scenario.store import ScenarioSet
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ class Train:
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
+
+    Example: drivax train offline/iql --data sets/train --drives drives/mixed --out runs/iql-mixed
     """
 
     config: tyro.conf.Positional[str]
@@ -59,6 +61,9 @@ class Train:
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
     """Scenario set for the choice of the best checkpoint. By default, whole recordings of DATA are held out: about a
     tenth of its scenarios (at most 256), or the smallest of several if none fits; `none` trains on all of them."""
+    drives: tuple[Path, ...] = ()
+    """Folders of drivax record, or runs of drivax evaluate, on DATA: bc and offline algorithms learn from these drives
+    instead of the logs."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc, offline algorithms and sac with demonstrations draw logged steps by them."""
     scale: Literal["step", "scenario"] | None = None
@@ -113,30 +118,35 @@ def _validation(name: str) -> ScenarioSet | Literal["held_out"] | None:
     return None if name == "none" else ScenarioSet.open(name)
 
 
-def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
-    """Return the training set, weighted if scores or an arm are given."""
+def _data(args: Train, config: TrainConfig) -> TrainingSet:
+    """Return the training set, with drives if given, weighted if scores or an arm are given."""
     data = ScenarioSet.open(args.data)
+    traffic = config.traffic if isinstance(config.traffic, str) else "mixed"
+    training = TrainingSet(data, drives=read_drives(args.drives, data, config.task, traffic))
     if args.arm is not None:
-        return _arm_data(args, args.arm, config, data)
+        return _arm_data(args, args.arm, config, training)
     if args.scores is not None:
         table = read_scores(args.scores, data)
-        usable = usable_steps(config, data, args.trust_code)
-        return WeightedSet(data, sampling_weights(table, args.weighting, args.scale or "step", usable))
+        usable = usable_steps(config, training, args.trust_code)
+        return replace(
+            training, weights=sampling_weights(table, args.weighting, args.scale or "step", usable)
+        )
     if args.weighting != WeightConfig():
         raise UsageError("--weighting without scores to weight", cure="pass --scores or --arm")
     if args.scale is not None:
         raise UsageError("--scale without scores to weight", cure="pass --scores")
-    return data
+    return training
 
 
-def _arm_data(args: Train, name: str, config: TrainConfig, data: ScenarioSet) -> WeightedSet:
+def _arm_data(args: Train, name: str, config: TrainConfig, training: TrainingSet) -> TrainingSet:
     """Return the training set with the weights of an arm of the long-tail study."""
     from drivax.studies.definition import load_study
 
     arm = load_study("longtail").arms[name]
     _check_arm(args, arm, config)
-    usable = usable_steps(config, data, args.trust_code)
-    return arm.weigh(data, partial(_table, args, config.egos, data), args.weighting, usable, config.seed)
+    usable, data = usable_steps(config, training, args.trust_code), training.scenarios
+    weights = arm.weigh(data, partial(_table, args, config.egos, data), args.weighting, usable, config.seed)
+    return replace(training, weights=weights)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:

@@ -24,8 +24,8 @@ from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
-from drivax.learning.config import check_learnable
-from drivax.learning.driving import Driving, Egos
+from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
+from drivax.learning.driving import Driving, Egos, check_learnable
 from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
@@ -35,7 +35,6 @@ from drivax.learning.experience import (
     sampler,
 )
 from drivax.learning.program import all_finite, trained_leaves
-from drivax.learning.training_log import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig

@@ -8,7 +8,6 @@ from .environment import Environment as Environment
 from .environment import Rollout as Rollout
 from .environment import collect as collect
 from .experience import Experience as Experience
-from .experience import WeightedSet as WeightedSet
 from .experience import sample_steps as sample_steps
 from .loop import TrainOptions as TrainOptions
 from .loop import make_agent as make_agent
@@ -20,3 +19,5 @@ from .policies import load_policy as load_policy
 from .policies import policy_traffic as policy_traffic
 from .replay import ReplayBuffer as ReplayBuffer
 from .replay import ReplayConfig as ReplayConfig
+from .training_set import TrainingSet as TrainingSet
+from .training_set import read_drives as read_drives

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -117,6 +117,15 @@ class HeldOutMetrics(Protocol):
         ...
 
 
+@runtime_checkable
+class HasCritics(Protocol):
+    """A learner that can tell at the end of a run whether its critics are healthy."""
+
+    def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str]:
+        """Return what is wrong with the critics, given the rows of ``metrics.jsonl``; empty if nothing is."""
+        ...
+
+
 def training_data(
     config: AlgorithmConfig, environment: Environment, data: Any, weights: np.ndarray | None = None
 ) -> Any:
@@ -133,6 +142,8 @@ def training_data(
         return experience
     if weights is not None:
         problem = f"{type(config).__name__} does not draw logged steps by weight"
-        cure = "leave out the weights, or use bc, cql, iql, td3_bc, or sac or bc_sac with demonstrations"
+        cure = (
+            "leave out the weights, or use bc, cql, iql, awac, td3_bc, or sac or bc_sac with demonstrations"
+        )
         raise UsageError(problem, cure=cure)
     return data

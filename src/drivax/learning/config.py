@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from drivax.checks import check_at_least
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
+from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
@@ -15,24 +16,23 @@ from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
-from drivax.learning.driving import Driving, Egos
+from drivax.learning.driving import Driving, Egos, check_learnable
 from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.settings.structure import kind_of
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.simulator.types import Traffic
-from drivax.tasks.actions import ActionSpace, DirectState, Trajectory
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder, is_policy, policy_folder, zoo
 
 #: Built-in algorithms by ``kind``, or a configuration of your own.
 Algorithm = (
     PpoConfig | SacConfig | BcConfig | BcPpoConfig | BcSacConfig | CqlConfig | IqlConfig | Td3BcConfig
+    | AwacConfig
     | AlgorithmConfig
 )  # fmt: skip
 
@@ -99,7 +99,7 @@ class TrainConfig:
             raise UsageError("patience needs validations", cure="set evaluate_every")
         fitted_q = isinstance(self.algorithm, OfflineConfig) and self.algorithm.fitted_q.updates > 0
         if self.checkpoint_rule == "fitted_q" and not fitted_q:
-            cure = "set algorithm.fitted_q.updates of cql, iql or td3_bc"
+            cure = "set algorithm.fitted_q.updates of cql, iql, awac or td3_bc"
             raise UsageError("checkpoint_rule fitted_q needs fitted-Q evaluation", cure=cure)
         shares = self.shares.values()
         if len(shares) > MOST_SHARES:
@@ -145,13 +145,6 @@ class TrainConfig:
     def iterations(self) -> int:
         """Number of iterations of the whole run."""
         return -(-self.total_steps // self.algorithm.steps_per_iteration)
-
-
-def check_learnable(actions: ActionSpace) -> None:
-    """Raise UsageError for an action space whose actions are not in [-1, 1]."""
-    if isinstance(actions, DirectState | Trajectory):
-        problem = f"policies cannot learn in {kind_of(type(actions))}"
-        raise UsageError(problem, cure="choose a space in [-1, 1]")
 
 
 def split_traffic(name: str) -> tuple[str | None, str]:

@@ -21,18 +21,19 @@ from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.settings.structure import kind_of
 from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import AgentContext, Frame, SimState
-from drivax.tasks.actions import Discrete, Route
+from drivax.tasks.actions import ActionSpace, DirectState, Discrete, Route, Trajectory
 from drivax.tasks.task import Task
 
 #: Vehicles that the policy drives in training: recorded egos, or any ego of a scenario (``scenario.build.assemble``).
 Egos = Literal["recorded", "moving"]
-#: Number of logs that are replayed in one batch.
-_BATCH = 64
+#: Number of logs, or recorded drives, that are replayed in one batch.
+BATCH = 64
 
 
 def count_egos(egos: Egos, most: int) -> int:
@@ -45,6 +46,13 @@ def count_egos(egos: Egos, most: int) -> int:
         cure = "convert or generate the set with --egos 8"
         raise UsageError("egos is moving, but only the recorded ego of each scenario has a route", cure=cure)
     return 1 if egos == "recorded" else most
+
+
+def check_learnable(actions: ActionSpace) -> None:
+    """Raise UsageError for an action space whose actions are not in [-1, 1]."""
+    if isinstance(actions, DirectState | Trajectory):
+        problem = f"policies cannot learn in {kind_of(type(actions))}"
+        raise UsageError(problem, cure="choose a space in [-1, 1]")
 
 
 @dataclass(frozen=True)
@@ -257,7 +265,7 @@ class Driving:
         """
         egos = count_egos(self.egos, data.most_egos)
         rows = jnp.arange(len(data) * egos)
-        rollouts = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(rows), _BATCH))
+        rollouts = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(rows), BATCH))
         # Zeros before the current step and at the last step, which has no successor.
         action, reward, terminated, truncated, clipped = (
             jnp.pad(values, ((0, 0), (CURRENT_STEP, 1), *((0, 0),) * (values.ndim - 2)))

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
+from drivax.checks import check_above_zero, check_at_most
 from drivax.errors import DataError, UsageError
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
-from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import effective_size
 
 #: Rows (scenarios, or egos of scenarios) and steps.
@@ -32,14 +32,6 @@ StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
 
 _MAX_UINT32 = 2**32 - 1
-
-
-@dataclass(frozen=True)
-class WeightedSet:
-    """Scenarios to train on, with sampling weights of at least 0, ``[M, T]`` (:meth:`ExperienceConfig.of`)."""
-
-    scenarios: ScenarioSet
-    weights: np.ndarray
 
 
 @record
@@ -107,10 +99,11 @@ def check_weights(weights: np.ndarray, scenarios: int, steps: int, egos: int) ->
 
 @record
 class ExpertSteps:
-    """Actions of experts, within the bounds, at T steps of M logs, and their outcome.
+    """Actions of experts, within the bounds, at T steps of M logs (or recorded drives), and their outcome.
 
-    Values of steps that are not ``usable`` are undefined. An action that was ``clipped`` to the bounds does not lead to
-    the next state. ``hold`` is the number of steps per decision (``Task.hold``), ``egos`` that of logs per scenario.
+    Values of steps that are not ``usable`` are undefined. A ``clipped`` action does not lead to the next state: it was
+    clipped to the bounds, or is not at the first step of its decision. ``hold`` is the number of steps per decision
+    (``Task.hold``), ``egos`` that of logs per scenario. ``scenario`` is the scenario of each log, if not in that order.
     """
 
     action: Float[Array, "M T D"]
@@ -121,6 +114,7 @@ class ExpertSteps:
     clipped: Bool[Array, "M T"]
     hold: int = static(default=1)
     egos: int = static(default=1)
+    scenario: Int[Array, " M"] | None = None
 
 
 @runtime_checkable
@@ -181,10 +175,16 @@ class ExperienceConfig:
     Attributes:
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
         weighted: What weights apply to: ``all``, or only the ``policy``, with values learned from uniform steps.
+        best: Share of the drives of each scenario, those with the highest return, to learn from; at least one.
     """
 
     mask_clipped: bool = True
     weighted: Literal["all", "policy"] = "all"
+    best: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "best")
+        check_at_most(self, 1, "best")
 
     def of(self, environment: Environment, data: Any, weights: np.ndarray | None = None) -> Experience:
         """Return the experience in an environment's data, drawn by ``weights`` or uniformly.
@@ -198,6 +198,8 @@ class ExperienceConfig:
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
+        if self.best < 1.0:
+            usable &= _has_high_return(expert, self.best)[:, None]
         if not usable.any():
             if not expert.usable.any():
                 raise DataError("no logged step has an expert action", cure="check the set")
@@ -206,12 +208,32 @@ class ExperienceConfig:
         uniform = sampler(np.asarray(usable, np.float64))
         if weights is None:
             return Experience(data, expert, usable, uniform, uniform)
-        (logs, steps), egos = usable.shape, expert.egos
-        weights = check_weights(weights, logs // egos, steps, egos)
-        by_weight = sampler((np.asarray(usable).reshape(-1, egos, steps) * weights).reshape(logs, steps))
+        by_weight = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
         if self.weighted == "all":
             return Experience(data, expert, usable, uniform, by_weight)
         return Experience(data, expert, usable, uniform, uniform, by_weight)
+
+
+def _has_high_return(expert: ExpertSteps, share: float) -> Bool[np.ndarray, " M"]:
+    """Mask of the ``share`` of the logs (or drives) of each scenario with the highest return, at least one."""
+    returns = np.asarray(jnp.sum(expert.reward * expert.usable, axis=1))
+    count = len(returns)
+    scenario = np.arange(count) // expert.egos if expert.scenario is None else np.asarray(expert.scenario)
+    order = np.lexsort((-returns, scenario))
+    _, first, sizes = np.unique(scenario[order], return_index=True, return_counts=True)
+    rank = np.empty(count, int)
+    rank[order] = np.arange(count) - np.repeat(first, sizes)
+    return rank < np.maximum(share * sizes, 1.0)[np.searchsorted(np.unique(scenario), scenario)]
+
+
+def _weights_of_logs(weights: np.ndarray, expert: ExpertSteps) -> np.ndarray:
+    """Return the weights of scenarios, or of all logs in their order, as those of the logs ``[M, T]``."""
+    (logs, steps), egos = expert.usable.shape, expert.egos
+    if expert.scenario is not None:
+        scenarios = np.asarray(expert.scenario)
+        return check_weights(weights, len(weights), steps, 1)[scenarios, 0]
+    weights = check_weights(weights, logs // egos, steps, egos)
+    return np.broadcast_to(weights, (logs // egos, egos, steps)).reshape(logs, steps)
 
 
 def environment_data(data: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,44 +14,49 @@ import jax
 import numpy as np
 
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk, inside
-from drivax.learning.algorithm import Agent, HeldOutMetrics, LearnerState, training_data
+from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, LearnerState, training_data
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
+from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
+from drivax.learning.drives import Driven
 from drivax.learning.driving import Driving, count_egos
-from drivax.learning.experience import WeightedSet, check_weights
+from drivax.learning.experience import check_weights
 from drivax.learning.mixture import Mixture, training_environment
-from drivax.learning.policies import POLICY_FILE, find_traffic, open_policy
+from drivax.learning.policies import find_traffic
+from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
 from drivax.learning.training_log import (
-    DivergenceError,
     Preempted,
     StopSignal,
     TrainingLog,
     Validation,
-    nonfinite_leaf,
-    nonfinite_log,
     validate,
 )
+from drivax.learning.training_set import TrainingSet, driven_environment, drives_digest, prepare_drives
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, check_lengths
 from drivax.seal import note_edits
 from drivax.settings import modules_of
-from drivax.tracking.checkpoints import Checkpoints, is_part
+from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RUN_FILE, RunFolder, run_and_step, training_sets
+from drivax.tracking.run_folder import RUN_FILE, RunFolder
 
 #: Problem and option to report if an input of the resumed run differs.
 _RESUMED_WITH_OTHER = {
     "validation": ("was validated on other scenarios or none", "--validation"),
     "weights": ("was trained with other weights or none", "weights"),
+    "drives": ("was trained on other drives or none", "--drives"),
     "data": ("was trained on other scenarios", "--data"),
 }
 
 #: Entries of ``run.json`` that the folders of several seeds share.
-_INHERITED_NOTES = ("validation", "weights", "networks_from", "devices")
+_INHERITED_NOTES = ("validation", "weights", "drives", "networks_from", "devices")
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] = ()) -> Any:
@@ -61,7 +66,7 @@ def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] 
     :func:`~drivax.learning.policies.load_policy`, for policies in the traffic.
 
     Raises:
-        UsageError: The algorithm has no parts: bc, cql, iql, td3_bc, and the warm starts bc_ppo and bc_sac.
+        UsageError: The algorithm has no parts: bc, cql, iql, awac, td3_bc, and the warm starts bc_ppo and bc_sac.
     """
     environment = training_environment(config, trust)
     learner = config.algorithm.build(environment, bank, config.iterations)
@@ -97,15 +102,16 @@ class TrainOptions:
 
 @note_edits()
 def train(
-    config: TrainConfig, data: ScenarioSet | WeightedSet, out: str | Path, *,
+    config: TrainConfig, data: ScenarioSet | TrainingSet, out: str | Path, *,
     validation: ScenarioSet | Literal["held_out"] | None = "held_out", **options: Any,
 ) -> RunFolder:  # fmt: skip
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device; ``bc``, offline algorithms, and ``sac`` and ``bc_sac`` with
-            ``demonstrations`` draw logged steps of a weighted set by weight, other algorithms refuse it.
+        data: Scenarios to train on, all held on the device. With weights, ``bc``, offline algorithms, and ``sac`` and
+            ``bc_sac`` with ``demonstrations`` draw logged steps by weight; with drives, ``bc`` and offline algorithms
+            learn from these; other algorithms refuse them.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
             its scenarios (and 256), else the smallest recording; none if there is only one. None trains on all
@@ -122,21 +128,22 @@ def train(
     """
     opts, out, folders = TrainOptions(**options), Path(out), list[RunFolder]()
     trust = (*opts.trust, *modules_of(config))
-    data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
+    training = data if isinstance(data, TrainingSet) else TrainingSet(data)
+    data, drives = training.scenarios, training.drives
     validation_set = _validation_set(data, validation, out, opts.resume)
-    notes = hashes(validation_set, weights)
+    notes = hashes(validation_set, training.weights) | {"drives": drives_digest(drives)}
     if opts.resume:
         config, folders = _resumed_folders(data, notes, out, opts.seeds, trust)
     else:
         RunFolder.check(out, opts.overwrite, "training")
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
-    scenarios, weights, validation_scenarios = _divide(config, data, weights, validation_set)
-    environment, bank = _environment(config, scenarios, trust)
-    learner = config.algorithm.build(environment, bank, config.iterations)
-    held_out = _held_out(config, environment, learner, validation_scenarios)
+    scenarios, weights, validation_scenarios = _divide(config, data, training.weights, validation_set)
+    environment, environment_data = _environment(config, scenarios, trust, drives)
+    learner = config.algorithm.build(environment, environment_data, config.iterations)
+    held_out = _held_out(config, environment, learner, validation_scenarios, drives)
     seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
-    experience = training_data(config.algorithm, environment, bank, weights)
+    experience = training_data(config.algorithm, environment, environment_data, weights)
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
     if opts.resume:
         warn_of_other_bits(folders[0].info, len(program.devices), opts.log)
@@ -195,17 +202,27 @@ def _divide(
     return data, weights, None
 
 
-def usable_steps(config: TrainConfig, data: ScenarioSet, trust: Sequence[str] = ()) -> np.ndarray:
-    """Return the mask ``[M, T]`` of the logged steps that training on a weighted set can draw, for each ego it drives.
+def usable_steps(
+    config: TrainConfig, data: ScenarioSet | TrainingSet, trust: Sequence[str] = ()
+) -> np.ndarray:
+    """Return the mask ``[M, T]`` of the logged steps that training with weights can draw, for each ego it drives.
 
-    ``trust`` is as for :func:`train`.
+    With drives, it holds where any drive of the scenario has such a step. ``trust`` is as for :func:`train`.
 
     Raises:
         UsageError: The algorithm does not draw logged steps by weight.
     """
-    environment, bank = _environment(config, data, trust)
-    experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
-    return np.asarray(experience.usable)
+    training = data if isinstance(data, TrainingSet) else TrainingSet(data)
+    scenarios, steps = training.scenarios, training.scenarios.capacity.steps
+    environment, environment_data = _environment(config, scenarios, trust, training.drives)
+    uniform = np.ones((len(scenarios), steps))
+    experience = training_data(config.algorithm, environment, environment_data, uniform)
+    usable, scenario = np.asarray(experience.usable), experience.expert.scenario
+    if scenario is None:
+        return usable
+    mask = np.zeros((len(scenarios), steps), bool)
+    np.logical_or.at(mask, np.asarray(scenario), usable)
+    return mask
 
 
 def hashes(validation: ScenarioSet | HoldOut | None, weights: np.ndarray | None) -> dict[str, Any]:
@@ -239,7 +256,11 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _held_out(
-    config: TrainConfig, environment: Driving | Mixture, learner: Any, scenarios: Sequence[Scenario] | None
+    config: TrainConfig,
+    environment: Driving | Mixture,
+    learner: Any,
+    scenarios: Sequence[Scenario] | None,
+    drives: Sequence[EpisodeTable],
 ) -> Validation | None:
     """Return the validation on scenarios, with the data of a learner's held-out metrics; None without scenarios."""
     if scenarios is None:
@@ -247,20 +268,33 @@ def _held_out(
     held_out = Validation.of(scenarios)
     if not isinstance(learner, HeldOutMetrics):
         return held_out
-    return replace(held_out, data=training_data(config.algorithm, environment, held_out.bank))
+    data: Any = held_out.bank
+    if isinstance(environment, Driven):
+        data = prepare_drives(environment, held_out.bank, scenarios, drives)
+    return replace(held_out, data=training_data(config.algorithm, environment, data))
 
 
 def _environment(
-    config: TrainConfig, data: Iterable[Scenario], trust: Sequence[str]
-) -> tuple[Driving | Mixture, ScenarioBank]:
-    """Return the environment of a training, and its bank.
+    config: TrainConfig, data: Sequence[Scenario], trust: Sequence[str], drives: Sequence[EpisodeTable] = ()
+) -> tuple[Driving | Mixture, Any]:
+    """Return the environment of a training, and its data: the bank, or recorded drives in it.
 
     Raises:
-        UsageError: ``egos`` is moving, but the set has no further egos.
+        UsageError: ``egos`` is moving, but the set has no further egos; or the training cannot use drives.
     """
     environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
     count_egos(config.egos, bank.most_egos)
-    return environment, environment.prepare(bank)
+    bank = environment.prepare(bank)
+    if not drives:
+        return environment, bank
+    if not isinstance(config.algorithm, OfflineConfig | BcConfig):
+        problem = f"{type(config.algorithm).__name__} does not learn from recorded drives"
+        raise UsageError(problem, cure="leave out the drives, or use bc, cql, iql, awac or td3_bc")
+    if not isinstance(environment, Driving) or config.egos != "recorded":
+        problem = "recorded drives are those of the recorded ego, in one kind of traffic"
+        raise UsageError(problem, cure="leave out egos, and use one traffic")
+    environment = driven_environment(environment, drives)
+    return environment, prepare_drives(environment, bank, data, drives)
 
 
 def _create_folders(
@@ -295,7 +329,7 @@ def _resumed_folders(
     """
     folder = RunFolder.open(out)
     previous = {"data": [entry.get("hash") for entry in folder.info.get("data") or ()]}
-    previous |= {name: folder.info.get(name) for name in ("validation", "weights")}
+    previous |= {name: folder.info.get(name) for name in notes}
     for name, value in {"data": [data.hash], **notes}.items():
         if previous[name] != value:
             problem, option = _RESUMED_WITH_OTHER[name]
@@ -355,9 +389,14 @@ class _Training:
                 if preempted:
                     problem = f"SIGTERM stopped the training after {self._steps(iteration):,} steps"
                     raise Preempted(problem, cure="continue it with --resume")
-        for log in self.logs:
+        for number, log in enumerate(self.logs):
             if log.divergence is not None:
                 raise log.divergence
+            if isinstance(program.seeds.learner, HasCritics):
+                problems = program.seeds.learner.critic_problems(list(log.folder.metric_rows()))
+                log.folder = log.folder.note(critics=problems)
+                for problem in problems:
+                    self.log(f"warning: seed {program.seeds.seeds[number]}: unhealthy critics: {problem}")
 
     def _steps(self, iteration: int) -> int:
         """Return the environment steps of each seed after an iteration."""
@@ -489,111 +528,3 @@ def _healthy_state(checkpoints: Checkpoints, template: Any, step: int) -> Any:
         cure = "start again with --overwrite and a lower learning rate"
         raise DataError(f"checkpoint of step {step}: {problem}", file=checkpoints.folder, cure=cure)
     return state
-
-
-@dataclass(frozen=True)
-class PretrainedRun:
-    """A checkpoint of another run, and the data sets that it was trained on, as in its ``run.json``."""
-
-    run: Path
-    step: int
-    data: list[dict[str, Any]]
-
-    @classmethod
-    def of(cls, name: str) -> PretrainedRun:
-        """Find the checkpoint ``RUN@STEP``; for ``RUN`` the best one, or the newest without validation.
-
-        Raises:
-            UsageError: The folder contains several seeds or an exported policy.
-            DataError: It is not a training run, or has no checkpoint.
-        """
-        run, step = run_and_step(name)
-        folder = open_policy(run)
-        if (folder.path / POLICY_FILE).is_file():
-            problem = "is an exported policy, which cannot be fine-tuned"
-            raise UsageError(problem, file=run, cure="name the training run")
-        if step is None:
-            step = Checkpoints(folder.checkpoints).best_or_newest()
-        if step is None:
-            raise DataError("has no checkpoint", file=run, cure="name a run that wrote one")
-        return cls(Path(run), step, training_sets(folder.info))
-
-    def __str__(self) -> str:
-        return f"{self.run}@{self.step}"
-
-    def notes(self) -> dict[str, Any]:
-        """Return the entry of ``run.json``."""
-        return {"run": str(self.run), "step": self.step, "data": self.data}
-
-    def networks(self, state: Any) -> dict[str, Any]:
-        """Return the stored networks by their paths in the initial state of one seed (or its shapes).
-
-        Networks that the checkpoint lacks are omitted, except ``parameters``. Raises DataError for the first array that
-        is missing or does not fit.
-        """
-        checkpoints = Checkpoints(RunFolder.open(self.run).checkpoints)
-        leaves = [leaf["name"] for leaf in checkpoints.about(self.step)["leaves"]]
-        networks = _networks(state)
-        sources = {path: source for path in networks if (source := _source(path, leaves))}
-        templates = {source: networks[path] for path, source in sources.items()}
-        cure = "start from a run with the same network, observation and actions"
-        restored = checkpoints.restore_parts(templates, self.step, cure)
-        return {path: restored[source] for path, source in sources.items()}
-
-
-def pretrained_networks(name: str | None, program: Program, log: Callable[[str], None]) -> dict[str, Any]:
-    """Return the networks of the run ``RUN`` or ``RUN@STEP`` by their paths in the state, and log them."""
-    if name is None:
-        return {}
-    run = PretrainedRun.of(name)
-    networks = run.networks(program.seeds.member_shapes(program.shapes))
-    log(f"starts from {', '.join(path.removeprefix('.') for path in networks)} of {run}")
-    return networks
-
-
-def initial_state(program: Program, networks: Mapping[str, Any]) -> Any:
-    """Return the initial state of all seeds, with these networks in place of their own."""
-    state, seeds = program.initial_state(), program.seeds
-    if not networks:
-        return state
-    states = [replace_networks(seeds.member(state, number), networks) for number in range(len(seeds.seeds))]
-    return program.state_of(states)
-
-
-def replace_networks(state: Any, networks: Mapping[str, Any], at: str = "") -> Any:
-    """Replace networks of a state, given by their paths."""
-    fields = {
-        name: replace_networks(value, networks, path) if _is_state(value) else networks.get(path, value)
-        for name, path, value in _fields(state, at)
-    }
-    return replace(state, **fields)
-
-
-def _networks(state: Any, at: str = "") -> dict[str, Any]:
-    """Return the networks of a state by their paths."""
-    networks: dict[str, Any] = {}
-    for _, path, value in _fields(state, at):
-        if _is_state(value):
-            networks |= _networks(value, path)
-        elif jax.tree.leaves(value):
-            networks[path] = value
-    return networks
-
-
-def _fields(state: Any, at: str) -> Iterable[tuple[str, str, Any]]:
-    """Yield name, path and value of the fields of a state that hold networks."""
-    for name in getattr(type(state), "networks", ("parameters",)):
-        yield name, f"{at}.{name}", getattr(state, name)
-
-
-def _is_state(value: Any) -> bool:
-    return hasattr(type(value), "networks")
-
-
-def _source(path: str, stored: Iterable[str]) -> str | None:
-    """Return the path of a network in a checkpoint: in the state or in a warm start's learner; None if missing."""
-    name = path[path.rindex(".") :]
-    for source in (name, f".learner{name}"):
-        if any(is_part(leaf, [source]) for leaf in stored):
-            return source
-    return name if name == ".parameters" else None  # restoring reports missing parameters

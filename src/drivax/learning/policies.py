@@ -27,7 +27,9 @@ from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, t
 #: File with the parameters of an exported policy, which has no checkpoints.
 POLICY_FILE = "policy.npz"
 #: Entries of ``run.json`` that an exported policy keeps from its training; only the command may contain paths.
-_PROVENANCE = ("command", "started", "versions", "git", "validation", "step")
+_PROVENANCE = ("command", "started", "versions", "git", "validation", "step", "critics")
+#: Ends the name of a policy whose critics are not healthy (:mod:`drivax.learning.critic_health`).
+_UNHEALTHY = " (unhealthy critics)"
 #: Overrides: parameters do not depend on traffic and starts, and the training's traffic may no longer exist.
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 
@@ -76,7 +78,7 @@ def load_policy(
     def planner(parameters: Any) -> Planner:
         run_name = _name(folder.path)
         name = run_name if step is None else f"{run_name}@{step}"
-        return learner.planner(parameters, name, samples)
+        return learner.planner(parameters, name + _UNHEALTHY * bool(folder.info.get("critics")), samples)
 
     policy_file = folder.path / POLICY_FILE
     if policy_file.is_file():

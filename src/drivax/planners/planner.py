@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,10 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from drivax.errors import UsageError
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
+from drivax.scenario.schema import DT_S
 from drivax.simulator.types import Action, SimState, Situation
 from drivax.tasks.actions import ActionSpace, action_of
+
+#: Correlation time of the noise on actions, s.
+_CORRELATION_S = 1.0
 
 
 @runtime_checkable
@@ -117,6 +123,58 @@ class Held:
             lambda new, old: jnp.where(is_decision_step, new, old), decision, (carry[1], carry[0])
         )
         return action, (inner_carry, action)
+
+
+@record
+class Noisy:
+    """A planner with noise on its actions: Gaussian, with a correlation time of one second, independent by component.
+
+    Attributes:
+        planner: The planner.
+        deviation: Standard deviation of the noise, in units of the action space.
+    """
+
+    planner: Any
+    deviation: float = static()
+    replays: bool = static(default=False)
+
+    @property
+    def name(self) -> str:
+        """Name of the planner, with the deviation."""
+        return f"{self.planner.name} (noise {self.deviation:g})"
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
+        """Return the planner's carry, and the first noise."""
+        planner_key, noise_key = jax.random.split(key)
+        noise = self.deviation * jax.random.normal(noise_key, state.context.action.shape)
+        return self.planner.init(bank, state, planner_key), noise
+
+    def act(
+        self, carry: tuple[Any, Action], bank: ScenarioBank, state: SimState, situation: Situation,
+        observation: Any, key: Array,
+    ) -> tuple[Action, Any]:  # fmt: skip
+        """Return the planner's action with noise, and the carry with the noise of the next step."""
+        planner_key, noise_key = jax.random.split(key)
+        inner_carry, noise = carry
+        action, inner_carry = self.planner.act(inner_carry, bank, state, situation, observation, planner_key)
+        fresh = self.deviation * jax.random.normal(noise_key, noise.shape)
+        # A first-order autoregressive process, whose variance stays constant.
+        kept = math.exp(-DT_S / _CORRELATION_S)
+        return action + noise, (inner_carry, kept * noise + math.sqrt(1.0 - kept**2) * fresh)
+
+
+def add_noise(planner: Planner, deviation: float) -> Planner:
+    """Return a planner with noise of a standard deviation on its actions; 0: the planner.
+
+    Raises:
+        UsageError: The deviation is negative, or the planner replays the log.
+    """
+    if not 0.0 <= deviation < math.inf:
+        raise UsageError(f"noise is {deviation:g}", cure="use 0 or more")
+    if deviation and planner.replays:
+        problem = f"planner {planner.name} replays the log, and has no actions to disturb"
+        raise UsageError(problem, cure="use expert_actions")
+    return Noisy(planner, deviation) if deviation else planner
 
 
 def hold(planner: Planner, steps: int) -> Planner:

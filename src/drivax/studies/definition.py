@@ -22,7 +22,6 @@ from drivax.curation.weights import Scale, WeightConfig, permute_scores, samplin
 from drivax.errors import UsageError, did_you_mean
 from drivax.files import inside
 from drivax.learning.config import TrainConfig
-from drivax.learning.experience import WeightedSet
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.store import ScenarioSet
@@ -54,8 +53,8 @@ class Arm:
     def weigh(
         self, data: ScenarioSet, tables: Tables, config: WeightConfig, usable: np.ndarray | None = None,
         seed: int = 0,
-    ) -> WeightedSet:  # fmt: skip
-        """Return a set with the sampling weights of the arm.
+    ) -> np.ndarray:  # fmt: skip
+        """Return the sampling weights of the steps of a set in the arm, ``[M, T]``.
 
         Args:
             data: The set.
@@ -79,7 +78,7 @@ class Arm:
             )
         if self.permuted:
             table = permute_scores(table, seed, usable)
-        return WeightedSet(data, sampling_weights(table, self.weights or config, self.scale, usable))
+        return sampling_weights(table, self.weights or config, self.scale, usable)
 
 
 @dataclass(frozen=True)

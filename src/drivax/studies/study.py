@@ -31,10 +31,10 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.files import inside, write_json
 from drivax.learning.config import TrainConfig
-from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import hashes, train, usable_steps
 from drivax.learning.policies import load_policy
 from drivax.learning.training_log import rank
+from drivax.learning.training_set import TrainingSet
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -73,7 +73,7 @@ class Job:
     usable: Bool[np.ndarray, "M T"]
     edited: bool = False
 
-    def training_set(self) -> WeightedSet:
+    def training_set(self) -> TrainingSet:
         """Return the training set with the arm's weights."""
         data = ScenarioSet.open(self.study.sets.train)
 
@@ -81,7 +81,7 @@ class Job:
             return read_scores(self.study.scores(method), data)
 
         arm, config = self.study.arms[self.arm], self.study.config
-        return arm.weigh(data, table, config.weights, self.usable, self.seed)
+        return TrainingSet(data, arm.weigh(data, table, config.weights, self.usable, self.seed))
 
 
 def run_study(
@@ -418,7 +418,7 @@ def _results(
     episodes |= {arm: _episodes(study, arm) for arm in study.arms}
     baseline = definition.baselines[0]
     weights = {
-        name: arm.weigh(data, tables.__getitem__, study.config.weights, usable).weights
+        name: arm.weigh(data, tables.__getitem__, study.config.weights, usable)
         for name, arm in study.arms.items()
     }
     return {

@@ -41,7 +41,7 @@ _RERUN = "run the command again"
 _ENTRIES: dict[str, Any] = {
     **dict.fromkeys(("kind", "planner", "traffic", "started", "command", "weights"), str),
     **dict.fromkeys(("own_metrics", "networks_from", "versions", "divergence"), dict), "data": list | dict,
-    **dict.fromkeys(("trained_on", "edited"), list),
+    **dict.fromkeys(("trained_on", "edited", "critics"), list),
     **dict.fromkeys(("seeds", "seed", "devices", "episodes"), int),
     "validation": str | dict, "sealed": bool,
 }  # fmt: skip

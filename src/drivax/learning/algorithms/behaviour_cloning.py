@@ -17,6 +17,7 @@ from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
+from drivax.learning.drives import Drives
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
@@ -136,10 +137,20 @@ class Cloning:
 
 @dataclass(frozen=True)
 class BcConfig(Cloning):
-    """Behaviour cloning: supervised learning of the expert's actions at random steps of the logs."""
+    """Behaviour cloning: supervised learning of the expert's actions at random steps of the logs.
+
+    Attributes:
+        best: Share of the recorded drives of each scenario, those with the highest return, to clone (filtered BC).
+    """
 
     kind: Literal["bc"] = "bc"
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    best: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above_zero(self, "best")
+        check_at_most(self, 1, "best")
 
     @property
     def steps_per_iteration(self) -> int:
@@ -147,10 +158,11 @@ class BcConfig(Cloning):
         return self.batch * self.updates
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the data, whose ``demonstrations`` are drawn, or experience drawn by weight."""
+        """Return the data, whose ``demonstrations`` are drawn, or experience drawn by weight or of recorded drives."""
+        if weights is None and not isinstance(data, Drives):
+            return data
         # The loss masks clipped steps, and logs their share.
-        config = ExperienceConfig(mask_clipped=False)
-        return data if weights is None else config.of(environment, data, weights)
+        return ExperienceConfig(mask_clipped=False, best=self.best).of(environment, data, weights)
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Bc:
         """Return behaviour cloning in an environment."""

@@ -1,4 +1,4 @@
-"""Base of off-policy algorithms, online (SAC) and offline (CQL, IQL, TD3+BC): policy, twin critics, and one update."""
+"""Base of off-policy algorithms, online (SAC) and offline (CQL, IQL, ...): policy, twin critics, and one update."""
 
 from __future__ import annotations
 

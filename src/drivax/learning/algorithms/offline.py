@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,9 @@ from drivax.learning.algorithms.off_policy import (
     squared_error,
 )
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam, mean_gradients
+from drivax.learning.critic_health import critic_problems, policy_returns, rank_correlation, returns_to_go
+from drivax.learning.drives import Drives
+from drivax.learning.driving import Driving
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
@@ -319,21 +322,69 @@ class Offline(OffPolicy[Config]):
         return feature_statistics(jax.lax.map(observe, index))
 
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
-        """Return ``mean_q``: the smaller critic's value of the policy's mode over a fixed set of held-out steps.
+        """Return metrics of the critics on held-out data.
 
-        Overestimation raises ``mean_q``. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates.
+        ``mean_q`` is the smaller critic's value of the policy's mode over a fixed set of steps; overestimation raises
+        it. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates. In driving with decisions of one
+        step, ``q_error`` is the root mean square error of the smaller Q from simulated returns of the policy, in
+        standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out drives.
         """
-        metrics = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
+        policy, critic = state.parameters, state.rest["critic"]
+        metrics = {"mean_q": float(self._mean_q(data, policy, critic))}
         if self.config.fitted_q.updates:
-            metrics["fitted_q"] = float(self._fitted_q(data, state.parameters))
+            metrics["fitted_q"] = float(self._fitted_q(data, policy))
+        environment = self.environment
+        if isinstance(environment, Driving) and environment.task.hold == 1:
+            q, returns = np.asarray(self._policy_returns(data, policy, critic))
+            metrics["q_error"] = float(np.sqrt(np.mean((q - returns) ** 2)) / max(returns.std(), 1e-9))
+            metrics["q_rank"] = rank_correlation(*np.asarray(self._drive_returns(data, policy, critic)))
         return metrics
+
+    def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str]:
+        """Return what is wrong with the critics of a finished run, given the rows of its log."""
+        return critic_problems(rows, getattr(self, "target_entropy", None))
+
+    def smaller_q(
+        self, critic: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
+    ) -> Float[Array, "*actions"]:
+        """Return the smaller of both critics' values."""
+        return jnp.min(self.q_values(critic, observation, action), axis=0)
+
+    def _policy_value(self, policy: Any, critic: Any, observation: dict[str, Array]) -> Float[Array, " B"]:
+        """Return the smaller critic's value of the policy's mode."""
+        return self.smaller_q(critic, observation, self.distribution(policy, observation).mode())
+
+    @partial(jax.jit, static_argnums=0)
+    def _policy_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 N"]:
+        """Return Q of the first states of all scenarios, and the simulated returns of the policy from there."""
+        bank = data.data.bank if isinstance(data.data, Drives) else data.data
+        returns, discount, first, final = policy_returns(
+            cast(Driving, self.environment),
+            bank,
+            lambda o: self.distribution(policy, o).mode(),
+            self.config.gamma,
+        )
+        value = partial(self._policy_value, policy, critic)
+        return jnp.stack([value(first), returns + discount * value(final)])
+
+    @partial(jax.jit, static_argnums=0)
+    def _drive_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 B"]:
+        """Return Q of a fixed set of held-out steps, and the returns of their drives from there."""
+        environment, expert = require_log(self.environment), data.expert
+        rows, last = jnp.arange(len(expert.usable)), expert.usable.shape[1] - 1
+        final = jnp.minimum(last - jnp.argmax(expert.usable[:, ::-1], axis=1) + 1, last)
+        observe = partial(environment.observe_recorded, data.data)
+        final_value = self._policy_value(policy, critic, observe((rows, final)))
+        index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES,))
+        q = self.smaller_q(critic, observe(index), expert.action[index])
+        returns = returns_to_go(expert, final_value, self.config.gamma)
+        return jnp.stack([q, returns[index]])
 
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
         index = sample_steps(data.critic, jax.random.key(0), (_SAMPLES,))
         observation = require_log(self.environment).observe_recorded(data.data, index)
-        action = self.distribution(policy, observation).mode()
-        return jnp.mean(jnp.min(self.q_values(critic, observation, action), axis=0))
+        return jnp.mean(self._policy_value(policy, critic, observation))
 
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:

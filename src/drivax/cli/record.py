@@ -1,0 +1,141 @@
+"""``drivax record``: record drives of several planners, to learn from offline."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from drivax.api import as_traffic, find_planner, load
+from drivax.checks import check_at_least
+from drivax.cli import record_of
+from drivax.cli.evaluate import requested_task
+from drivax.escaping import show
+from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
+from drivax.files import replace_folder
+from drivax.planners.catalogue import PLANNERS
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.store import ScenarioSet
+from drivax.tasks.conditions import fix_conditions
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.run_folder import RunFolder, is_policy, run_and_step
+
+#: Planners and noise of the mixtures, named like those of D4RL (Fu et al. 2020, arXiv 2004.07219).
+MIXTURES: dict[str, tuple[tuple[str, float], ...]] = {
+    "medium": (("zoo:bc", 0.0), ("zoo:bc", 0.2)),
+    "mixed": (
+        ("pdm", 0.0), ("idm", 0.0), ("idm", 0.3), ("constant_speed", 0.2), ("zoo:bc", 0.0), ("zoo:aggressive", 0.0),
+    ),
+}  # fmt: skip
+#: Ends the name of a training run of which all checkpoints drive: the mixture ``replay`` of D4RL.
+_ALL = "@all"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordConfig:
+    """Configuration of a recording, stored as ``config.yaml``.
+
+    Attributes:
+        noise: Standard deviations of noise on the actions of each planner; mixtures have their own.
+        seeds: Number of drives of each kind per scenario, with different noise and samples.
+        seed: First seed.
+        sample: Let trained policies sample their actions instead of taking the mode.
+        traffic: Traffic model, as for drivax evaluate; training must have the same.
+        start_step: Step of the log at which drives start.
+        filter: Only scenarios that meet this condition; repeat it to combine several.
+        limit: Only the first N scenarios that remain after filtering.
+    """
+
+    planners: tuple[str, ...]
+    noise: tuple[float, ...] = (0.0,)
+    seeds: int = 1
+    seed: int = 0
+    sample: bool = False
+    traffic: str = "log"
+    start_step: int = CURRENT_STEP
+    filter: tuple[str, ...] = ()
+    limit: int | None = None
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "seeds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(RecordConfig):
+    """Record drives of planners on every scenario of a set, failures included, for offline learning.
+
+    PLANNER is that of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium (a clone,
+    without and with noise) or mixed (pdm, idm without and with noise, a clone, an aggressive driver, and one that
+    ignores traffic). --task.KEY VALUE changes settings of the task of planners that are not trained.
+
+    OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --drives OUT learns from them.
+
+    Example: drivax record mixed --data sets/train --out drives/mixed
+
+    Example: drivax record idm pdm runs/ppo@all --noise 0 0.3 --data sets/train --out drives/all
+    """
+
+    planners: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PLANNER")]
+    """Planners and mixtures."""
+    data: Path
+    """Scenario set."""
+    out: Path
+    """Folder to write."""
+    filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
+    """Run code of this module of yours that a trained policy names; repeat it to trust several."""
+    overwrite: bool = False
+    """Replace OUT if it is an earlier recording."""
+
+
+def run(args: Record, overrides: Sequence[str] = ()) -> int:
+    """Record all drives, then print their headline metrics."""
+    RunFolder.check(args.out, args.overwrite, "drives")
+    traffic, task = as_traffic(args.traffic, args.trust_code), requested_task(overrides)
+    data, summaries = ScenarioSet.open(args.data), []
+    first = load(args.data, 1, filters=args.filter)
+    seeds = range(args.seed, args.seed + args.seeds)
+    kinds = itertools.product(dict.fromkeys(_drivers(args.planners, args.noise)), seeds)
+    with replace_folder(args.out) as partial_folder:
+        RunFolder.create(partial_folder, record_of(RecordConfig, args), [data], overwrite=True, kind="drives")
+        for number, ((name, noise), seed) in enumerate(kinds):
+            is_trained = is_policy(run_and_step(name)[0], PLANNERS)
+            planner, own_task = find_planner(
+                name, first.bank, args.sample and is_trained, None if is_trained else task, args.trust_code
+            )
+            config = EvaluationConfig(
+                planner=name,
+                traffic=args.traffic,
+                start_step=args.start_step,
+                filter=args.filter,
+                limit=args.limit,
+                seed=seed,
+                sample=args.sample and is_trained,
+                noise=noise,
+                task=replace(own_task, conditions=fix_conditions(own_task.conditions)),
+            )
+            text = re.sub(r"[^\w.]+", "-", name)[-40:]
+            out = partial_folder / f"{number:02d}-{text}"
+            table = run_evaluation(config, planner, data, out, traffic=traffic, sizes=first.sizes)
+            summaries.append(table.summary())
+    show(format_summary(summaries))
+    show(f"wrote {args.out}")
+    return 0
+
+
+def _drivers(planners: Sequence[str], noise: Sequence[float]) -> Iterator[tuple[str, float]]:
+    """Yield planner and noise of every kind of drive."""
+    for name in planners:
+        if name in MIXTURES:
+            yield from MIXTURES[name]
+        elif name.endswith(_ALL):
+            run = name.removesuffix(_ALL)
+            steps = Checkpoints(RunFolder.open(run).checkpoints).steps()
+            yield from itertools.product([f"{run}@{step}" for step in sorted(steps)], noise)
+        else:
+            yield from itertools.product([name], noise)

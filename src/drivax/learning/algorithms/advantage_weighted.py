@@ -1,0 +1,63 @@
+"""Base of algorithms whose policy imitates logged actions, weighted by the exponential of their advantage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drivax.checks import check_above_zero, check_at_least
+from drivax.learning.algorithms.off_policy import Trained
+from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
+from drivax.rl.equations import advantage_weights
+
+
+@dataclass(frozen=True)
+class AdvantageWeightedConfig(OfflineConfig):
+    """Settings of advantage-weighted imitation.
+
+    Attributes:
+        inverse_temperature: ``beta`` of the imitation weights ``exp(beta A)``; 0: uniform weights.
+        largest_weight: Upper bound of the weights.
+        loss: Imitation loss: ``likelihood``, as published, or ``mse`` of the mode, in action units.
+    """
+
+    inverse_temperature: float = 3.0
+    largest_weight: float = 100.0
+    loss: Literal["likelihood", "mse"] = "likelihood"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, 0, "inverse_temperature")
+        check_above_zero(self, "largest_weight")
+        if self.loss == "mse":
+            self.check_gradient()
+
+
+Config = TypeVar("Config", bound=AdvantageWeightedConfig)
+
+
+class AdvantageWeighted(Offline[Config]):
+    """An advantage-weighted algorithm in one environment."""
+
+    def imitation(
+        self, trained: Trained, policy_batch: PolicyBatch, advantage: Float[Array, " B"]
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the imitation loss, and values to log, given the advantages of the logged actions."""
+        config, (observation, expert) = self.config, policy_batch
+        weights = advantage_weights(advantage, config.inverse_temperature, config.largest_weight)
+        policy = self.distribution(trained["policy"], observation)
+        error = policy.mode() - expert
+        is_mse = config.loss == "mse"
+        loss = jnp.mean(error**2, axis=-1) if is_mse else -policy.log_prob(policy.raw_action(expert))
+        imitation = jnp.mean(weights * loss)
+        return imitation, {
+            "policy": imitation,
+            "advantage": jnp.mean(advantage),
+            "weight": jnp.mean(weights),
+            # With a margin, because exponential and logarithm round.
+            "weights_cut": jnp.mean(weights >= 0.999 * config.largest_weight),
+            "imitation_error": jnp.mean(jnp.abs(error)),
+        }

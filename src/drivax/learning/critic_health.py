@@ -1,0 +1,115 @@
+"""Health of critics: whether Q values are returns, rank drives by their return, and have converged.
+
+Q values that diverge, or that only fit the data, still train a policy: in effect an imitation. Each validation of an
+offline run in driving compares the critics with simulated returns of the present policy, and with returns of held-out
+drives; the end of the run names what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from drivax.learning.driving import Driving, keep
+from drivax.learning.experience import ExpertSteps
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.simulator import Simulator
+
+#: Largest root mean square error of Q, in standard deviations of the simulated returns.
+MOST_Q_ERROR = 0.5
+#: Least rank correlation (Spearman) of Q with the returns of held-out drives.
+LEAST_Q_RANK = 0.5
+#: Largest mean TD error of the last quarter of a run relative to the quarter before it.
+MOST_TD_RISE = 1.05
+#: Largest distance of the entropy from its target over the last quarter of a run, nats.
+MOST_ENTROPY_ERROR = 0.5
+
+Observation = dict[str, Array]
+
+
+def policy_returns(
+    environment: Driving, bank: ScenarioBank, act: Callable[[Observation], Array], gamma: float
+) -> tuple[Float[Array, " N"], Float[Array, " N"], Observation, Observation]:
+    """Drive a policy in all scenarios from the current step to the end of the episode.
+
+    Returns:
+        Discounted return; ``gamma^n`` of the final state after n steps, 0 where the episode terminated; and the
+        observations of the first and the final states. The return of an endless episode is their return plus that power
+        of ``gamma`` times the final state's value.
+    """
+    simulator = Simulator(replace(environment.task, metrics="none"), environment.simulator.traffic)
+    state = jax.vmap(partial(simulator.reset, bank))(jnp.arange(len(bank)))
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:
+        state, over, value, discount = carry
+        action = act(environment.observe_all(bank, state.context))
+        after, result = jax.vmap(simulator.step, (None, 0, 0))(bank, state, action)
+        value = value + jnp.where(over, 0.0, discount * result.reward)
+        discount = jnp.where(over, discount, jnp.where(result.terminated, 0.0, gamma * discount))
+        return (keep(over, state, after), over | result.terminated | result.truncated, value, discount), None
+
+    over, value = jnp.zeros(len(bank), bool), jnp.zeros(len(bank))
+    first = environment.observe_all(bank, state.context)
+    carry = (state, over, value, jnp.ones(len(bank)))
+    (state, _, value, discount), _ = jax.lax.scan(step, carry, None, bank.steps - 1 - CURRENT_STEP)
+    return value, discount, first, environment.observe_all(bank, state.context)
+
+
+def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: float) -> Float[Array, "M T"]:
+    """Return the discounted return of recorded drives from each usable step on; elsewhere it is undefined.
+
+    ``final_value`` is the value of the state in which a drive ends without termination.
+    """
+
+    def step(value: Array, step_t: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        reward, terminated, usable = step_t
+        value = jnp.where(usable, reward + gamma * jnp.where(terminated, 0.0, value), value)
+        return value, value
+
+    columns = (steps.reward.T, steps.terminated.T, steps.usable.T)
+    return jax.lax.scan(step, final_value, columns, reverse=True)[1].T
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Spearman's rank correlation; NaN if either is constant."""
+    from scipy.stats import spearmanr
+
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return float("nan")
+    return float(spearmanr(a, b)[0])
+
+
+def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str]:
+    """Return what is wrong with the critics of a finished run, given the rows of its ``metrics.jsonl``.
+
+    ``entropy`` is the policy's target entropy, None for a policy without one. Checks without values are left out.
+    """
+    problems = []
+    td_error = _column(rows, "loss/critic")
+    third, last = (td_error[len(td_error) * k // 4 : len(td_error) * (k + 1) // 4] for k in (2, 3))
+    if len(third) and last.mean() > MOST_TD_RISE * third.mean():
+        problems.append(
+            f"the TD error rises over the second half, from {third.mean():.3g} to {last.mean():.3g}"
+        )
+    errors, ranks = _column(rows, "validation/q_error"), _column(rows, "validation/q_rank")
+    if len(errors) and errors[-1] > MOST_Q_ERROR:
+        problems.append(f"Q is off by {errors[-1]:.2f} standard deviations of the policy's returns")
+    if len(ranks) and not ranks[-1] >= LEAST_Q_RANK:
+        problems.append(f"Q has a rank correlation of {ranks[-1]:.2f} with the returns of held-out drives")
+    entropies = _column(rows, "loss/entropy")
+    entropies = entropies[len(entropies) * 3 // 4 :]
+    if entropy is not None and len(entropies) and abs(entropies.mean() - entropy) > MOST_ENTROPY_ERROR:
+        problems.append(f"the entropy is {entropies.mean():.2f}, its target {entropy:.2f}")
+    return problems
+
+
+def _column(rows: Sequence[Mapping[str, float]], name: str) -> np.ndarray:
+    return np.array([row[name] for row in rows if name in row], np.float64)

@@ -1,0 +1,124 @@
+"""Recorded drives: evaluations of any drivers, as logged steps that offline algorithms learn from.
+
+An evaluation stores the motion and the executed actions of its driver. Before training, every drive is replayed once,
+with the rewards and episode ends of the training. Only what observations depend on is kept: some 60 bytes per step in
+log traffic, more in reactive traffic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.learning.driving import BATCH, Driving
+from drivax.learning.experience import ExpertSteps, StepIndex
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import HISTORY, AgentContext
+from drivax.tasks.actions import Route
+
+
+@record
+class Drives:
+    """M drives in the scenarios of a bank, at T steps of the log.
+
+    Attributes:
+        bank: The scenarios.
+        contexts: Fields of the context (:class:`~drivax.simulator.types.AgentContext`) at these steps, ``[M, T, ...]``,
+            without its ``history``.
+        motion: x, y, heading, speed at these steps, and at the ``HISTORY - 1`` steps before the first.
+        steps: Actions of the drivers and their outcome.
+    """
+
+    bank: ScenarioBank
+    contexts: dict[str, Any]
+    motion: Float[Array, "M times 4"]
+    steps: ExpertSteps
+
+
+@dataclass(frozen=True)
+class Driven(Driving):
+    """Recorded drives as an environment of logged steps; its data are :class:`Drives`."""
+
+    start_step: int = 0
+
+    def shapes(self, data: Any) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each group of one observation."""
+        return super().shapes(data.bank)
+
+    def expert_steps(self, data: Any) -> ExpertSteps:
+        """Return the steps of the drives."""
+        return data.steps
+
+    def observe_recorded(self, data: Any, index: StepIndex) -> dict[str, Array]:
+        """Observe recorded steps."""
+        row, step = index
+        values = jax.tree.map(lambda leaf: leaf[row, step], data.contexts)
+        history = data.motion[row[..., None], step[..., None] + jnp.arange(HISTORY)]
+        return self.observe_all(data.bank, AgentContext(**values, history=history))
+
+    def replay(
+        self, bank: ScenarioBank, drive: tuple[Int[Array, ""], Float[Array, "S 4"], Float[Array, "S1 D"]]
+    ) -> tuple[dict[str, Any], Float[Array, "times 4"], tuple[Array, ...]]:
+        """Replay a drive: return contexts and motion from ``start_step`` on, and action, reward and ends of its steps.
+
+        The first motion is that of the log.
+        """
+        index, motion, action = drive
+        simulator = Simulator(replace(self.task, metrics="none"), self.simulator.traffic)
+        initial = simulator.reset(bank, index, self.start_step)
+
+        def step(state: Any, drive: tuple[Array, Array]) -> tuple[Any, tuple[Any, ...]]:
+            motion, action = drive
+            after, result = simulator.replay(bank, state, motion, action)
+            space = self.task.actions
+            # In the space ``route``, the executed action is not in the space of the requested one.
+            if isinstance(space, Route):
+                action = jnp.clip(space.unsteer(bank, state.context, action), -1.0, 1.0)
+            outcome = (action, result.reward, result.terminated, result.truncated)
+            return after, (_without_history(state.context), outcome)
+
+        final, (contexts, outcome) = jax.lax.scan(step, initial, (motion[1:], action))
+        last = jax.tree.map(lambda leaf: leaf[None], _without_history(final.context))
+        contexts = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), contexts, last)
+        return contexts, jnp.concatenate([initial.context.history[:-1], motion]), outcome
+
+
+def _without_history(context: AgentContext) -> dict[str, Any]:
+    return {field.name: getattr(context, field.name) for field in fields(context) if field.name != "history"}
+
+
+@partial(jax.jit, static_argnums=0)
+def replay_drives(
+    environment: Driven, bank: ScenarioBank, index: Int[Array, " M"], motion: Float[Array, "M S 4"],
+    action: Float[Array, "M S1 D"], is_logged: Bool[Array, " M"],
+) -> Drives:  # fmt: skip
+    """Replay all drives, in batches."""
+    finite = jnp.isfinite(action).all(axis=-1)
+    action = jnp.where(finite[..., None], action, 0.0)
+    replay = partial(environment.replay, bank)
+    contexts, motion, outcome = jax.lax.map(
+        replay, (index, motion, action), batch_size=min(len(index), BATCH)
+    )
+    start = environment.start_step
+
+    def pad(values: Array, last: int = 0) -> Array:
+        """Pad by zeros before the start, and at the last step, which has no successor."""
+        return jnp.pad(values, ((0, 0), (start, last), *((0, 0),) * (values.ndim - 2)))
+
+    action, reward, terminated, truncated = (pad(values, 1) for values in outcome)
+    ends, time = terminated | truncated, jnp.arange(action.shape[1])
+    over = jnp.cumsum(ends, axis=1) > ends
+    is_decision = (time - start) % environment.task.hold == 0
+    usable = pad(finite, 1) & ~over & (time >= start)
+    clipped = ~is_decision | (is_logged[:, None] & (jnp.abs(action) >= 1.0).any(axis=-1))
+    steps = ExpertSteps(
+        action, reward, terminated, truncated, usable, clipped, environment.task.hold, scenario=index
+    )
+    return Drives(bank, jax.tree.map(pad, contexts), pad(motion), steps)
