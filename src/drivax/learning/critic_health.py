@@ -78,15 +78,6 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
     return jax.lax.scan(step, final_value, columns, reverse=True)[1].T
 
 
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return Spearman's rank correlation; NaN if either is constant."""
-    from scipy.stats import rankdata
-
-    if np.ptp(a) == 0 or np.ptp(b) == 0:
-        return float("nan")
-    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
-
-
 def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str]:
     """Return what is wrong with the critics of a finished run, given the rows of its ``metrics.jsonl``.
 

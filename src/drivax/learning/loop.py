@@ -109,9 +109,8 @@ def train(
 
     Args:
         config: Settings of the training.
-        data: Scenarios to train on, all held on the device. With weights, ``bc``, offline algorithms, and ``sac`` and
-            ``bc_sac`` with ``demonstrations`` draw logged steps by weight; with drives, ``bc`` and offline algorithms
-            learn from these; other algorithms refuse them.
+        data: Scenarios to train on, all held on the device. Weights are for ``bc``, offline algorithms, and ``sac`` and
+            ``bc_sac`` with ``demonstrations``; drives for ``bc`` and offline algorithms.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
             its scenarios (and 256), else the smallest recording; none if there is only one. None trains on all
@@ -147,8 +146,7 @@ def train(
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
     if opts.resume:
         warn_of_other_bits(folders[0].info, len(program.devices), opts.log)
-    memory = program.account(None if held_out is None else held_out.bank)
-    memory.check()
+    (memory := program.account(None if held_out is None else held_out.bank)).check()
     if isinstance(validation_set, HoldOut):
         opts.log(validation_set.text())
     opts.log(memory.text())

@@ -25,7 +25,7 @@ from drivax.learning.algorithms.off_policy import (
     squared_error,
 )
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam, mean_gradients
-from drivax.learning.critic_health import critic_problems, policy_returns, rank_correlation, returns_to_go
+from drivax.learning.critic_health import critic_problems, policy_returns, returns_to_go
 from drivax.learning.drives import Drives
 from drivax.learning.driving import Driving
 from drivax.learning.environment import Environment
@@ -45,6 +45,7 @@ from drivax.networks.distributions import REPARAMETERISED, Actions
 from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
 from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
+from drivax.stats.ranking import rank_correlation
 
 #: Steps that the mean Q and feature statistics are computed over, and steps per batch.
 _SAMPLES, _BATCH = 2048, 256
@@ -336,7 +337,8 @@ class Offline(OffPolicy[Config]):
         environment = self.environment
         if isinstance(environment, Driving) and environment.task.hold == 1:
             q, returns = np.asarray(self._policy_returns(data, policy, critic))
-            metrics["q_error"] = float(np.sqrt(np.mean((q - returns) ** 2)) / max(returns.std(), 1e-9))
+            if returns.std() > 0.0:  # more than one scenario
+                metrics["q_error"] = float(np.sqrt(np.mean((q - returns) ** 2)) / returns.std())
             metrics["q_rank"] = rank_correlation(*np.asarray(self._drive_returns(data, policy, critic)))
         return metrics
 
