@@ -29,7 +29,8 @@ from drivax.tracking.run_folder import RunFolder, is_policy, run_and_step
 MIXTURES: dict[str, tuple[tuple[str, float], ...]] = {
     "medium": (("zoo:bc", 0.0), ("zoo:bc", 0.2)),
     "mixed": (
-        ("pdm", 0.0), ("idm", 0.0), ("idm", 0.3), ("constant_speed", 0.2), ("zoo:bc", 0.0), ("zoo:aggressive", 0.0),
+        ("expert", 0.0), ("expert_actions", 0.3), ("pdm", 0.0), ("idm", 0.0), ("idm", 0.3), ("constant_speed", 0.2),
+        ("zoo:bc", 0.0), ("zoo:aggressive", 0.0),
     ),
 }  # fmt: skip
 #: Ends the name of a training run of which all checkpoints drive: the mixture ``replay`` of D4RL.
@@ -70,8 +71,8 @@ class Record(RecordConfig):
     """Record drives of planners on every scenario of a set, failures included, for offline learning.
 
     PLANNER is that of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium (a clone,
-    without and with noise) or mixed (pdm, idm without and with noise, a clone, an aggressive driver, and one that
-    ignores traffic). --task.KEY VALUE changes settings of the task of planners that are not trained.
+    without and with noise) or mixed (the log, and followed with noise; pdm; idm without and with noise; a clone; an
+    aggressive driver; one that ignores traffic). --task.KEY VALUE changes the task of planners that are not trained.
 
     OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --drives OUT learns from them.
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from drivax.errors import UsageError
 from drivax.stats.clusters import as_values, paired_differences
@@ -79,6 +78,8 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         confidence: 1 - significance level.
         share: ``w``, the share of the first arm; None for pairs.
     """
+    from scipy import special  # takes 0.1 s to import
+
     if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0) or math.isnan(effect):
         cure = "confidence and share lie between 0 and 1, n above 0, and the effect is a number"
         raise UsageError("effect, confidence, share or n out of range", cure=cure)

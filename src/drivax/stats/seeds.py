@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy import special
 
 from drivax.errors import UsageError
 from drivax.stats.clusters import Labels, dense_labels
@@ -113,9 +112,13 @@ class CrossedEffect:
         return self._smallest_number(self._with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
+        from scipy import special  # takes 0.1 s to import
+
         return float(special.stdtr(min(self.degrees_of_freedom, _MAX_FREEDOM), t))
 
     def _quantile(self, share: float) -> float:
+        from scipy import special  # takes 0.1 s to import
+
         return float(special.stdtrit(min(self.degrees_of_freedom, _MAX_FREEDOM), share))
 
     def _critical(self, confidence: float) -> float:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy import special
 
 from drivax.errors import UsageError
 from drivax.stats.clusters import (
@@ -58,6 +57,8 @@ def mcnemar_test(a: Any, b: Any, *, mid: bool = True) -> SignificanceResult:
     Psychometrika 12, 1947). The mid-p value, ``2 P(X <= k) - P(X = k)``, is less conservative and nearly always keeps
     its level (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013). Both are 1 for equal counts.
     """
+    from scipy import special  # takes 0.1 s to import
+
     for values in (as_values(a), as_values(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
             raise UsageError("McNemar's test takes only 0 and 1", cure="use paired_permutation")

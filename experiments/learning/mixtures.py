@@ -1,0 +1,154 @@
+"""Compare offline algorithms on recorded mixtures of drivers, on the built-in world's benchmark.
+
+python -m experiments.learning.mixtures run --data BENCHMARK --runs RUNS [--minutes 50]
+python -m experiments.learning.mixtures judge --runs RUNS        (means with intervals, stored)
+
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on 1,024 training
+scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`; it
+skips what exists, resumes a training, and starts nothing after the minutes given. Checkpoints are not selected: the
+last one is evaluated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.evaluation.episode_table import EpisodeTable
+from drivax.files import write_json
+from drivax.tracking.run_folder import RunFolder, versions
+from experiments.learning.benchmark import Episodes, mean_interval
+from experiments.repository import RESULTS
+
+RESULT = RESULTS / "mixtures.json"
+SCENARIOS, SEEDS = 1024, 3
+MIXTURES = ("expert", "mixed")
+#: Drivers of `mixed` other than the log.
+DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
+#: Settings of all trainings: the reward of completion, with terms for time to collision and clearance.
+TASK = (
+    "--task.rewards.preset",
+    "completion",
+    "--task.rewards.urgency",
+    "-0.2",
+    "--task.rewards.close",
+    "-0.2",
+)
+#: Preset and settings of each algorithm.
+ALGORITHMS = {
+    "bc": ("offline/bc",),
+    "filtered_bc": ("offline/bc", "--algorithm.best", "0.25"),
+    "awac": ("offline/awac",),
+    "iql": ("offline/iql",),
+    "td3_bc": ("offline/td3_bc",),
+    "cql_bc": ("offline/cql_bc",),
+}
+METRICS = ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio")
+
+
+def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
+    """Yield the output and the arguments of every command, in order."""
+    scenarios, test = runs / "train", data / "test"
+    yield scenarios, ["export", str(data / "train"), str(scenarios), "--limit", str(SCENARIOS)]
+    for driver in DRIVERS:
+        out = runs / "drivers" / driver.replace(":", "-")
+        yield out, ["evaluate", "--planner", driver, "--data", str(test), "--out", str(out)]
+    for mixture in MIXTURES:
+        drives = runs / "drives" / mixture
+        yield drives, ["record", mixture, "--data", str(scenarios), "--out", str(drives)]
+        for name, (preset, *settings) in ALGORITHMS.items():
+            folder = runs / mixture / name
+            train = ["train", preset, *settings, *TASK, "--data", str(scenarios), "--drives", str(drives)]
+            yield folder, [*train, "--seeds", str(SEEDS), "--out", str(folder)]
+            for seed in range(SEEDS):
+                out = runs / "evaluated" / mixture / name / f"seed-{seed}"
+                planner = str(folder / f"seed-{seed}")
+                yield out, ["evaluate", "--planner", planner, "--data", str(test), "--out", str(out)]
+
+
+def run(data: Path, runs: Path, minutes: float) -> bool:
+    """Run the commands whose output is missing; return whether all are done."""
+    begin = time.monotonic()
+    for out, arguments in steps(data, runs):
+        is_training = arguments[0] == "train"
+        if out.exists() and not (is_training and not _is_trained(out)):
+            continue
+        if time.monotonic() - begin > 60 * minutes:
+            return False
+        if is_training and out.exists():
+            arguments = ["train", arguments[1], *arguments[arguments.index("--data") :], "--resume"]
+        print(" ".join(arguments), flush=True)
+        subprocess.run([sys.executable, "-m", "drivax", *arguments], check=True)
+    return True
+
+
+def _is_trained(folder: Path) -> bool:
+    """Return whether all seeds of a training have ended."""
+    seeds = [folder / f"seed-{seed}" for seed in range(SEEDS)]
+    if not all((seed / "metrics.jsonl").is_file() for seed in seeds):
+        return False
+    total = int(RunFolder.open(folder).settings["total_steps"])
+    return all(RunFolder.open(seed).read_metrics()[-1]["step"] >= total for seed in seeds)
+
+
+def compute_results(runs: Path) -> dict[str, Any]:
+    """Return means of drivers and policies, and differences of policies from both clones and the best driver."""
+    drivers = {path.name: _episodes([path]) for path in sorted((runs / "drivers").iterdir())}
+    best = max(drivers, key=lambda name: float(np.nanmean(drivers[name].values["vmax_score"])))
+    policies = {}
+    for mixture in MIXTURES:
+        evaluated = {name: runs / "evaluated" / mixture / name for name in ALGORITHMS}
+        episodes = {
+            name: _episodes(sorted(folder.iterdir())) for name, folder in evaluated.items() if folder.exists()
+        }
+        for name, own in episodes.items():
+            seeds = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
+            others = {key: episodes[key] for key in ("bc", "filtered_bc") if key in episodes and key != name}
+            policies[f"{mixture}/{name}"] = {
+                "means": {metric: mean_interval(own, metric).as_dict() for metric in METRICS},
+                "critics": [info.get("critics") for info in seeds],
+                "differences": {
+                    other: {metric: mean_interval(own, metric, reference).as_dict() for metric in METRICS}
+                    for other, reference in (others | {best: drivers[best]}).items()
+                },
+            }
+    means = {name: {m: mean_interval(own, m).as_dict() for m in METRICS} for name, own in drivers.items()}
+    command = "python -m experiments.learning.mixtures judge"
+    return {"command": command, "drivers": means, "policies": policies, "versions": versions()}
+
+
+def _episodes(folders: Sequence[Path]) -> Episodes:
+    """Return the episodes of a planner, with a row for each seed."""
+    tables = [EpisodeTable.read(folder) for folder in folders]
+    values = {metric: np.stack([table.metrics[metric] for table in tables]) for metric in METRICS}
+    return Episodes(values, np.array(tables[0].clusters), {})
+
+
+def main() -> None:
+    """Run the commands that are missing, or compare what they wrote."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    running = commands.add_parser("run")
+    running.add_argument("--data", type=Path, required=True)
+    running.add_argument("--minutes", type=float, default=50.0)
+    judging = commands.add_parser("judge")
+    for command in (running, judging):
+        command.add_argument("--runs", type=Path, required=True)
+    args = parser.parse_args()
+    if args.command == "judge":
+        write_json(RESULT, compute_results(args.runs))
+    elif not run(args.data, args.runs, args.minutes):
+        print("run again to go on")
+
+
+if __name__ == "__main__":
+    main()
