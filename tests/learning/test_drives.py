@@ -236,4 +236,61 @@ def test_command_records_and_training_learns_from_it(data, tmp_path, capsys):
         settings.load(TrainConfig, TINY), TrainingSet(data, drives=read_drives([out], data, Task()))
     )
     assert usable.shape == (3, 91) and usable[:, 10].all() and not usable[:, :10].any()
-    assert Physical() == Task().actions
+
+
+@pytest.mark.parametrize("with_drives", [False, True])
+def test_critics_are_checked_in_reactive_traffic(data, tmp_path, with_drives):
+    """The simulated returns and the replay need the data of the traffic in the held-out scenarios, too."""
+    config = settings.load(TrainConfig, TINY | {"traffic": "idm"})
+    drives = ()
+    if with_drives:
+        task = replace(Task(), actions=config.task.actions)
+        drives = read_drives(
+            [record(IdmPlanner(), data, tmp_path / "idm", "idm", task)], data, config.task, "idm"
+        )
+    run = train(config, TrainingSet(data, drives=drives), tmp_path / "run", validation=data)
+    assert np.isfinite(run.read_metrics()[-1]["validation/q_error"])
+    assert run.info["critics"] is not None
+
+
+def test_held_out_scenarios_without_drives_are_validated_without_metrics_of_critics(data, tmp_path):
+    generate(tmp_path / "other", 2, 12, Generation(workers=0))
+    config = settings.load(TrainConfig, TINY)
+    drives = read_drives([record(IdmPlanner(), data, tmp_path / "idm")], data, config.task)
+    other = ScenarioSet.open(tmp_path / "other")
+    run = train(config, TrainingSet(data, drives=drives), tmp_path / "run", validation=other)
+    row = run.read_metrics()[-1]
+    assert "validation/vmax_score" in row and "validation/mean_q" not in row
+    assert run.info["critics"] is None
+
+
+def test_filtered_cloning_without_drives_is_refused(data, tmp_path):
+    config = settings.load(TrainConfig, TINY | {"algorithm": {"kind": "bc", "network": NETWORK, "best": 0.5}})
+    with pytest.raises(UsageError, match=r"best is 0\.5, but there are no recorded drives to choose from"):
+        train(config, data, tmp_path / "run", validation=None)
+
+
+def test_recording_is_refused_before_the_first_evaluation(data, tmp_path, capsys):
+    call = ["--data", str(data.path), "--out", str(tmp_path / "out")]
+    for planners, words in (
+        (["idm", "expert", "--noise", "0.3"], "planner expert replays the log"),
+        (["idm", "imd"], "unknown planner 'imd'"),
+        (["idm", "--noise", "-1"], "noise is -1; use 0 or more"),
+    ):
+        assert main(["record", *planners, *call]) == 2
+        err = capsys.readouterr().err
+        assert words in err and "evaluating" not in err
+    assert not (tmp_path / "out").exists()
+    evaluation = record(IdmPlanner(), data, tmp_path / "idm")
+    assert main(["record", "idm", *call[:2], "--out", str(evaluation), "--overwrite"]) == 2
+    assert "output folder contains a run of kind evaluation, not drives" in capsys.readouterr().err
+
+
+def test_noise_keeps_what_evaluation_reads_of_a_planner():
+    class Prepared(IdmPlanner):
+        def prepare(self, scenario_of):
+            return None
+
+    noisy = add_noise(Prepared(), 0.1)
+    assert noisy.actions == Physical() and callable(noisy.prepare)
+    assert not hasattr(add_noise(IdmPlanner(), 0.1), "prepare")

@@ -79,6 +79,7 @@ def place(record, row, kind, size, s, offset, steps=slice(0, 91), identity=1):
 
 def make_scenario(number: int) -> Scenario:
     record = np.zeros((), record_dtype(SMALL))
+    record["lane_length"] = 1.0
     record["scenario_id"], record["dataset"] = f"hand-{number:02d}".encode(), b"hand"
     record["segment"] = f"road-{number // 2}".encode()
     record["dt_s"], record["current_step"], record["steps"] = 0.1, 10, 91

@@ -32,6 +32,7 @@ def scenarios(tmp_path: Path) -> ScenarioSet:
     capacity = Capacity(name="tiny", agents=1, parked=1, steps=2, segments=1, features=1, lanes=1, grid=1)
     record = np.zeros((), record_dtype(capacity))
     record["scenario_id"], record["steps"], record["dt_s"] = b"one", 2, 0.1
+    record["agent_valid"][:, 0], record["lane_length"] = True, 1.0
     with ScenarioWriter(tmp_path / "set", capacity) as writer:
         writer.add(Scenario(record, capacity, SourceCounts(2, 1, 1, {}, 0, 0)))
     return ScenarioSet.open(tmp_path / "set")

@@ -15,10 +15,13 @@ from drivax.api import as_traffic, find_planner, load
 from drivax.checks import check_at_least
 from drivax.cli import record_of
 from drivax.cli.evaluate import requested_task
+from drivax.errors import DataError, UsageError
 from drivax.escaping import show
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
 from drivax.files import replace_folder
+from drivax.learning.policies import open_policy
 from drivax.planners.catalogue import PLANNERS
+from drivax.planners.planner import add_noise
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
 from drivax.tasks.conditions import fix_conditions
@@ -43,7 +46,7 @@ class RecordConfig:
 
     Attributes:
         noise: Standard deviations of noise on the actions of each planner; mixtures have their own.
-        seeds: Number of drives of each kind per scenario, with different noise and samples.
+        seeds: Number of drives of each kind per scenario; without noise and samples they are equal.
         seed: First seed.
         sample: Let trained policies sample their actions instead of taking the mode.
         traffic: Traffic model, as for drivax evaluate; training must have the same.
@@ -64,6 +67,10 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "seeds")
+        if not self.planners or not self.noise:
+            raise UsageError(
+                "no planner to record" if self.noise else "no level of noise", cure="give one or more"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +78,9 @@ class Record(RecordConfig):
     """Record drives of planners on every scenario of a set, failures included, for offline learning.
 
     PLANNER is that of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium (a clone,
-    without and with noise) or mixed (the log, and followed with noise; pdm; idm without and with noise; a clone; an
-    aggressive driver; one that ignores traffic). --task.KEY VALUE changes the task of planners that are not trained.
+    without and with noise) or mixed (the log, and a driver that follows it with noise; pdm; idm without and with noise;
+    a clone; an aggressive driver; one that ignores traffic). --task.KEY VALUE changes the task of planners that are not
+    trained.
 
     OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --drives OUT learns from them.
 
@@ -101,14 +109,20 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
     data, summaries = ScenarioSet.open(args.data), []
     first = load(args.data, 1, filters=args.filter)
     seeds = range(args.seed, args.seed + args.seeds)
-    kinds = itertools.product(dict.fromkeys(_drivers(args.planners, args.noise)), seeds)
+    drivers = {}
+    for name, noise in _drivers(
+        args.planners, args.noise
+    ):  # before the first evaluation, so that errors come at once
+        is_trained = is_policy(run_and_step(name)[0], PLANNERS)
+        planner, driver_task = find_planner(
+            name, first.bank, args.sample and is_trained, None if is_trained else task, args.trust_code
+        )
+        add_noise(planner, noise)
+        drivers[name, noise] = planner, driver_task, is_trained
     with replace_folder(args.out) as partial_folder:
         RunFolder.create(partial_folder, record_of(RecordConfig, args), [data], overwrite=True, kind="drives")
-        for number, ((name, noise), seed) in enumerate(kinds):
-            is_trained = is_policy(run_and_step(name)[0], PLANNERS)
-            planner, own_task = find_planner(
-                name, first.bank, args.sample and is_trained, None if is_trained else task, args.trust_code
-            )
+        for number, ((name, noise), seed) in enumerate(itertools.product(drivers, seeds)):
+            planner, driver_task, is_trained = drivers[name, noise]
             config = EvaluationConfig(
                 planner=name,
                 traffic=args.traffic,
@@ -118,7 +132,7 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
                 seed=seed,
                 sample=args.sample and is_trained,
                 noise=noise,
-                task=replace(own_task, conditions=fix_conditions(own_task.conditions)),
+                task=replace(driver_task, conditions=fix_conditions(driver_task.conditions)),
             )
             text = re.sub(r"[^\w.]+", "-", name)[-40:]
             out = partial_folder / f"{number:02d}-{text}"
@@ -136,7 +150,9 @@ def _drivers(planners: Sequence[str], noise: Sequence[float]) -> Iterator[tuple[
             yield from MIXTURES[name]
         elif name.endswith(_ALL):
             run = name.removesuffix(_ALL)
-            steps = Checkpoints(RunFolder.open(run).checkpoints).steps()
+            steps = Checkpoints(open_policy(run).checkpoints).steps()
+            if not steps:
+                raise DataError("has no checkpoint", file=run, cure="name a training run")
             yield from itertools.product([f"{run}@{step}" for step in sorted(steps)], noise)
         else:
             yield from itertools.product([name], noise)

@@ -78,26 +78,27 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
     return jax.lax.scan(step, final_value, columns, reverse=True)[1].T
 
 
-def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str]:
+def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str] | None:
     """Return what is wrong with the critics of a finished run, given the rows of its ``metrics.jsonl``.
 
-    ``entropy`` is the policy's target entropy, None for a policy without one. Checks without values are left out.
+    None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
+    None for a policy without one.
     """
-    problems = []
+    problems, errors, ranks = [], _column(rows, "validation/q_error"), _column(rows, "validation/q_rank")
+    if not len(errors) or not len(ranks):
+        return None
     td_error = _column(rows, "loss/critic")
-    third, last = (td_error[len(td_error) * k // 4 : len(td_error) * (k + 1) // 4] for k in (2, 3))
-    if len(third) and last.mean() > MOST_TD_RISE * third.mean():
-        problems.append(
-            f"the TD error rises over the second half, from {third.mean():.3g} to {last.mean():.3g}"
-        )
-    errors, ranks = _column(rows, "validation/q_error"), _column(rows, "validation/q_rank")
-    if len(errors) and errors[-1] > MOST_Q_ERROR:
+    before, last = (td_error[len(td_error) * k // 4 : len(td_error) * (k + 1) // 4] for k in (2, 3))
+    if len(before) and not last.mean() <= MOST_TD_RISE * before.mean():
+        values = f"from {before.mean():.3g} to {last.mean():.3g}"
+        problems.append(f"the TD error rises over the second half, {values}")
+    if not errors[-1] <= MOST_Q_ERROR:
         problems.append(f"Q is off by {errors[-1]:.2f} standard deviations of the policy's returns")
-    if len(ranks) and not ranks[-1] >= LEAST_Q_RANK:
+    if not ranks[-1] >= LEAST_Q_RANK:
         problems.append(f"Q has a rank correlation of {ranks[-1]:.2f} with the returns of held-out drives")
     entropies = _column(rows, "loss/entropy")
     entropies = entropies[len(entropies) * 3 // 4 :]
-    if entropy is not None and len(entropies) and abs(entropies.mean() - entropy) > MOST_ENTROPY_ERROR:
+    if entropy is not None and len(entropies) and not abs(entropies.mean() - entropy) <= MOST_ENTROPY_ERROR:
         problems.append(f"the entropy is {entropies.mean():.2f}, its target {entropy:.2f}")
     return problems
 

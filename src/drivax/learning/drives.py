@@ -66,9 +66,10 @@ class Driven(Driving):
     def replay(
         self, bank: ScenarioBank, drive: tuple[Int[Array, ""], Float[Array, "S 4"], Float[Array, "S1 D"]]
     ) -> tuple[dict[str, Any], Float[Array, "times 4"], tuple[Array, ...]]:
-        """Replay a drive: return contexts and motion from ``start_step`` on, and action, reward and ends of its steps.
+        """Replay a drive, which begins as logged.
 
-        The first motion is that of the log.
+        Returns contexts and motion from ``start_step`` on, and of each step action, reward, ends, and whether the
+        action exceeds the bounds.
         """
         index, motion, action = drive
         simulator = Simulator(replace(self.task, metrics="none"), self.simulator.traffic)
@@ -80,8 +81,10 @@ class Driven(Driving):
             space = self.task.actions
             # In the space ``route``, the executed action is not in the space of the requested one.
             if isinstance(space, Route):
-                action = jnp.clip(space.unsteer(bank, state.context, action), -1.0, 1.0)
-            outcome = (action, result.reward, result.terminated, result.truncated)
+                action = space.unsteer(bank, state.context, action)
+            clipped = space.exceeds_bounds(action)
+            action = jnp.clip(action, -1.0, 1.0)
+            outcome = (action, result.reward, result.terminated, result.truncated, clipped)
             return after, (_without_history(state.context), outcome)
 
         final, (contexts, outcome) = jax.lax.scan(step, initial, (motion[1:], action))
@@ -112,12 +115,12 @@ def replay_drives(
         """Pad by zeros before the start, and at the last step, which has no successor."""
         return jnp.pad(values, ((0, 0), (start, last), *((0, 0),) * (values.ndim - 2)))
 
-    action, reward, terminated, truncated = (pad(values, 1) for values in outcome)
+    action, reward, terminated, truncated, clipped = (pad(values, 1) for values in outcome)
     ends, time = terminated | truncated, jnp.arange(action.shape[1])
     over = jnp.cumsum(ends, axis=1) > ends
     is_decision = (time - start) % environment.task.hold == 0
     usable = pad(finite, 1) & ~over & (time >= start)
-    clipped = ~is_decision | (is_logged[:, None] & (jnp.abs(action) >= 1.0).any(axis=-1))
+    clipped |= ~is_decision | (is_logged[:, None] & (jnp.abs(action) >= 1.0).any(axis=-1))
     steps = ExpertSteps(
         action, reward, terminated, truncated, usable, clipped, environment.task.hold, scenario=index
     )

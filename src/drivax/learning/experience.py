@@ -150,7 +150,7 @@ class Experience:
         data: The environment's data.
         expert: The expert's steps.
         usable: Steps to learn from.
-        uniform: Sampler that draws usable steps with equal probability.
+        uniform: Sampler that draws usable steps, of all drives, with equal probability.
         critic: Sampler of steps for policy evaluation.
         policy: Sampler of steps for policy improvement; None: that of the critic.
     """
@@ -198,27 +198,33 @@ class ExperienceConfig:
         """
         expert = _expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
-        if self.best < 1.0:
-            usable &= _has_high_return(expert, self.best)[:, None]
         if not usable.any():
             if not expert.usable.any():
                 raise DataError("no logged step has an expert action", cure="check the set")
             problem = "the expert's action exceeds the bounds at all logged steps"
             raise DataError(problem, cure="choose an action space with wider bounds")
-        uniform = sampler(np.asarray(usable, np.float64))
+        uniform = critic = sampler(np.asarray(usable, np.float64))
+        if self.best < 1.0:
+            if expert.scenario is None:
+                problem = f"best is {self.best:g}, but there are no recorded drives to choose from"
+                raise UsageError(problem, cure="give some with --drives, or leave out best")
+            usable &= _has_high_return(expert, usable, self.best)[:, None]
+            critic = sampler(np.asarray(usable, np.float64))
         if weights is None:
-            return Experience(data, expert, usable, uniform, uniform)
+            return Experience(data, expert, usable, uniform, critic)
         by_weight = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
         if self.weighted == "all":
             return Experience(data, expert, usable, uniform, by_weight)
-        return Experience(data, expert, usable, uniform, uniform, by_weight)
+        return Experience(data, expert, usable, uniform, critic, by_weight)
 
 
-def _has_high_return(expert: ExpertSteps, share: float) -> Bool[np.ndarray, " M"]:
-    """Mask of the ``share`` of the logs (or drives) of each scenario with the highest return, at least one."""
-    returns = np.asarray(jnp.sum(expert.reward * expert.usable, axis=1))
-    count = len(returns)
-    scenario = np.arange(count) // expert.egos if expert.scenario is None else np.asarray(expert.scenario)
+def _has_high_return(expert: ExpertSteps, usable: Bool[Array, "M T"], share: float) -> Bool[np.ndarray, " M"]:
+    """Mask of the ``share`` of the drives of each scenario with the highest return, at least one.
+
+    Drives without a usable step rank last.
+    """
+    returns = np.where(usable.any(axis=1), np.sum(expert.reward * expert.usable, axis=1), -np.inf)
+    count, scenario = len(returns), np.asarray(expert.scenario)
     order = np.lexsort((-returns, scenario))
     _, first, sizes = np.unique(scenario[order], return_index=True, return_counts=True)
     rank = np.empty(count, int)

@@ -36,7 +36,13 @@ from drivax.learning.training_log import (
     Validation,
     validate,
 )
-from drivax.learning.training_set import TrainingSet, driven_environment, drives_digest, prepare_drives
+from drivax.learning.training_set import (
+    TrainingSet,
+    driven_environment,
+    drives_digest,
+    have_drives,
+    prepare_drives,
+)
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
@@ -260,15 +266,20 @@ def _held_out(
     scenarios: Sequence[Scenario] | None,
     drives: Sequence[EpisodeTable],
 ) -> Validation | None:
-    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without scenarios."""
+    """Return the validation on scenarios, with the data of a learner's held-out metrics; None without scenarios.
+
+    Without recorded drives in these scenarios, there are no such data, and no such metrics.
+    """
     if scenarios is None:
         return None
     held_out = Validation.of(scenarios)
     if not isinstance(learner, HeldOutMetrics):
         return held_out
-    data: Any = held_out.bank
+    data: Any = environment.prepare(held_out.bank)
     if isinstance(environment, Driven):
-        data = prepare_drives(environment, held_out.bank, scenarios, drives)
+        if not have_drives(scenarios, drives):
+            return held_out
+        data = prepare_drives(environment, data, scenarios, drives)
     return replace(held_out, data=training_data(config.algorithm, environment, data))
 
 
@@ -388,13 +399,14 @@ class _Training:
                     problem = f"SIGTERM stopped the training after {self._steps(iteration):,} steps"
                     raise Preempted(problem, cure="continue it with --resume")
         for number, log in enumerate(self.logs):
-            if log.divergence is not None:
-                raise log.divergence
-            if isinstance(program.seeds.learner, HasCritics):
+            if log.divergence is None and isinstance(program.seeds.learner, HasCritics):
                 problems = program.seeds.learner.critic_problems(list(log.folder.metric_rows()))
                 log.folder = log.folder.note(critics=problems)
-                for problem in problems:
+                for problem in problems or ():
                     self.log(f"warning: seed {program.seeds.seeds[number]}: unhealthy critics: {problem}")
+        for log in self.logs:
+            if log.divergence is not None:
+                raise log.divergence
 
     def _steps(self, iteration: int) -> int:
         """Return the environment steps of each seed after an iteration."""
@@ -508,7 +520,7 @@ class _Training:
         planner = seeds.learner.planner(parameters, "policy", samples=False)
         traffic = find_traffic(self.config.validation_traffic, self.trust)
         row = validate(planner, validation, self.config.task, traffic)
-        if isinstance(seeds.learner, HeldOutMetrics):
+        if isinstance(seeds.learner, HeldOutMetrics) and validation.data is not None:
             member = jax.device_put(seeds.member(state, number), device)
             metrics = seeds.learner.held_out_metrics(validation.data, member)
             row |= {f"validation/{name}": value for name, value in metrics.items()}

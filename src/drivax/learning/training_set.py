@@ -71,6 +71,9 @@ def read_drives(
     tables = tuple(EpisodeTable.read(folder) for path in paths for folder in _runs(Path(path)))
     expected: dict[str, Any] = {"task.hold": task.hold, "traffic": traffic, "noisy_start": False}
     expected["start_step"] = tables[0].settings.get("start_step") if tables else None
+    if tables and type(expected["start_step"]) is not int:
+        problem = f"start_step of its drives is {expected['start_step']!r}"
+        raise DataError(problem, file=tables[0].folder, cure=_RECORD)
     dynamics = _dynamics(settings.plain(task)["actions"])
     for table in tables:
         folder = table.folder
@@ -106,6 +109,12 @@ def _entry(values: Mapping[str, Any], name: str) -> Any:
     return _entry(value, rest) if rest and isinstance(value, Mapping) else value
 
 
+def have_drives(scenarios: Sequence[Scenario], tables: Sequence[EpisodeTable]) -> bool:
+    """Return whether any drive is in these scenarios."""
+    keys = {(name["dataset"], name["scenario_id"]) for name in scenario_names(scenarios)}
+    return any(not keys.isdisjoint(table.scenarios) for table in tables)
+
+
 def prepare_drives(
     environment: Driven, bank: ScenarioBank, scenarios: Sequence[Scenario], tables: Sequence[EpisodeTable]
 ) -> Drives:
@@ -136,6 +145,8 @@ def _drives_in(
     if shape != expected or (drives.start != environment.start_step).any():
         problem = f"{shape[0]} steps and {shape[1]} numbers per action, not {expected[0]} and {expected[1]}"
         raise DataError(problem, file=file, cure=_RECORD)
+    if not np.isfinite(drives.ego).all():
+        raise DataError("a motion is not finite", file=file, cure=_RECORD)
     # A crashed driver has no actions, and a log that was replayed may exceed their bounds.
     is_logged = np.full(len(known), _planner(table) == "expert")
     return index[known].astype(np.int32), drives.ego[known], drives.action[known], is_logged

@@ -143,6 +143,16 @@ class Noisy:
         """Name of the planner, with the deviation."""
         return f"{self.planner.name} (noise {self.deviation:g})"
 
+    @property
+    def actions(self) -> ActionSpace:
+        """Action space of the planner, if it has one of its own."""
+        return self.planner.actions
+
+    @property
+    def prepare(self) -> Any:
+        """Preparation of the planner, if it needs one."""
+        return self.planner.prepare
+
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
         """Return the planner's carry, and the first noise."""
         planner_key, noise_key = jax.random.split(key)

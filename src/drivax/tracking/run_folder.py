@@ -46,6 +46,8 @@ _ENTRIES: dict[str, Any] = {
     "validation": str | dict, "sealed": bool,
 }  # fmt: skip
 _TRAINING_KINDS = ("training", "seeds")
+#: Groups of kinds that replace each other; all others form a group.
+_GROUPS = {"training": "training", "seeds": "training", "drives": "drives"}
 #: Kinds of runs whose data sets have hashes; tables of other programs may lack them.
 _HASHED_KINDS = (*_TRAINING_KINDS, "policy", "study")
 #: Largest number of seeds that is read, far more than a device trains; resuming creates a folder for each.
@@ -92,8 +94,8 @@ class RunFolder:
     def check(path: Path, overwrite: bool, kind: str | None = None) -> None:
         """Check, before any work, that a run can be written to a folder.
 
-        With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), and other runs
-        only by other runs, as far as both kinds are known.
+        With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), a recording only
+        by a recording, and other runs only by other runs, as far as both kinds are known.
 
         Raises:
             UsageError: The folder exists and cannot be replaced.
@@ -103,7 +105,7 @@ class RunFolder:
         if not (path / RUN_FILE).is_file():
             raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
         present_kind = _kind(path)
-        if len({name in _TRAINING_KINDS for name in (kind, present_kind) if name is not None}) > 1:
+        if len({_GROUPS.get(name, "other") for name in (kind, present_kind) if name is not None}) > 1:
             problem = f"output folder contains a run of kind {present_kind}, not {kind}"
             raise UsageError(problem, file=path, cure="choose another name")
         check_output(path, overwrite, folder=True)

@@ -159,7 +159,7 @@ class BcConfig(Cloning):
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
         """Return the data, whose ``demonstrations`` are drawn, or experience drawn by weight or of recorded drives."""
-        if weights is None and not isinstance(data, Drives):
+        if weights is None and not isinstance(data, Drives) and self.best == 1.0:
             return data
         # The loss masks clipped steps, and logs their share.
         return ExperienceConfig(mask_clipped=False, best=self.best).of(environment, data, weights)

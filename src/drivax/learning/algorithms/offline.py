@@ -342,8 +342,8 @@ class Offline(OffPolicy[Config]):
             metrics["q_rank"] = rank_correlation(*np.asarray(self._drive_returns(data, policy, critic)))
         return metrics
 
-    def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str]:
-        """Return what is wrong with the critics of a finished run, given the rows of its log."""
+    def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
+        """Return what is wrong with the critics of a finished run, given the rows of its log; None if not checked."""
         return critic_problems(rows, getattr(self, "target_entropy", None))
 
     def smaller_q(
