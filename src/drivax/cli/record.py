@@ -110,9 +110,8 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
     first = load(args.data, 1, filters=args.filter)
     seeds = range(args.seed, args.seed + args.seeds)
     drivers = {}
-    for name, noise in _drivers(
-        args.planners, args.noise
-    ):  # before the first evaluation, so that errors come at once
+    # Before the first evaluation, so that errors come at once.
+    for name, noise in _drivers(args.planners, args.noise):
         is_trained = is_policy(run_and_step(name)[0], PLANNERS)
         planner, driver_task = find_planner(
             name, first.bank, args.sample and is_trained, None if is_trained else task, args.trust_code

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import stat
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +31,7 @@ _allowed = jax.make_user_context(True)
 
 
 @cache
-def _load() -> Any:
+def _load() -> ctypes.CDLL | str:
     """Return the library with its kernels registered, or why it is not used."""
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
@@ -75,11 +76,9 @@ def _build_problem() -> str | None:
     return None
 
 
-def _register() -> Any:
+def _register() -> ctypes.CDLL:
     # Start the backend first: a later start would raise errors of registration, such as of XLA's version, and fail.
     jax.default_backend()
-    import ctypes  # not without kernels
-
     library = ctypes.CDLL(str(PATH))
     for name in ("drivax_kernels", "drivax_target", "drivax_hash"):
         getattr(library, name).restype = ctypes.c_char_p
@@ -89,7 +88,7 @@ def _register() -> Any:
     return library
 
 
-def _target_name(library: Any, kernel: str) -> str:
+def _target_name(library: ctypes.CDLL, kernel: str) -> str:
     """Return a name with the hash of the build, because cached programs outlive builds."""
     return f"drivax_{kernel}_{library.drivax_hash().decode()}"
 

@@ -148,9 +148,5 @@ def _drives_in(
     if not np.isfinite(drives.ego).all():
         raise DataError("a motion is not finite", file=file, cure=_RECORD)
     # A crashed driver has no actions, and a log that was replayed may exceed their bounds.
-    is_logged = np.full(len(known), _planner(table) == "expert")
+    is_logged = np.full(len(known), table.settings.get("planner") == "expert")
     return index[known].astype(np.int32), drives.ego[known], drives.action[known], is_logged
-
-
-def _planner(table: EpisodeTable) -> str:
-    return str(table.settings.get("planner"))

@@ -299,7 +299,9 @@ def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) 
 
 
 #: Least and largest numbers.
-_AGENT_KINDS, _ROAD_KINDS, _LIGHT_STATES = (0, 5), (-1, 20), (-1, 8)
+_AGENT_KINDS, _ROAD_KINDS, _LIGHT_STATES = (
+    (least, int(max(kind))) for least, kind in ((0, AgentKind), (-1, RoadKind), (-1, LightState))
+)
 
 
 @cache
