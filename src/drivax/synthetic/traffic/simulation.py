@@ -83,7 +83,7 @@ _MAX_REACTION_STEPS = 6
 #: Steps ahead for which a planned ego reserves connectors.
 _LOOKAHEAD_STEPS = 25
 #: Runs that are simulated together.
-_BATCH_RUNS = 16
+_BATCH_RUNS = 8
 
 _T = TypeVar("_T")
 
