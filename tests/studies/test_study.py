@@ -331,7 +331,7 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     again = capsys.readouterr().err
     assert "trained" not in again and "evaluating" not in again
     # An edited evaluation is refused, or named by the results and the page.
-    episodes = out / "drives" / "heuristic" / "seed-0" / "episodes.csv"
+    episodes = out / "evaluations" / "heuristic" / "seed-0" / "episodes.csv"
     text = episodes.read_text()
     rows = [line.split(",") for line in text.splitlines(keepends=True)]
     rows[1][rows[0].index("ade")] = "1.5"
@@ -375,7 +375,7 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert "heuristic collides less than its matched random control" in page
     # Runs with other weights, and evaluations older than their run, are refused.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
-    info, evaluation = json.loads(run.read_text()), out / "drives" / "heuristic" / "seed-0" / "run.json"
+    info, evaluation = json.loads(run.read_text()), out / "evaluations" / "heuristic" / "seed-0" / "run.json"
     run.write_text(json.dumps(info | {"weights": "0" * 64}))
     assert main([*arguments, "--anyway"]) == 2
     assert "was trained with other settings or weights" in capsys.readouterr().err
@@ -494,7 +494,7 @@ def test_changed_claims_are_refused_when_a_study_resumes(data, tmp_path):
     [
         "runs",
         "runs/bc/seed-0",
-        "drives",
+        "evaluations",
         "scores/x.npz",
         "test",
         "results.json",

@@ -295,7 +295,7 @@ class Study:
 
     def evaluation(self, name: str, seed: int | None = None) -> Path:
         """Return the evaluation folder of an arm with one seed, or of a planner."""
-        return inside(self.folder, "drives", name, *([] if seed is None else [f"seed-{seed}"]))
+        return inside(self.folder, "evaluations", name, *([] if seed is None else [f"seed-{seed}"]))
 
     def evaluations(self, arm: str) -> tuple[str, ...]:
         """Return the names of an arm's evaluations: the first baseline is evaluated at other checkpoints, too."""

@@ -58,7 +58,7 @@ from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.workers import one_core_each
 
 #: What a study writes into its folder, besides the files of a run folder.
-_OUTPUTS = ("scores", "test", "runs", "drives", "results.json", "report.html", "critical.html")
+_OUTPUTS = ("scores", "test", "runs", "evaluations", "results.json", "report.html", "critical.html")
 _PROGRESS = "validation/progress_ratio"
 Log = Callable[[str], None]
 
