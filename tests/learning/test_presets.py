@@ -81,6 +81,10 @@ def test_published_numbers_of_offline_algorithms():
     assert (cql.policy_rate, cql.critic_rate, cql.gradient_norm) == (1e-5, 3e-5, 1.0)
     assert not cql.importance and not cql.next_actions and cql.temperature_rate == 0.0
     assert settings.load(TrainConfig, "published/cql").total_steps == 510_000 * 512
+    corl = settings.load(TrainConfig, "published/cql_corl").algorithm
+    assert (corl.policy_rate, corl.critic_rate, corl.temperature_rate) == (3e-5, 3e-4, 3e-5)
+    assert (corl.actions, corl.batch, corl.gamma, corl.tau) == (10, 256, 0.99, 0.005)
+    assert corl.normalise and corl.importance and corl.next_actions and corl.network.head == (256, 256, 256)
     iql = settings.load(TrainConfig, "published/iql").algorithm
     assert (iql.expectile, iql.inverse_temperature, iql.largest_weight, iql.loss) == (
         0.7,

@@ -41,6 +41,7 @@ class CqlConfig(OfflineConfig):
 
     Attributes:
         penalty: Weight of the conservative penalty relative to half the squared TD error; initial value with a ``gap``.
+        relative: Multiply the weight by the mean absolute Q, so that it does not depend on the scale of rewards.
         gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
         actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.
@@ -58,6 +59,7 @@ class CqlConfig(OfflineConfig):
 
     kind: Literal["cql"] = "cql"
     penalty: float = 5.0
+    relative: bool = False
     gap: float | None = None
     penalty_rate: float = 3e-4
     actions: int = 10
@@ -80,6 +82,10 @@ class CqlConfig(OfflineConfig):
         if self.gap is not None and self.penalty == 0.0:
             problem = "penalty is 0, from which the multiplier of a gap cannot start"
             raise UsageError(problem, cure="use more than 0, or no gap")
+        if self.gap is not None and self.relative:
+            raise UsageError(
+                "a gap replaces the weight of the penalty", cure="leave out relative, or the gap"
+            )
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
         """Return CQL in an environment."""
@@ -134,7 +140,7 @@ class Cql(Offline[CqlConfig]):
         error = squared_error(q, target_q)
         densities = jnp.broadcast_to(log_density[:, None], sampled_q.shape)
         penalty = conservative_penalty(sampled_q, densities, q, self.config.penalty_temperature)
-        weight, weight_loss = self._penalty_weight(trained, penalty)
+        weight, weight_loss = self._penalty_weight(trained, penalty, q)
         return error + weight * jnp.mean(penalty) + weight_loss, {
             "critic": error,
             "penalty": jnp.mean(penalty),
@@ -167,10 +173,11 @@ class Cql(Offline[CqlConfig]):
         stacked = jnp.concatenate([*actions, logged[None]])
         return stacked, jnp.zeros(stacked.shape[:-1])
 
-    def _penalty_weight(self, trained: Trained, penalty: Array) -> tuple[Array, Array]:
+    def _penalty_weight(self, trained: Trained, penalty: Array, q: Array) -> tuple[Array, Array]:
         """Return the penalty's weight, without gradient, and the loss of its multiplier."""
         if self.config.gap is None:
-            return jnp.asarray(self.config.penalty), jnp.zeros(())
+            scale = mean_over_devices(jnp.abs(q)) if self.config.relative else jnp.ones(())
+            return self.config.penalty * scale, jnp.zeros(())
         log_weight = jnp.minimum(trained["log_penalty"], _MAX_LOG_WEIGHT)
         loss = jnp.mean(penalty_weight_loss(log_weight, penalty, self.config.gap))
         return jax.lax.stop_gradient(jnp.exp(log_weight)), loss
