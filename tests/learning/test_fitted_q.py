@@ -11,7 +11,7 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.iql import IqlConfig
-from drivax.learning.algorithms.offline import FittedQ, FittedQConfig
+from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
 from drivax.learning.training_log import rank

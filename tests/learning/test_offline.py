@@ -191,6 +191,18 @@ def test_published_penalty_includes_the_logged_action(batch, policy_batch):
     assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
 
 
+def test_relative_penalty_follows_the_values(batch, policy_batch):
+    learner, trained, target = build_learner(replace(CQL, penalty=0.5, relative=True))
+    _, keys = step_keys(5)
+    _, logs = losses(learner, trained, target, batch, policy_batch, keys)
+    q = np.asarray(learner.q_values(trained["critic"], batch.observation, batch.action))
+    assert logs["penalty_weight"] == pytest.approx(0.5 * np.abs(q).mean(), rel=1e-5)
+    gradient = jax.grad(lambda t: learner.loss(t, target, batch, policy_batch, keys)[0])(trained)
+    fixed, *_ = build_learner(replace(CQL, penalty=logs["penalty_weight"]))
+    expected = jax.grad(lambda t: fixed.loss(t, target, batch, policy_batch, keys)[0])(trained)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), gradient, expected)
+
+
 def test_iql_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(IQL, largest_weight=1.05))
     total, logs = losses(learner, trained, target, batch, policy_batch, step_keys(1)[1])
@@ -424,6 +436,7 @@ def test_impossible_settings_are_refused():
         (partial(IqlConfig, inverse_temperature=-1.0), "inverse_temperature is -1.0; use 0 or more"),
         (partial(CqlConfig, actions=0), "actions is 0; use 1 or more"),
         (partial(CqlConfig, backup_actions=0), "backup_actions is 0"),
+        (partial(CqlConfig, relative=True, gap=1.0), "a gap replaces the weight of the penalty"),
         (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0, .*; use more than 0, or no gap"),
         (partial(Td3BcConfig, delay=0), "delay is 0; use 1 or more"),
     ):

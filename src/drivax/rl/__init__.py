@@ -1,7 +1,8 @@
 """Equations of reinforcement learning: arrays in, arrays out.
 
 ``equations`` has advantages and returns, TD targets, and the terms of losses, among them PPO's clipped surrogate. The
-modules of :mod:`drivax.learning.algorithms` add these terms up to the loss of an algorithm.
+modules of :mod:`drivax.learning.algorithms` add these terms up to the loss of an algorithm. ``off_policy_evaluation``
+estimates a policy's return from episodes of others.
 """
 
 import lazy_loader

@@ -13,3 +13,5 @@ from .equations import soft_policy_loss as soft_policy_loss
 from .equations import soft_value as soft_value
 from .equations import td_target as td_target
 from .equations import temperature_loss as temperature_loss
+from .off_policy_evaluation import doubly_robust as doubly_robust
+from .off_policy_evaluation import weighted_importance_sampling as weighted_importance_sampling

@@ -2,7 +2,7 @@ from .behaviour_cloning import BcConfig as BcConfig
 from .behaviour_cloning import Cloning as Cloning
 from .cql import CqlConfig as CqlConfig
 from .iql import IqlConfig as IqlConfig
-from .offline import FittedQConfig as FittedQConfig
+from .off_policy_evaluation import FittedQConfig as FittedQConfig
 from .offline import OfflineConfig as OfflineConfig
 from .ppo import PpoConfig as PpoConfig
 from .sac import SacConfig as SacConfig

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar, cast
 
 import jax
@@ -22,116 +21,31 @@ from drivax.learning.algorithms.off_policy import (
     OffPolicy,
     Trained,
     reduce_over_updates,
-    squared_error,
 )
+from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam, mean_gradients
 from drivax.learning.critic_health import critic_problems, policy_returns, returns_to_go
-from drivax.learning.drives import Drives
 from drivax.learning.driving import Driving
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
     ExperienceConfig,
-    LoggedEnvironment,
     expert_actions,
     require_log,
     sample_steps,
     transitions,
 )
 from drivax.learning.program import map_over_devices
+from drivax.learning.recorded_episodes import RecordedEpisodes
 from drivax.learning.replay import Transitions
-from drivax.networks.actor_critic import Critic, NetworkConfig
-from drivax.networks.distributions import REPARAMETERISED, Actions
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import REPARAMETERISED
 from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
-from drivax.rl.equations import polyak, td_target
 from drivax.scenario.record import record
 from drivax.stats.ranking import rank_correlation
 
 #: Steps that the mean Q and feature statistics are computed over, and steps per batch.
 _SAMPLES, _BATCH = 2048, 256
-
-
-@dataclass(frozen=True)
-class FittedQConfig:
-    """Settings of fitted-Q evaluation on held-out steps, at every validation.
-
-    Attributes:
-        updates: Updates of a new critic at each validation; 0: no fitted-Q evaluation.
-        batch: Steps per update.
-        rate: Initial learning rate of Adam; decays linearly to a tenth.
-        tau: Polyak averaging rate of the target critic.
-        gradient_norm: Maximum global norm of the gradient.
-    """
-
-    updates: int = 0
-    batch: int = 256
-    rate: float = 1e-3
-    tau: float = 0.01
-    gradient_norm: float = 10.0
-
-    def __post_init__(self) -> None:
-        check_at_least(self, 1, "batch")
-        check_at_most(self, MOST_SAMPLES, "batch", "updates")
-        check_at_least(self, 0, "updates", "rate")
-        check_shares(self, "tau")
-        check_above_zero(self, "gradient_norm")
-
-
-@dataclass(frozen=True)
-class FittedQ:
-    """Fitted-Q evaluation (Le et al. 2019, arXiv 1903.08738) of policies, from logged steps alone."""
-
-    config: FittedQConfig
-    network: NetworkConfig
-    environment: LoggedEnvironment
-    gamma: float
-
-    def value(
-        self, data: Experience, act: Callable[[dict[str, Array]], Float[Array, "B D"]],
-        statistics: Statistics = MappingProxyType({}),
-    ) -> Float[Array, ""]:  # fmt: skip
-        """Return the estimated discounted return of a policy from the start of episodes.
-
-        The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the
-        mean of ``Q(s, pi(s))`` over the first usable steps of all logs. Every call draws the same steps.
-        ``statistics`` normalise the features, if the network does.
-        """
-        network_key, key = jax.random.split(jax.random.key(0))
-        actions = Actions(self.environment.action_size, self.environment.levels)
-        critic = Critic(self.network, self.environment.shapes(data.data), nnx.Rngs(network_key), actions)
-        set_statistics(critic, statistics)
-        graph, initial = nnx.split(critic, nnx.Param)
-        config = self.config
-        optimiser = clipped_adam(config.rate, config.gradient_norm, updates=config.updates)
-
-        def q_values(parameters: Any, observation: dict[str, Array], action: Array) -> Array:
-            return nnx.merge(graph, parameters)(observation, action)
-
-        def update(carry: tuple[Any, Any, Any], key: Array) -> tuple[tuple[Any, Any, Any], None]:
-            parameters, target_parameters, state = carry
-            index = sample_steps(data.critic, key, (config.batch,))
-            batch = transitions(self.environment, data, index, self.gamma)
-            next_action = act(batch.next_observation)
-            next_value = q_values(target_parameters, batch.next_observation, next_action)
-            target = td_target(batch.reward, next_value, batch.terminated, batch.discount)
-
-            def loss(parameters: Any) -> Array:
-                return squared_error(q_values(parameters, batch.observation, batch.action), target)
-
-            updates, state = optimiser.update(jax.grad(loss)(parameters), state, parameters)
-            parameters: Any = optax.apply_updates(parameters, updates)
-            return (parameters, polyak(target_parameters, parameters, config.tau), state), None
-
-        carry = (initial, jax.tree.map(jnp.copy, initial), optimiser.init(initial))
-        (parameters, _, _), _ = jax.lax.scan(update, carry, jax.random.split(key, config.updates))
-        observation, weight = self._first_steps(data)
-        return jnp.sum(q_values(parameters, observation, act(observation)) * weight) / weight.sum()
-
-    def _first_steps(self, data: Experience) -> tuple[dict[str, Array], Float[Array, " M"]]:
-        """Observe the first usable step of every log; weight 0 where a log has none."""
-        usable = data.expert.usable
-        index = jnp.arange(len(usable)), jnp.argmax(usable, axis=1)
-        return self.environment.observe_recorded(data.data, index), usable.any(axis=1).astype(jnp.float32)
 
 
 @dataclass(frozen=True)
@@ -328,7 +242,7 @@ class Offline(OffPolicy[Config]):
         ``mean_q`` is the smaller critic's value of the policy's mode over a fixed set of steps; overestimation raises
         it. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates. In driving with decisions of one
         step, ``q_error`` is the root mean square error of the smaller Q from simulated returns of the policy, in
-        standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out drives.
+        standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out episodes.
         """
         policy, critic = state.parameters, state.rest["critic"]
         metrics = {"mean_q": float(self._mean_q(data, policy, critic))}
@@ -339,7 +253,7 @@ class Offline(OffPolicy[Config]):
             q, returns = np.asarray(self._policy_returns(data, policy, critic))
             if returns.std() > 0.0:  # more than one scenario
                 metrics["q_error"] = float(np.sqrt(np.mean((q - returns) ** 2)) / returns.std())
-            metrics["q_rank"] = rank_correlation(*np.asarray(self._drive_returns(data, policy, critic)))
+            metrics["q_rank"] = rank_correlation(*np.asarray(self._episode_returns(data, policy, critic)))
         return metrics
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
@@ -359,7 +273,7 @@ class Offline(OffPolicy[Config]):
     @partial(jax.jit, static_argnums=0)
     def _policy_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 N"]:
         """Return Q of the first states of all scenarios, and the simulated returns of the policy from there."""
-        bank = data.data.bank if isinstance(data.data, Drives) else data.data
+        bank = data.data.bank if isinstance(data.data, RecordedEpisodes) else data.data
         returns, discount, first, final = policy_returns(
             cast(Driving, self.environment),
             bank,
@@ -370,8 +284,8 @@ class Offline(OffPolicy[Config]):
         return jnp.stack([value(first), returns + discount * value(final)])
 
     @partial(jax.jit, static_argnums=0)
-    def _drive_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 B"]:
-        """Return Q of a fixed set of held-out steps, and the returns of their drives from there."""
+    def _episode_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 B"]:
+        """Return Q of a fixed set of held-out steps, and the returns of their episodes from there."""
         environment, expert = require_log(self.environment), data.expert
         rows, last = jnp.arange(len(expert.usable)), expert.usable.shape[1] - 1
         final = jnp.minimum(last - jnp.argmax(expert.usable[:, ::-1], axis=1) + 1, last)
