@@ -116,7 +116,7 @@ def training(bank: ScenarioBank, preset: Sequence[str], environments: int | None
     program = Program(Seeds(learner, (0,)), bank, config.devices)
     state = program.initial_state()
     for _ in range(4):
-        state, logs = program.step(state)
+        state, logs, *_ = program.step(state)
         jax.block_until_ready((state, logs))
         seconds.append(time.perf_counter() - begin)
         begin = time.perf_counter()

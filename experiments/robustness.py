@@ -193,7 +193,7 @@ def commands(scenarios: int, part: int) -> dict[str, Command]:
             "--out study",
             "study", overwrite=False, workers=True,
         ),
-        "record": _command("record idm constant_speed --noise 0 0.3 --data part --out drives", "drives"),
+        "record": _command("record idm constant_speed --noise 0 0.3 --data part --out episodes", "episodes"),
     }  # fmt: skip
 
 

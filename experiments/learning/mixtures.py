@@ -61,11 +61,11 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
         out = runs / "drivers" / driver.replace(":", "-")
         yield out, ["evaluate", "--planner", driver, "--data", str(test), "--out", str(out)]
     for mixture in MIXTURES:
-        drives = runs / "drives" / mixture
-        yield drives, ["record", mixture, "--data", str(scenarios), "--out", str(drives)]
+        episodes = runs / "episodes" / mixture
+        yield episodes, ["record", mixture, "--data", str(scenarios), "--out", str(episodes)]
         for name, (preset, *settings) in ALGORITHMS.items():
             folder = runs / mixture / name
-            train = ["train", preset, *settings, *TASK, "--data", str(scenarios), "--drives", str(drives)]
+            train = ["train", preset, *settings, *TASK, "--data", str(scenarios), "--episodes", str(episodes)]
             yield folder, [*train, "--seeds", str(SEEDS), "--out", str(folder)]
             for seed in range(SEEDS):
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"

@@ -67,7 +67,7 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
 
     def iterate() -> Any:
-        state[0], logs = program.step(state[0])
+        state[0], logs, *_ = program.step(state[0])
         return logs
 
     algorithm: Any = config.algorithm

@@ -89,7 +89,7 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
     state = [program.initial_state()]
 
     def whole() -> Any:
-        state[0], logs = program.step(state[0])
+        state[0], logs, *_ = program.step(state[0])
         return logs
 
     return {"whole": whole, "acting": run(act), "simulating": run(simulate)}

@@ -69,7 +69,7 @@ def run(learner, data, seeds, devices):
         assert leaf.nbytes < 1024 or len(copies) == 1, "cores share one copy of the data"
     state = program.initial_state()
     for _ in range(3):
-        state, logs = program.step(state)
+        state, logs, _ = program.step(state)
     inner = getattr(state, "learner", state)
     environments = getattr(inner, "environments", None)
     held = {

@@ -195,7 +195,7 @@ def test_each_seed_has_its_own_multiplier():
     state, alone = program.initial_state(), [Program(Seeds(learner, (seed,)), (), 1) for seed in (3, 4)]
     singles = [single.initial_state() for single in alone]
     for _ in range(3):
-        state, _ = program.step(state)
+        state, *_ = program.step(state)
         singles = [single.step(own)[0] for single, own in zip(alone, singles, strict=True)]
     together = [float(program.seeds.member(state, number).multipliers["failure"]) for number in range(2)]
     assert together[0] != together[1]

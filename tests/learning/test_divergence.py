@@ -66,8 +66,8 @@ def iterate(settings, environment, seeds=(3,), iterations=4):
     program = Program(Seeds(settings.build(environment, SHOWN, iterations), seeds), SHOWN)
     state = program.initial_state()
     for _ in range(iterations):
-        state, logs = program.step(state)
-        yield jax.device_get(state), jax.device_get(logs), np.asarray(program.all_finite(state))
+        state, logs, finite = program.step(state)
+        yield jax.device_get(state), jax.device_get(logs), np.asarray(finite)
 
 
 def is_finite(state):

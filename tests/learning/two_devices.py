@@ -142,14 +142,14 @@ def check_training(name):
     state, rows = program.initial_state(), []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(4):
-            state, logs = program.step(state)
+            state, logs, _ = program.step(state)
             rows.append(jax.device_get(logs))
             if number == 1:
                 Checkpoints(Path(folder)).save(2, state)
         template = program.seeds.member_shapes(program.shapes)
         resumed = program.state_of([Checkpoints(Path(folder)).restore(template)])
     for number in (2, 3):
-        resumed, logs = program.step(resumed)
+        resumed, logs, _ = program.step(resumed)
         jax.tree.map(same, jax.device_get(logs), rows[number])
     jax.tree.map(same, state.parameters, resumed.parameters)
 

@@ -140,22 +140,21 @@ class Program:
                 shapes, self._layout,
             )  # fmt: skip
         self.data, self.shapes = data, shapes
-        outputs = None if self._layout is None else (self._layout, None)
+        outputs = None if self._layout is None else (self._layout, None, None)
         iterate = jax.jit(self._iterate, donate_argnums=1, out_shardings=outputs)
         with contextlib.nullcontext() if self._layout is None else jax.set_mesh(self._mesh):
             self.compiled = iterate.lower(data, shapes).compile()
-        trained = trained_leaves(shapes)
-        self._is_trained = [keystr(path) in trained for path, _ in jax.tree.leaves_with_path(shapes)]
-        # A separate program: fused with the iteration, the check could change how parameters are rounded.
-        self._all_finite = jax.jit(seeds.all_finite).lower(list(trained.values())).compile()
 
-    def _iterate(self, data: Any, state: Any) -> tuple[Any, Any]:
+    def _iterate(self, data: Any, state: Any) -> tuple[Any, Any, Bool[Array, "*seeds"]]:
         """Iterate whole seeds on each device; learners divide their work themselves if seeds cannot be divided."""
-        if self._layout is None or _SEEDS not in self._mesh.axis_names:
-            return self.seeds.iterate(data, state)
-        specs = (PartitionSpec(), PartitionSpec(_SEEDS))
-        run = jax.shard_map(self.seeds.iterate, in_specs=specs, out_specs=specs[1], check_vma=False)
-        return run(data, state)
+        run = self.seeds.iterate
+        if self._layout is not None and _SEEDS in self._mesh.axis_names:
+            specs = (PartitionSpec(), PartitionSpec(_SEEDS))
+            run = jax.shard_map(run, in_specs=specs, out_specs=specs[1], check_vma=False)
+        after, logs = run(data, state)
+        # Fused with the iteration, the check could change how parameters are rounded.
+        leaves = jax.lax.optimization_barrier(list(trained_leaves(after).values()))
+        return after, logs, self.seeds.all_finite(leaves)
 
     def account(self, validation: Any = None) -> MemoryAccount:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
@@ -170,14 +169,12 @@ class Program:
         state = self.seeds.stack(states)
         return state if self._layout is None else jax.device_put(state, self._layout)
 
-    def step(self, state: Any) -> tuple[Any, Any]:
-        """Return the state after one iteration, and the logs of each seed; the old state is donated."""
-        return self.compiled(self.data, state)
+    def step(self, state: Any) -> tuple[Any, Any, Bool[Array, "*seeds"]]:
+        """Return the state after one iteration, and of each seed the logs and whether all trained leaves are finite.
 
-    def all_finite(self, state: Any) -> Bool[Array, "*seeds"]:
-        """Return whether all trained leaves of the state after an iteration are finite, for each seed."""
-        leaves = zip(jax.tree.leaves(state), self._is_trained, strict=True)
-        return self._all_finite([leaf for leaf, is_trained in leaves if is_trained])
+        The old state is donated.
+        """
+        return self.compiled(self.data, state)
 
 
 def trained_leaves(state: Any) -> dict[str, Any]:
