@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drivax import settings
+from drivax.learning import loop
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
@@ -16,6 +17,7 @@ from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
+from drivax.report.pages.report import write_report
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
@@ -92,7 +94,7 @@ def rows(td_error=(1.0, 0.5, 0.3, 0.2), q_error=0.2, q_rank=0.8, entropy=-2.0):
     [
         ({"td_error": (1.0, 0.5, 0.37, 1.0)}, "the TD error rises over the second half, from 0.37 to 1"),
         ({"q_error": 0.6}, "Q is off by 0.60 standard deviations of the policy's returns"),
-        ({"q_rank": 0.3}, "Q has a rank correlation of 0.30 with the returns of held-out drives"),
+        ({"q_rank": 0.3}, "Q has a rank correlation of 0.30 with the returns of held-out episodes"),
         ({"q_error": float("nan")}, "Q is off by nan standard deviations"),
         ({"q_rank": float("nan")}, "Q has a rank correlation of nan"),
         ({"entropy": -0.9}, "the entropy is -0.90, its target -2.00"),
@@ -109,24 +111,40 @@ def test_runs_without_returns_are_not_checked():
     assert critic_problems(rows(entropy=3.0)) == []
 
 
+#: Three iterations, after which Q knows nothing.
+TINY = {
+    "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
+    "algorithm": {
+        "kind": "iql", "batch": 8, "updates": 1,
+        "network": {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]},
+    },
+    "total_steps": 24,
+}  # fmt: skip
+
+
+def test_critics_are_judged_at_the_checkpoint_that_is_loaded(data, tmp_path, monkeypatch):
+    """The best is the second of three."""
+    scores = iter((0.2, 0.7, 0.5))
+    monkeypatch.setattr(loop, "validate", lambda *_: {"validation/vmax_score": next(scores)})
+    config = settings.load(TrainConfig, TINY | {"evaluate_every": 1, "checkpoint_rule": "score"})
+    run = train(config, data, tmp_path / "run", validation=data)
+    rows = run.read_metrics()
+    assert len(rows) == 3 and rows[1]["validation/q_error"] != rows[2]["validation/q_error"]
+    assert run.info["critics"] == critic_problems(rows[:2]) != critic_problems(rows)
+
+
 def test_policies_of_unhealthy_critics_are_named_so(data, tmp_path):
-    """After three iterations Q knows nothing: the run says it, and so does the name in tables."""
-    values = {
-        "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
-        "algorithm": {
-            "kind": "iql", "batch": 8, "updates": 1,
-            "network": {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]},
-        },
-        "total_steps": 24,
-    }  # fmt: skip
+    """The run says it, and so do the name in tables and the report."""
     lines = []
-    run = train(settings.load(TrainConfig, values), data, tmp_path / "run", validation=data, log=lines.append)
+    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "run", validation=data, log=lines.append)
     row = run.read_metrics()[-1]
     assert row["validation/q_error"] > 0.5 and -1.0 <= row["validation/q_rank"] <= 1.0
     assert any("Q is off by" in problem for problem in run.info["critics"])
     assert any("unhealthy critics: Q is off by" in line for line in lines)
     planner, _ = load_policy(run.path, ScenarioBank.from_scenarios(data))
     assert planner.name == "run (unhealthy critics)"
+    page = write_report([run.path], tmp_path / "report.html").read_text()
+    assert "Unhealthy critics:" in page and "<li>run: Q is off by" in page
 
 
 def test_metrics_of_critics_agree_with_their_definition(data):

@@ -1,4 +1,4 @@
-"""``drivax record``: record drives of several planners, to learn from offline."""
+"""``drivax record``: record episodes of several planners, to learn from offline."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class RecordConfig:
 
     Attributes:
         noise: Standard deviations of noise on the actions of each planner; mixtures have their own.
-        seeds: Number of drives of each kind per scenario; without noise and samples they are equal.
+        seeds: Number of episodes of each kind per scenario; without noise and samples they are equal.
         seed: First seed.
         sample: Let trained policies sample their actions instead of taking the mode.
         traffic: Traffic model, as for drivax evaluate; training must have the same.
-        start_step: Step of the log at which drives start.
+        start_step: Step of the log at which episodes start.
         filter: Only scenarios that meet this condition; repeat it to combine several.
         limit: Only the first N scenarios that remain after filtering.
     """
@@ -75,18 +75,18 @@ class RecordConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Record(RecordConfig):
-    """Record drives of planners on every scenario of a set, failures included, for offline learning.
+    """Record episodes of planners on every scenario of a set, failures included, for offline learning.
 
     PLANNER is that of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium (a clone,
     without and with noise) or mixed (the log, and a driver that follows it with noise; pdm; idm without and with noise;
     a clone; an aggressive driver; one that ignores traffic). --task.KEY VALUE changes the task of planners that are not
     trained.
 
-    OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --drives OUT learns from them.
+    OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --episodes OUT learns from them.
 
-    Example: drivax record mixed --data sets/train --out drives/mixed
+    Example: drivax record mixed --data sets/train --out episodes/mixed
 
-    Example: drivax record idm pdm runs/ppo@all --noise 0 0.3 --data sets/train --out drives/all
+    Example: drivax record idm pdm runs/ppo@all --noise 0 0.3 --data sets/train --out episodes/all
     """
 
     planners: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PLANNER")]
@@ -103,8 +103,8 @@ class Record(RecordConfig):
 
 
 def run(args: Record, overrides: Sequence[str] = ()) -> int:
-    """Record all drives, then print their headline metrics."""
-    RunFolder.check(args.out, args.overwrite, "drives")
+    """Record all episodes, then print their headline metrics."""
+    RunFolder.check(args.out, args.overwrite, "episodes")
     traffic, task = as_traffic(args.traffic, args.trust_code), requested_task(overrides)
     data, summaries = ScenarioSet.open(args.data), []
     first = load(args.data, 1, filters=args.filter)
@@ -118,8 +118,11 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
         )
         add_noise(planner, noise)
         drivers[name, noise] = planner, driver_task, is_trained
+    runs = []
     with replace_folder(args.out) as partial_folder:
-        RunFolder.create(partial_folder, record_of(RecordConfig, args), [data], overwrite=True, kind="drives")
+        recording = RunFolder.create(
+            partial_folder, record_of(RecordConfig, args), [data], overwrite=True, kind="episodes"
+        )
         for number, ((name, noise), seed) in enumerate(itertools.product(drivers, seeds)):
             planner, driver_task, is_trained = drivers[name, noise]
             config = EvaluationConfig(
@@ -134,16 +137,19 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
                 task=replace(driver_task, conditions=fix_conditions(driver_task.conditions)),
             )
             text = re.sub(r"[^\w.]+", "-", name)[-40:]
-            out = partial_folder / f"{number:02d}-{text}"
-            table = run_evaluation(config, planner, data, out, traffic=traffic, sizes=first.sizes)
+            runs.append(f"{number:02d}-{text}")
+            table = run_evaluation(
+                config, planner, data, partial_folder / runs[-1], traffic=traffic, sizes=first.sizes
+            )
             summaries.append(table.summary())
+        recording.note(runs=runs)
     show(format_summary(summaries))
     show(f"wrote {args.out}")
     return 0
 
 
 def _drivers(planners: Sequence[str], noise: Sequence[float]) -> Iterator[tuple[str, float]]:
-    """Yield planner and noise of every kind of drive."""
+    """Yield planner and noise of every kind of episode."""
     for name in planners:
         if name in MIXTURES:
             yield from MIXTURES[name]

@@ -20,4 +20,4 @@ from .policies import policy_traffic as policy_traffic
 from .replay import ReplayBuffer as ReplayBuffer
 from .replay import ReplayConfig as ReplayConfig
 from .training_set import TrainingSet as TrainingSet
-from .training_set import read_drives as read_drives
+from .training_set import read_episodes as read_episodes

@@ -122,7 +122,7 @@ class HasCritics(Protocol):
     """A learner that can tell at the end of a run whether its critics are healthy."""
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
-        """Return what is wrong with the critics, given the rows of ``metrics.jsonl``; None if they were not checked."""
+        """Return what is wrong with the critics, given the rows of ``metrics.jsonl`` up to the policy, or None."""
         ...
 
 

@@ -1,8 +1,8 @@
-"""Health of critics: whether Q values are returns, rank drives by their return, and have converged.
+"""Health of critics: whether Q values are returns, rank episodes by their return, and have converged.
 
 Q values that diverge, or that only fit the data, still train a policy: in effect an imitation. Each validation of an
 offline run in driving compares the critics with simulated returns of the present policy, and with returns of held-out
-drives; the end of the run names what is wrong.
+episodes; the end of the run names what is wrong.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from drivax.learning.driving import Driving, keep
+from drivax.learning.driving import BATCH, Driving
 from drivax.learning.experience import ExpertSteps
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import SimState
 
 #: Largest root mean square error of Q, in standard deviations of the simulated returns.
 MOST_Q_ERROR = 0.5
-#: Least rank correlation (Spearman) of Q with the returns of held-out drives.
+#: Least rank correlation (Spearman) of Q with the returns of held-out episodes.
 LEAST_Q_RANK = 0.5
 #: Largest mean TD error of the last quarter of a run relative to the quarter before it.
 MOST_TD_RISE = 1.05
@@ -46,27 +47,32 @@ def policy_returns(
         of ``gamma`` times the final state's value.
     """
     simulator = Simulator(replace(environment.task, metrics="none"), environment.simulator.traffic)
-    state = jax.vmap(partial(simulator.reset, bank))(jnp.arange(len(bank)))
+
+    def observe(state: SimState) -> Observation:
+        return dict(simulator.observe(bank, state.context))
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
         state, over, value, discount = carry
-        action = act(environment.observe_all(bank, state.context))
-        after, result = jax.vmap(simulator.step, (None, 0, 0))(bank, state, action)
+        action = act(jax.tree.map(lambda leaf: leaf[None], observe(state)))[0]
+        after, result = simulator.step(bank, state, action)
         value = value + jnp.where(over, 0.0, discount * result.reward)
         discount = jnp.where(over, discount, jnp.where(result.terminated, 0.0, gamma * discount))
-        return (keep(over, state, after), over | result.terminated | result.truncated, value, discount), None
+        state = jax.tree.map(partial(jnp.where, over), state, after)
+        return (state, over | result.terminated | result.truncated, value, discount), None
 
-    over, value = jnp.zeros(len(bank), bool), jnp.zeros(len(bank))
-    first = environment.observe_all(bank, state.context)
-    carry = (state, over, value, jnp.ones(len(bank)))
-    (state, _, value, discount), _ = jax.lax.scan(step, carry, None, bank.steps - 1 - CURRENT_STEP)
-    return value, discount, first, environment.observe_all(bank, state.context)
+    def episode(index: Int[Array, ""]) -> tuple[Array, Array, Observation, Observation]:
+        initial = simulator.reset(bank, index)
+        carry = (initial, jnp.zeros((), bool), jnp.zeros(()), jnp.ones(()))
+        (final, _, value, discount), _ = jax.lax.scan(step, carry, None, bank.steps - 1 - CURRENT_STEP)
+        return value, discount, observe(initial), observe(final)
+
+    return jax.lax.map(episode, jnp.arange(len(bank)), batch_size=min(len(bank), BATCH))
 
 
 def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: float) -> Float[Array, "M T"]:
-    """Return the discounted return of recorded drives from each usable step on; elsewhere it is undefined.
+    """Return the discounted return of recorded episodes from each usable step on; elsewhere it is undefined.
 
-    ``final_value`` is the value of the state in which a drive ends without termination.
+    ``final_value`` is the value of the state in which an episode ends without termination.
     """
 
     def step(value: Array, step_t: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -79,7 +85,7 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
 
 
 def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str] | None:
-    """Return what is wrong with the critics of a finished run, given the rows of its ``metrics.jsonl``.
+    """Return what is wrong with the critics of a run, given the rows of its ``metrics.jsonl`` up to its policy.
 
     None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
     None for a policy without one.
@@ -95,7 +101,7 @@ def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None =
     if not errors[-1] <= MOST_Q_ERROR:
         problems.append(f"Q is off by {errors[-1]:.2f} standard deviations of the policy's returns")
     if not ranks[-1] >= LEAST_Q_RANK:
-        problems.append(f"Q has a rank correlation of {ranks[-1]:.2f} with the returns of held-out drives")
+        problems.append(f"Q has a rank correlation of {ranks[-1]:.2f} with the returns of held-out episodes")
     entropies = _column(rows, "loss/entropy")
     entropies = entropies[len(entropies) * 3 // 4 :]
     if entropy is not None and len(entropies) and not abs(entropies.mean() - entropy) <= MOST_ENTROPY_ERROR:

@@ -32,7 +32,7 @@ from drivax.tasks.task import Task
 
 #: Vehicles that the policy drives in training: recorded egos, or any ego of a scenario (``scenario.build.assemble``).
 Egos = Literal["recorded", "moving"]
-#: Number of logs, or recorded drives, that are replayed in one batch.
+#: Number of logs, or recorded episodes, that are replayed in one batch.
 BATCH = 64
 
 

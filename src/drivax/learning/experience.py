@@ -99,11 +99,12 @@ def check_weights(weights: np.ndarray, scenarios: int, steps: int, egos: int) ->
 
 @record
 class ExpertSteps:
-    """Actions of experts, within the bounds, at T steps of M logs (or recorded drives), and their outcome.
+    """Actions of experts, within the bounds, at T steps of M logs (or recorded episodes), and their outcome.
 
     Values of steps that are not ``usable`` are undefined. A ``clipped`` action does not lead to the next state: it was
     clipped to the bounds, or is not at the first step of its decision. ``hold`` is the number of steps per decision
-    (``Task.hold``), ``egos`` that of logs per scenario. ``scenario`` is the scenario of each log, if not in that order.
+    (``Task.hold``), ``egos`` that of logs per scenario. Episodes have ``scenario``, the scenario of each, out of
+    ``scenarios``.
     """
 
     action: Float[Array, "M T D"]
@@ -114,6 +115,7 @@ class ExpertSteps:
     clipped: Bool[Array, "M T"]
     hold: int = static(default=1)
     egos: int = static(default=1)
+    scenarios: int = static(default=0)
     scenario: Int[Array, " M"] | None = None
 
 
@@ -150,7 +152,7 @@ class Experience:
         data: The environment's data.
         expert: The expert's steps.
         usable: Steps to learn from.
-        uniform: Sampler that draws usable steps, of all drives, with equal probability.
+        uniform: Sampler that draws usable steps, of all episodes, with equal probability.
         critic: Sampler of steps for policy evaluation.
         policy: Sampler of steps for policy improvement; None: that of the critic.
     """
@@ -175,7 +177,7 @@ class ExperienceConfig:
     Attributes:
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
         weighted: What weights apply to: ``all``, or only the ``policy``, with values learned from uniform steps.
-        best: Share of the drives of each scenario, those with the highest return, to learn from; at least one.
+        best: Share of the episodes of each scenario, those with the highest return, to learn from; at least one.
     """
 
     mask_clipped: bool = True
@@ -206,8 +208,8 @@ class ExperienceConfig:
         uniform = critic = sampler(np.asarray(usable, np.float64))
         if self.best < 1.0:
             if expert.scenario is None:
-                problem = f"best is {self.best:g}, but there are no recorded drives to choose from"
-                raise UsageError(problem, cure="give some with --drives, or leave out best")
+                problem = f"best is {self.best:g}, but there are no recorded episodes to choose from"
+                raise UsageError(problem, cure="give some with --episodes, or leave out best")
             usable &= _has_high_return(expert, usable, self.best)[:, None]
             critic = sampler(np.asarray(usable, np.float64))
         if weights is None:
@@ -219,9 +221,9 @@ class ExperienceConfig:
 
 
 def _has_high_return(expert: ExpertSteps, usable: Bool[Array, "M T"], share: float) -> Bool[np.ndarray, " M"]:
-    """Mask of the ``share`` of the drives of each scenario with the highest return, at least one.
+    """Mask of the ``share`` of the episodes of each scenario with the highest return, at least one.
 
-    Drives without a usable step rank last.
+    Episodes without a usable step rank last.
     """
     returns = np.where(usable.any(axis=1), np.sum(expert.reward * expert.usable, axis=1), -np.inf)
     count, scenario = len(returns), np.asarray(expert.scenario)
@@ -237,7 +239,7 @@ def _weights_of_logs(weights: np.ndarray, expert: ExpertSteps) -> np.ndarray:
     (logs, steps), egos = expert.usable.shape, expert.egos
     if expert.scenario is not None:
         scenarios = np.asarray(expert.scenario)
-        return check_weights(weights, len(weights), steps, 1)[scenarios, 0]
+        return check_weights(weights, expert.scenarios, steps, 1)[scenarios, 0]
     weights = check_weights(weights, logs // egos, steps, egos)
     return np.broadcast_to(weights, (logs // egos, egos, steps)).reshape(logs, steps)
 

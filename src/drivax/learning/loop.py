@@ -22,13 +22,14 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
-from drivax.learning.drives import Driven
 from drivax.learning.driving import Driving, count_egos
 from drivax.learning.experience import check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import find_traffic
 from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
+from drivax.learning.recorded_episodes import RecordedDriving
+from drivax.learning.stored_episodes import StoredDriving, StoredEpisodes, fit_observations
 from drivax.learning.training_log import (
     Preempted,
     StopSignal,
@@ -38,10 +39,9 @@ from drivax.learning.training_log import (
 )
 from drivax.learning.training_set import (
     TrainingSet,
-    driven_environment,
-    drives_digest,
-    have_drives,
-    prepare_drives,
+    episodes_digest,
+    prepare_episodes,
+    recorded_environment,
 )
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
@@ -57,12 +57,12 @@ from drivax.tracking.run_folder import RUN_FILE, RunFolder
 _RESUMED_WITH_OTHER = {
     "validation": ("was validated on other scenarios or none", "--validation"),
     "weights": ("was trained with other weights or none", "weights"),
-    "drives": ("was trained on other drives or none", "--drives"),
+    "recorded_episodes": ("was trained on other episodes or none", "--episodes"),
     "data": ("was trained on other scenarios", "--data"),
 }
 
 #: Entries of ``run.json`` that the folders of several seeds share.
-_INHERITED_NOTES = ("validation", "weights", "drives", "networks_from", "devices")
+_INHERITED_NOTES = ("validation", "weights", "recorded_episodes", "networks_from", "devices")
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank, *, trust: Sequence[str] = ()) -> Any:
@@ -116,7 +116,7 @@ def train(
     Args:
         config: Settings of the training.
         data: Scenarios to train on, all held on the device. Weights are for ``bc``, offline algorithms, and ``sac`` and
-            ``bc_sac`` with ``demonstrations``; drives for ``bc`` and offline algorithms.
+            ``bc_sac`` with ``demonstrations``; episodes for ``bc`` and offline algorithms.
         out: Run folder.
         validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
             its scenarios (and 256), else the smallest recording; none if there is only one. None trains on all
@@ -134,9 +134,9 @@ def train(
     opts, out, folders = TrainOptions(**options), Path(out), list[RunFolder]()
     trust = (*opts.trust, *modules_of(config))
     training = data if isinstance(data, TrainingSet) else TrainingSet(data)
-    data, drives = training.scenarios, training.drives
+    data, episodes = training.scenarios, training.episodes
     validation_set = _validation_set(data, validation, out, opts.resume)
-    notes = hashes(validation_set, training.weights) | {"drives": drives_digest(drives)}
+    notes = hashes(validation_set, training.weights) | {"recorded_episodes": episodes_digest(episodes)}
     if opts.resume:
         config, folders = _resumed_folders(data, notes, out, opts.seeds, trust)
     else:
@@ -144,9 +144,9 @@ def train(
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     scenarios, weights, validation_scenarios = _divide(config, data, training.weights, validation_set)
-    environment, environment_data = _environment(config, scenarios, trust, drives)
+    environment, environment_data = _environment(config, scenarios, trust, training)
     learner = config.algorithm.build(environment, environment_data, config.iterations)
-    held_out = _held_out(config, environment, learner, validation_scenarios, drives)
+    held_out = _held_out(config, environment, learner, validation_scenarios, episodes)
     seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
     experience = training_data(config.algorithm, environment, environment_data, weights)
     program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
@@ -211,15 +211,16 @@ def usable_steps(
 ) -> np.ndarray:
     """Return the mask ``[M, T]`` of the logged steps that training with weights can draw, for each ego it drives.
 
-    With drives, it holds where any drive of the scenario has such a step. ``trust`` is as for :func:`train`.
+    With episodes, it holds where any episode of the scenario has such a step. ``trust`` is as for :func:`train`.
 
     Raises:
         UsageError: The algorithm does not draw logged steps by weight.
     """
     training = data if isinstance(data, TrainingSet) else TrainingSet(data)
     scenarios, steps = training.scenarios, training.scenarios.capacity.steps
-    environment, environment_data = _environment(config, scenarios, trust, training.drives)
     uniform = np.ones((len(scenarios), steps))
+    weighted = replace(training, weights=uniform)
+    environment, environment_data = _environment(config, scenarios, trust, weighted)
     experience = training_data(config.algorithm, environment, environment_data, uniform)
     usable, scenario = np.asarray(experience.usable), experience.expert.scenario
     if scenario is None:
@@ -264,46 +265,56 @@ def _held_out(
     environment: Driving | Mixture,
     learner: Any,
     scenarios: Sequence[Scenario] | None,
-    drives: Sequence[EpisodeTable],
+    episodes: Sequence[EpisodeTable] | StoredEpisodes,
 ) -> Validation | None:
     """Return the validation on scenarios, with the data of a learner's held-out metrics; None without scenarios.
 
-    Without recorded drives in these scenarios, there are no such data, and no such metrics.
+    Without recorded episodes in these scenarios, there are no such data, and no such metrics.
     """
     if scenarios is None:
         return None
     held_out = Validation.of(scenarios)
-    if not isinstance(learner, HeldOutMetrics):
+    if isinstance(episodes, StoredEpisodes) or not isinstance(learner, HeldOutMetrics):
         return held_out
     data: Any = environment.prepare(held_out.bank)
-    if isinstance(environment, Driven):
-        if not have_drives(scenarios, drives):
+    if isinstance(environment, RecordedDriving):
+        data = prepare_episodes(environment, data, scenarios, episodes)
+        if data is None:
             return held_out
-        data = prepare_drives(environment, data, scenarios, drives)
     return replace(held_out, data=training_data(config.algorithm, environment, data))
 
 
 def _environment(
-    config: TrainConfig, data: Sequence[Scenario], trust: Sequence[str], drives: Sequence[EpisodeTable] = ()
+    config: TrainConfig, data: Sequence[Scenario], trust: Sequence[str], training: TrainingSet
 ) -> tuple[Driving | Mixture, Any]:
-    """Return the environment of a training, and its data: the bank, or recorded drives in it.
+    """Return the environment of a training, and its data: the bank, or episodes in it.
 
     Raises:
-        UsageError: ``egos`` is moving, but the set has no further egos; or the training cannot use drives.
+        UsageError: ``egos`` is moving, but the set has no further egos; or the training cannot use the episodes.
     """
     environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
     count_egos(config.egos, bank.most_egos)
-    bank = environment.prepare(bank)
-    if not drives:
+    bank, episodes = environment.prepare(bank), training.episodes
+    if not episodes:
         return environment, bank
     if not isinstance(config.algorithm, OfflineConfig | BcConfig):
-        problem = f"{type(config.algorithm).__name__} does not learn from recorded drives"
-        raise UsageError(problem, cure="leave out the drives, or use bc, cql, iql, awac or td3_bc")
+        problem = f"{type(config.algorithm).__name__} does not learn from recorded episodes"
+        raise UsageError(problem, cure="leave out the episodes, or use bc, cql, iql, awac or td3_bc")
     if not isinstance(environment, Driving) or config.egos != "recorded":
-        problem = "recorded drives are those of the recorded ego, in one kind of traffic"
+        problem = "recorded episodes are those of the recorded ego, in one kind of traffic"
         raise UsageError(problem, cure="leave out egos, and use one traffic")
-    environment = driven_environment(environment, drives)
-    return environment, prepare_drives(environment, bank, data, drives)
+    if isinstance(episodes, StoredEpisodes):
+        if training.weights is not None:
+            raise UsageError("weights of scenarios do not fit stored episodes", cure="leave out one of both")
+        stored = fit_observations(episodes, environment.shapes(bank), environment.action_size)
+        return StoredDriving(environment.simulator), stored
+    environment = recorded_environment(environment, episodes)
+    recorded = prepare_episodes(environment, bank, data, episodes)
+    if recorded is None:
+        raise DataError(
+            "no recorded episode is in the scenarios to train on", cure="record some: drivax record"
+        )
+    return environment, recorded
 
 
 def _create_folders(
@@ -383,8 +394,8 @@ class _Training:
                 if all(log.stopped for log in self.logs):
                     break
                 started = time.perf_counter()
-                state, values = program.step(state)
-                values, finite = jax.device_get((values, program.all_finite(state)))
+                state, values, finite = program.step(state)
+                values, finite = jax.device_get((values, finite))
                 rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
                 # Read once, so that all seeds write a checkpoint of the same iteration.
                 preempted = stop.received and iteration < config.iterations
@@ -398,15 +409,26 @@ class _Training:
                 if preempted:
                     problem = f"SIGTERM stopped the training after {self._steps(iteration):,} steps"
                     raise Preempted(problem, cure="continue it with --resume")
-        for number, log in enumerate(self.logs):
-            if log.divergence is None and isinstance(program.seeds.learner, HasCritics):
-                problems = program.seeds.learner.critic_problems(list(log.folder.metric_rows()))
-                log.folder = log.folder.note(critics=problems)
-                for problem in problems or ():
-                    self.log(f"warning: seed {program.seeds.seeds[number]}: unhealthy critics: {problem}")
+        self._check_critics()
         for log in self.logs:
             if log.divergence is not None:
                 raise log.divergence
+
+    def _check_critics(self) -> None:
+        """Note what is wrong with the critics of each finished seed."""
+        seeds = self.program.seeds
+        if not isinstance(seeds.learner, HasCritics):
+            return
+        for seed, log in zip(seeds.seeds, self.logs, strict=True):
+            if log.divergence is not None:
+                continue
+            # Later rows say nothing about the policy that is loaded.
+            step = log.checkpoints.best_or_newest()
+            rows = [row for row in log.folder.metric_rows() if step is None or row["step"] <= step]
+            problems = seeds.learner.critic_problems(rows)
+            log.folder = log.folder.note(critics=problems)
+            for problem in problems or ():
+                self.log(f"warning: seed {seed}: unhealthy critics: {problem}")
 
     def _steps(self, iteration: int) -> int:
         """Return the environment steps of each seed after an iteration."""

@@ -1,4 +1,4 @@
-"""Sets to train on, and recorded drives in them: evaluations of any drivers."""
+"""Sets to train on, and recorded episodes in them: evaluations of any drivers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,13 +16,16 @@ from drivax import settings
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.learning.drives import Driven, Drives, replay_drives
+from drivax.files import inside
 from drivax.learning.driving import Driving
+from drivax.learning.recorded_episodes import RecordedDriving, RecordedEpisodes, replay_episodes
+from drivax.learning.stored_episodes import StoredEpisodes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
+from drivax.tracking.run_folder import RunFolder
 
 _RECORD = "record them again: drivax record"
 
@@ -33,24 +37,29 @@ class TrainingSet:
     Attributes:
         scenarios: The scenarios.
         weights: Sampling weights of steps, at least 0, ``[M, T]`` (:meth:`ExperienceConfig.of`); None: uniform.
-        drives: Recorded drives in these scenarios to learn from instead of the logs (:func:`read_drives`).
+        episodes: Episodes to learn from instead of the logs: recorded in these scenarios (:func:`read_episodes`), or
+            stored with the observations of the training.
     """
 
     scenarios: ScenarioSet
     weights: np.ndarray | None = None
-    drives: tuple[EpisodeTable, ...] = ()
+    episodes: tuple[EpisodeTable, ...] | StoredEpisodes = ()
 
 
-def driven_environment(environment: Driving, drives: Sequence[EpisodeTable]) -> Driven:
-    """Return the environment of recorded drives, with the task and traffic of a training environment."""
-    start_step = int(drives[0].settings["start_step"])
-    return Driven(Simulator(environment.task, environment.simulator.traffic), start_step=start_step)
+def recorded_environment(environment: Driving, episodes: Sequence[EpisodeTable]) -> RecordedDriving:
+    """Return the environment of recorded episodes, with the task and traffic of a training environment."""
+    start_step = int(episodes[0].settings["start_step"])
+    return RecordedDriving(Simulator(environment.task, environment.simulator.traffic), start_step=start_step)
 
 
-def drives_digest(drives: Iterable[EpisodeTable]) -> str | None:
-    """Return a SHA-256 of the scenarios, motions and actions of drives, for ``run.json``; None without drives."""
+def episodes_digest(episodes: Iterable[EpisodeTable] | StoredEpisodes) -> str | None:
+    """Return a SHA-256 of the actions of episodes and what they see, for ``run.json``; None without episodes."""
     digest, empty = hashlib.sha256(), True
-    for table in drives:
+    if isinstance(episodes, StoredEpisodes):
+        for values in jax.tree.leaves(episodes):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()
+    for table in episodes:
         digest.update(repr(table.scenarios).encode())
         for values in (table.trajectories.ego, table.trajectories.action):
             digest.update(np.ascontiguousarray(values).tobytes())
@@ -58,41 +67,42 @@ def drives_digest(drives: Iterable[EpisodeTable]) -> str | None:
     return None if empty else digest.hexdigest()
 
 
-def read_drives(
+def read_episodes(
     paths: Iterable[str | Path], scenarios: ScenarioSet, task: Task, traffic: str = "log"
 ) -> tuple[EpisodeTable, ...]:
-    """Read recorded drives: folders of ``drivax record``, or run folders of ``drivax evaluate``.
+    """Read recorded episodes: folders of ``drivax record``, or run folders of ``drivax evaluate``.
 
     Raises:
-        DataError: A folder is missing or damaged, or its drives are in another set.
+        DataError: A folder is missing or damaged, or its episodes are in another set.
         UsageError: They have another action space, decision interval or traffic than the training, began elsewhere than
             on the log, or at different steps.
     """
-    tables = tuple(EpisodeTable.read(folder) for path in paths for folder in _runs(Path(path)))
+    tables = tuple(EpisodeTable.read(folder) for path in paths for folder in episode_folders(path))
     expected: dict[str, Any] = {"task.hold": task.hold, "traffic": traffic, "noisy_start": False}
     expected["start_step"] = tables[0].settings.get("start_step") if tables else None
     if tables and type(expected["start_step"]) is not int:
-        problem = f"start_step of its drives is {expected['start_step']!r}"
+        problem = f"start_step of its episodes is {expected['start_step']!r}"
         raise DataError(problem, file=tables[0].folder, cure=_RECORD)
     dynamics = _dynamics(settings.plain(task)["actions"])
     for table in tables:
         folder = table.folder
         if table.data.get("hash") != scenarios.hash:
-            problem = f"its drives are not in the scenarios of {scenarios.path}"
+            problem = f"its episodes are not in the scenarios of {scenarios.path}"
             raise DataError(problem, file=folder, cure="give the set in which they were recorded with --data")
         if _dynamics(_entry(table.settings, "task.actions")) != dynamics:
-            problem = "its drives have another action space than the training"
+            problem = "its episodes have another action space than the training"
             raise UsageError(problem, file=folder, cure=f"train with theirs (task.actions), or {_RECORD}")
         for name, value in expected.items():
             if (recorded := _entry(table.settings, name)) != value:
-                problem = f"{name} of its drives is {recorded}, not {value}"
+                problem = f"{name} of its episodes is {recorded}, not {value}"
                 raise UsageError(problem, file=folder, cure=f"train with it, or {_RECORD}")
     return tables
 
 
-def _runs(path: Path) -> list[Path]:
-    """Return the run folders in a folder of ``drivax record``, or the path itself."""
-    return sorted(file.parent for file in path.glob("*/run.json")) or [path]
+def episode_folders(path: str | Path) -> list[Path]:
+    """Return the run folders of a recording (``drivax record``), or the path itself."""
+    folder = RunFolder.open(path)
+    return [inside(folder.path, str(name)) for name in folder.info.get("runs", ())] or [folder.path]
 
 
 def _dynamics(actions: Any) -> Any:
@@ -109,44 +119,39 @@ def _entry(values: Mapping[str, Any], name: str) -> Any:
     return _entry(value, rest) if rest and isinstance(value, Mapping) else value
 
 
-def have_drives(scenarios: Sequence[Scenario], tables: Sequence[EpisodeTable]) -> bool:
-    """Return whether any drive is in these scenarios."""
-    keys = {(name["dataset"], name["scenario_id"]) for name in scenario_names(scenarios)}
-    return any(not keys.isdisjoint(table.scenarios) for table in tables)
-
-
-def prepare_drives(
-    environment: Driven, bank: ScenarioBank, scenarios: Sequence[Scenario], tables: Sequence[EpisodeTable]
-) -> Drives:
-    """Return the drives of tables in the scenarios of a bank, prepared for the environment's traffic.
+def prepare_episodes(
+    environment: RecordedDriving,
+    bank: ScenarioBank,
+    scenarios: Sequence[Scenario],
+    tables: Sequence[EpisodeTable],
+) -> RecordedEpisodes | None:
+    """Return the episodes of tables in the scenarios of a bank, prepared for the environment's traffic; None without.
 
     Raises:
-        DataError: There are none, or trajectories are damaged.
+        DataError: Trajectories are damaged.
     """
     row_of = {
         (name["dataset"], name["scenario_id"]): row for row, name in enumerate(scenario_names(scenarios))
     }
-    parts = [_drives_in(table, row_of, environment, bank.steps) for table in tables]
-    index, motion, action, is_logged = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    parts = [_episodes_in(table, row_of, environment, bank.steps) for table in tables]
+    index, motion, action = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     if not len(index):
-        raise DataError("no drive is in the scenarios to train on", cure=_RECORD)
-    return replay_drives(environment, bank, *map(jnp.asarray, (index, motion, action, is_logged)))
+        return None
+    return replay_episodes(environment, bank, *map(jnp.asarray, (index, motion, action)))
 
 
-def _drives_in(
-    table: EpisodeTable, row_of: Mapping[tuple[str, str], int], environment: Driven, steps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return bank row, motion, action, and whether the log was replayed, of a table's drives in a bank."""
+def _episodes_in(
+    table: EpisodeTable, row_of: Mapping[tuple[str, str], int], environment: RecordedDriving, steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bank row, motion and action of a table's episodes in a bank."""
     index = np.array([row_of.get(key, -1) for key in table.scenarios])
-    known, drives = np.flatnonzero(index >= 0), table.trajectories
+    known, episodes = np.flatnonzero(index >= 0), table.trajectories
     file = None if table.folder is None else table.folder / "trajectories.npz"
     expected = (steps - environment.start_step, environment.action_size)
-    shape = (drives.ego.shape[1], drives.action.shape[2])
-    if shape != expected or (drives.start != environment.start_step).any():
+    shape = (episodes.ego.shape[1], episodes.action.shape[2])
+    if shape != expected or (episodes.start != environment.start_step).any():
         problem = f"{shape[0]} steps and {shape[1]} numbers per action, not {expected[0]} and {expected[1]}"
         raise DataError(problem, file=file, cure=_RECORD)
-    if not np.isfinite(drives.ego).all():
+    if not np.isfinite(episodes.ego).all():
         raise DataError("a motion is not finite", file=file, cure=_RECORD)
-    # A crashed driver has no actions, and a log that was replayed may exceed their bounds.
-    is_logged = np.full(len(known), table.settings.get("planner") == "expert")
-    return index[known].astype(np.int32), drives.ego[known], drives.action[known], is_logged
+    return index[known].astype(np.int32), episodes.ego[known], episodes.action[known]

@@ -17,7 +17,6 @@ from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
-from drivax.learning.drives import Drives
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
     Experience,
@@ -28,6 +27,7 @@ from drivax.learning.experience import (
     sample_steps,
 )  # fmt: skip
 from drivax.learning.program import sum_over_devices
+from drivax.learning.recorded_episodes import RecordedEpisodes
 from drivax.networks.actor_critic import NetworkConfig, Policy, graph_of
 from drivax.networks.distributions import REPARAMETERISED, Actions, Distribution
 from drivax.planners.functions import NetworkPlanner
@@ -140,7 +140,7 @@ class BcConfig(Cloning):
     """Behaviour cloning: supervised learning of the expert's actions at random steps of the logs.
 
     Attributes:
-        best: Share of the recorded drives of each scenario, those with the highest return, to clone (filtered BC).
+        best: Share of the recorded episodes of each scenario, those with the highest return, to clone (filtered BC).
     """
 
     kind: Literal["bc"] = "bc"
@@ -158,8 +158,8 @@ class BcConfig(Cloning):
         return self.batch * self.updates
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the data, whose ``demonstrations`` are drawn, or experience drawn by weight or of recorded drives."""
-        if weights is None and not isinstance(data, Drives) and self.best == 1.0:
+        """Return the data, whose ``demonstrations`` are drawn, or experience: by weight, or of recorded episodes."""
+        if weights is None and not isinstance(data, RecordedEpisodes) and self.best == 1.0:
             return data
         # The loss masks clipped steps, and logs their share.
         return ExperienceConfig(mask_clipped=False, best=self.best).of(environment, data, weights)

@@ -106,13 +106,23 @@ def _page(
         data.append(episode_data(runs, tags, playable))
         scripts += [*(player_scripts() if packed_episodes else ()), asset("episode_table.js")]
     if trainings:
-        sections.append(section("Learning curves", curve_sections(trainings)))
+        sections.append(section("Learning curves", _unhealthy_critics(trainings), curve_sections(trainings)))
     if runs:
         meanings = explanations(result_tables.sort_metrics(result_tables.metric_names(runs)), runs)
         sections.append(section("What the metrics mean", meanings))
     sections.append(_provenance([*runs, *trainings]))
     title = f"{runs[-1].name}: evaluation report" if runs else "training report"
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
+
+
+def _unhealthy_critics(trainings: Sequence[Training]) -> str:
+    """Return a list of what is wrong with critics; empty if nothing is."""
+    items = [
+        f"<li>{escape(training.name)}: {escape(str(problem))}</li>"
+        for training in trainings
+        for problem in training.info.get("critics") or ()
+    ]
+    return f"<p><b>Unhealthy critics:</b></p><ul>{''.join(items)}</ul>" if items else ""
 
 
 def _lead(runs: Sequence[EpisodeTable]) -> str:

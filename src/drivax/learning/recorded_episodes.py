@@ -1,6 +1,6 @@
-"""Recorded drives: evaluations of any drivers, as logged steps that offline algorithms learn from.
+"""Recorded episodes: evaluations of any drivers, as logged steps that offline algorithms learn from.
 
-An evaluation stores the motion and the executed actions of its driver. Before training, every drive is replayed once,
+An evaluation stores the motion and the executed actions of its driver. Before training, every episode is replayed once,
 with the rewards and episode ends of the training. Only what observations depend on is kept: some 60 bytes per step in
 log traffic, more in reactive traffic.
 """
@@ -13,10 +13,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from drivax.learning.driving import BATCH, Driving
 from drivax.learning.experience import ExpertSteps, StepIndex
+from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
@@ -25,8 +26,8 @@ from drivax.tasks.actions import Route
 
 
 @record
-class Drives:
-    """M drives in the scenarios of a bank, at T steps of the log.
+class RecordedEpisodes:
+    """M episodes in the scenarios of a bank, at T steps of the log.
 
     Attributes:
         bank: The scenarios.
@@ -43,8 +44,8 @@ class Drives:
 
 
 @dataclass(frozen=True)
-class Driven(Driving):
-    """Recorded drives as an environment of logged steps; its data are :class:`Drives`."""
+class RecordedDriving(Driving):
+    """Recorded episodes as an environment of logged steps; its data are :class:`RecordedEpisodes`."""
 
     start_step: int = 0
 
@@ -53,7 +54,7 @@ class Driven(Driving):
         return super().shapes(data.bank)
 
     def expert_steps(self, data: Any) -> ExpertSteps:
-        """Return the steps of the drives."""
+        """Return the steps of the episodes."""
         return data.steps
 
     def observe_recorded(self, data: Any, index: StepIndex) -> dict[str, Array]:
@@ -64,33 +65,36 @@ class Driven(Driving):
         return self.observe_all(data.bank, AgentContext(**values, history=history))
 
     def replay(
-        self, bank: ScenarioBank, drive: tuple[Int[Array, ""], Float[Array, "S 4"], Float[Array, "S1 D"]]
+        self, bank: ScenarioBank, episode: tuple[Int[Array, ""], Float[Array, "S 4"], Float[Array, "S1 D"]]
     ) -> tuple[dict[str, Any], Float[Array, "times 4"], tuple[Array, ...]]:
-        """Replay a drive, which begins as logged.
+        """Replay an episode, which begins as logged.
 
         Returns contexts and motion from ``start_step`` on, and of each step action, reward, ends, and whether the
-        action exceeds the bounds.
+        action does not lead to the next state: it exceeds the bounds, or reaches them in an exact replay of the log,
+        where evaluations clip it.
         """
-        index, motion, action = drive
+        index, motion, action = episode
         simulator = Simulator(replace(self.task, metrics="none"), self.simulator.traffic)
         initial = simulator.reset(bank, index, self.start_step)
 
-        def step(state: Any, drive: tuple[Array, Array]) -> tuple[Any, tuple[Any, ...]]:
-            motion, action = drive
+        def step(state: Any, episode: tuple[Array, Array]) -> tuple[Any, tuple[Any, ...]]:
+            motion, action = episode
             after, result = simulator.replay(bank, state, motion, action)
+            is_logged = (motion == logged_motion(bank, state.context, 1)).all()
             space = self.task.actions
             # In the space ``route``, the executed action is not in the space of the requested one.
             if isinstance(space, Route):
                 action = space.unsteer(bank, state.context, action)
             clipped = space.exceeds_bounds(action)
             action = jnp.clip(action, -1.0, 1.0)
-            outcome = (action, result.reward, result.terminated, result.truncated, clipped)
-            return after, (_without_history(state.context), outcome)
+            outcome = (action, result.reward, result.terminated, result.truncated)
+            return after, (_without_history(state.context), outcome, clipped, is_logged)
 
-        final, (contexts, outcome) = jax.lax.scan(step, initial, (motion[1:], action))
+        final, (contexts, outcome, clipped, is_logged) = jax.lax.scan(step, initial, (motion[1:], action))
         last = jax.tree.map(lambda leaf: leaf[None], _without_history(final.context))
         contexts = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), contexts, last)
-        return contexts, jnp.concatenate([initial.context.history[:-1], motion]), outcome
+        clipped |= is_logged.all() & (jnp.abs(outcome[0]) >= 1.0).any(axis=-1)
+        return contexts, jnp.concatenate([initial.context.history[:-1], motion]), (*outcome, clipped)
 
 
 def _without_history(context: AgentContext) -> dict[str, Any]:
@@ -98,11 +102,11 @@ def _without_history(context: AgentContext) -> dict[str, Any]:
 
 
 @partial(jax.jit, static_argnums=0)
-def replay_drives(
-    environment: Driven, bank: ScenarioBank, index: Int[Array, " M"], motion: Float[Array, "M S 4"],
-    action: Float[Array, "M S1 D"], is_logged: Bool[Array, " M"],
-) -> Drives:  # fmt: skip
-    """Replay all drives, in batches."""
+def replay_episodes(
+    environment: RecordedDriving, bank: ScenarioBank, index: Int[Array, " M"], motion: Float[Array, "M S 4"],
+    action: Float[Array, "M S1 D"],
+) -> RecordedEpisodes:  # fmt: skip
+    """Replay all episodes, in batches."""
     finite = jnp.isfinite(action).all(axis=-1)
     action = jnp.where(finite[..., None], action, 0.0)
     replay = partial(environment.replay, bank)
@@ -120,8 +124,8 @@ def replay_drives(
     over = jnp.cumsum(ends, axis=1) > ends
     is_decision = (time - start) % environment.task.hold == 0
     usable = pad(finite, 1) & ~over & (time >= start)
-    clipped |= ~is_decision | (is_logged[:, None] & (jnp.abs(action) >= 1.0).any(axis=-1))
     steps = ExpertSteps(
-        action, reward, terminated, truncated, usable, clipped, environment.task.hold, scenario=index
-    )
-    return Drives(bank, jax.tree.map(pad, contexts), pad(motion), steps)
+        action, reward, terminated, truncated, usable, clipped | ~is_decision, environment.task.hold,
+        scenarios=len(bank), scenario=index,
+    )  # fmt: skip
+    return RecordedEpisodes(bank, jax.tree.map(pad, contexts), pad(motion), steps)
