@@ -18,6 +18,7 @@ from drivax.escaping import escape_controls
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
+    "minari": "minari", "h5py": "minari",
 }  # fmt: skip
 #: Maximum length of a problem, record or cure, in characters; of longer ones, which quote a value, both ends are kept.
 _LONGEST = 1000

@@ -164,9 +164,9 @@ class _Backend:
         self.simulator = Simulator(self.task, model)
         cpu = jax.devices("cpu")[0]
         self.bank = jax.device_put(prepare_bank(self.simulator.traffic, bank), cpu)
-        self.actions = _action_space(self.task)
+        self.actions = action_space(self.task)
         _, groups = jax.eval_shape(partial(_reset, self.simulator), self.bank, 0)
-        self.observations = gymnasium.spaces.Dict({name: _space(leaf) for name, leaf in groups.items()})
+        self.observations = observation_space(groups)
 
     def check_row(self, scenario: Any) -> int:
         """Return ``scenario`` as a row of the bank, or raise an error if it is not one."""
@@ -436,7 +436,12 @@ def _option(options: Mapping[str, Any] | None, name: str) -> Any:
     return options.get(name)
 
 
-def _action_space(task: Task) -> gymnasium.spaces.Space[Any]:
+def action_space(task: Task) -> gymnasium.spaces.Space[Any]:
+    """Return the space of a task's actions.
+
+    Raises:
+        UsageError: It has no bounds.
+    """
     if isinstance(task.actions, DirectState | Trajectory):
         kind = kind_of(type(task.actions))
         raise UsageError(f"{kind} is unbounded and has no space", cure="use another action space")
@@ -445,10 +450,17 @@ def _action_space(task: Task) -> gymnasium.spaces.Space[Any]:
     return gymnasium.spaces.Box(-1.0, 1.0, (task.actions.size,), np.float32)
 
 
-def _space(leaf: jax.ShapeDtypeStruct) -> gymnasium.spaces.Space[Any]:
-    if leaf.dtype == jnp.int8:
-        return gymnasium.spaces.MultiBinary(leaf.shape)
-    return gymnasium.spaces.Box(-LIMIT, LIMIT, leaf.shape, np.float32)
+def observation_space(groups: Mapping[str, Any]) -> gymnasium.spaces.Space[Any]:
+    """Return the space of observations with the shapes and types of these groups, without empty ones."""
+    return gymnasium.spaces.Dict(
+        {
+            name: gymnasium.spaces.MultiBinary(leaf.shape)
+            if leaf.dtype in (bool, np.int8)
+            else gymnasium.spaces.Box(-LIMIT, LIMIT, leaf.shape, np.float32)
+            for name, leaf in groups.items()
+            if leaf.size
+        }
+    )
 
 
 def _to_numpy(observation: Mapping[str, Array]) -> Observation:

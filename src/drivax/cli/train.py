@@ -20,7 +20,8 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Egos
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import use_all_cores, widen_pool
-from drivax.learning.training_set import TrainingSet, read_drives
+from drivax.learning.stored_episodes import minari_folder
+from drivax.learning.training_set import TrainingSet, read_episodes
 from drivax.scenario.store import ScenarioSet
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Train:
 
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
 
-    Example: drivax train offline/iql --data sets/train --drives drives/mixed --out runs/iql-mixed
+    Example: drivax train offline/iql --data sets/train --episodes episodes/mixed --out runs/iql-mixed
     """
 
     config: tyro.conf.Positional[str]
@@ -61,9 +62,9 @@ class Train:
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
     """Scenario set for the choice of the best checkpoint. By default, whole recordings of DATA are held out: about a
     tenth of its scenarios (at most 256), or the smallest of several if none fits; `none` trains on all of them."""
-    drives: tuple[Path, ...] = ()
-    """Folders of drivax record, or runs of drivax evaluate, on DATA: bc and offline algorithms learn from these drives
-    instead of the logs."""
+    episodes: tuple[Path, ...] = ()
+    """Episodes to learn from instead of the logs, by bc and offline algorithms: folders of drivax record or runs of
+    drivax evaluate, on DATA, or a Minari data set."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc, offline algorithms and sac with demonstrations draw logged steps by them."""
     scale: Literal["step", "scenario"] | None = None
@@ -119,10 +120,18 @@ def _validation(name: str) -> ScenarioSet | Literal["held_out"] | None:
 
 
 def _data(args: Train, config: TrainConfig) -> TrainingSet:
-    """Return the training set, with drives if given, weighted if scores or an arm are given."""
+    """Return the training set, with recorded episodes if given, weighted if scores or an arm are given."""
     data = ScenarioSet.open(args.data)
     traffic = config.traffic if isinstance(config.traffic, str) else "mixed"
-    training = TrainingSet(data, drives=read_drives(args.drives, data, config.task, traffic))
+    stored = [path for path in args.episodes if minari_folder(path) is not None]
+    if len(stored) and len(args.episodes) > 1:
+        raise UsageError("is a Minari data set, not the only one", file=stored[0], cure="give it alone")
+    if stored:
+        from drivax.adapters.minari import read_minari
+
+        training = TrainingSet(data, episodes=read_minari(stored[0]))
+    else:
+        training = TrainingSet(data, episodes=read_episodes(args.episodes, data, config.task, traffic))
     if args.arm is not None:
         return _arm_data(args, args.arm, config, training)
     if args.scores is not None:
