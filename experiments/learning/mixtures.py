@@ -2,6 +2,7 @@
 
 python -m experiments.learning.mixtures run --data BENCHMARK --runs RUNS [--minutes 50]
 python -m experiments.learning.mixtures judge --runs RUNS        (means with intervals, stored)
+python -m experiments.learning.mixtures table                    (write the stored results to the page)
 
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on 1,024 training
 scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`; it
@@ -12,6 +13,7 @@ last one is evaluated.
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 import time
@@ -25,22 +27,15 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_json
 from drivax.tracking.run_folder import RunFolder, versions
 from experiments.learning.benchmark import Episodes, mean_interval
-from experiments.repository import RESULTS
+from experiments.learning.tables import interval, label, table
+from experiments.repository import DOCS, RESULTS, fill_places
 
 RESULT = RESULTS / "mixtures.json"
+PAGE = DOCS / "results" / "mixtures.md"
 SCENARIOS, SEEDS = 1024, 3
 MIXTURES = ("expert", "mixed")
 #: Drivers of `mixed` other than the log.
 DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
-#: Settings of all trainings: the reward of completion, with terms for time to collision and clearance.
-TASK = (
-    "--task.rewards.preset",
-    "completion",
-    "--task.rewards.urgency",
-    "-0.2",
-    "--task.rewards.close",
-    "-0.2",
-)
 #: Preset and settings of each algorithm.
 ALGORITHMS = {
     "bc": ("offline/bc",),
@@ -65,7 +60,7 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
         yield episodes, ["record", mixture, "--data", str(scenarios), "--out", str(episodes)]
         for name, (preset, *settings) in ALGORITHMS.items():
             folder = runs / mixture / name
-            train = ["train", preset, *settings, *TASK, "--data", str(scenarios), "--episodes", str(episodes)]
+            train = ["train", preset, *settings, "--data", str(scenarios), "--episodes", str(episodes)]
             yield folder, [*train, "--seeds", str(SEEDS), "--out", str(folder)]
             for seed in range(SEEDS):
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"
@@ -124,6 +119,35 @@ def compute_results(runs: Path) -> dict[str, Any]:
     return {"command": command, "drivers": means, "policies": policies, "versions": versions()}
 
 
+def page_tables(results: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the tables of the page: drivers, and policies and their differences for each mixture."""
+    heads = [f"`{metric}`" for metric in METRICS]
+
+    def cells(means: dict[str, Any], signed: bool = False) -> list[str]:
+        return [interval(means[metric], signed=signed) for metric in METRICS]
+
+    drivers = [[label(name.replace("-", ":")), *cells(means)] for name, means in results["drivers"].items()]
+    tables = {"drivers": table(["driver", *heads], drivers)}
+    for mixture in MIXTURES:
+        rows, differences = [], []
+        for name in ALGORITHMS:
+            policy = results["policies"].get(f"{mixture}/{name}")
+            if policy is None:
+                continue
+            checked = [problems for problems in policy["critics"] if problems is not None]
+            healthy = sum(not problems for problems in checked)
+            rows.append(
+                [label(name), *cells(policy["means"]), f"{healthy} of {len(checked)}" if checked else "-"]
+            )
+            differences += [
+                [f"{label(name)} - {label(other.replace('-', ':'))}", *cells(values, signed=True)]
+                for other, values in policy["differences"].items()
+            ]
+        tables[mixture] = table(["algorithm", *heads, "healthy critics"], rows)
+        tables[f"{mixture} differences"] = table(["difference", *heads], differences)
+    return tables
+
+
 def _episodes(folders: Sequence[Path]) -> Episodes:
     """Return the episodes of a planner, with a row for each seed."""
     tables = [EpisodeTable.read(folder) for folder in folders]
@@ -141,11 +165,15 @@ def main() -> None:
     running.add_argument("--data", type=Path, required=True)
     running.add_argument("--minutes", type=float, default=50.0)
     judging = commands.add_parser("judge")
+    commands.add_parser("table")
     for command in (running, judging):
         command.add_argument("--runs", type=Path, required=True)
     args = parser.parse_args()
     if args.command == "judge":
         write_json(RESULT, compute_results(args.runs))
+    elif args.command == "table":
+        tables = page_tables(json.loads(RESULT.read_text()))
+        PAGE.write_text(fill_places(PAGE.read_text(), "mixtures.py", tables))
     elif not run(args.data, args.runs, args.minutes):
         print("run again to go on")
 
