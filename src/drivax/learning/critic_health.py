@@ -22,7 +22,6 @@ from drivax.learning.experience import ExpertSteps
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import SimState
 
 #: Largest root mean square error of Q, in standard deviations of the simulated returns.
 MOST_Q_ERROR = 0.5
@@ -48,23 +47,27 @@ def policy_returns(
     """
     simulator = Simulator(replace(environment.task, metrics="none"), environment.simulator.traffic)
 
-    def observe(state: SimState) -> Observation:
-        return dict(simulator.observe(bank, state.context))
-
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        state, over, value, discount = carry
-        action = act(jax.tree.map(lambda leaf: leaf[None], observe(state)))[0]
+    def step(carry: Any, is_first: Array) -> tuple[Any, None]:
+        # One step more than the episode has, so that the final state is observed here, too: tracing takes long.
+        state, over, value, discount, first, _ = carry
+        observation = dict(simulator.observe(bank, state.context))
+        action = act(jax.tree.map(lambda leaf: leaf[None], observation))[0]
         after, result = simulator.step(bank, state, action)
         value = value + jnp.where(over, 0.0, discount * result.reward)
         discount = jnp.where(over, discount, jnp.where(result.terminated, 0.0, gamma * discount))
         state = jax.tree.map(partial(jnp.where, over), state, after)
-        return (state, over | result.terminated | result.truncated, value, discount), None
+        over |= result.terminated | result.truncated
+        first = jax.tree.map(partial(jnp.where, is_first), observation, first)
+        return (state, over, value, discount, first, observation), None
 
     def episode(index: Int[Array, ""]) -> tuple[Array, Array, Observation, Observation]:
         initial = simulator.reset(bank, index)
-        carry = (initial, jnp.zeros((), bool), jnp.zeros(()), jnp.ones(()))
-        (final, _, value, discount), _ = jax.lax.scan(step, carry, None, bank.steps - 1 - CURRENT_STEP)
-        return value, discount, observe(initial), observe(final)
+        shapes = jax.eval_shape(lambda: dict(simulator.observe(bank, initial.context)))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        carry = (initial, jnp.zeros((), bool), jnp.zeros(()), jnp.ones(()), zeros, zeros)
+        steps = jnp.arange(bank.steps - CURRENT_STEP)
+        (_, _, value, discount, first, final), _ = jax.lax.scan(step, carry, steps == 0)
+        return value, discount, first, final
 
     return jax.lax.map(episode, jnp.arange(len(bank)), batch_size=min(len(bank), BATCH))
 

@@ -245,7 +245,8 @@ class Offline(OffPolicy[Config]):
         standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out episodes.
         """
         policy, critic = state.parameters, state.rest["critic"]
-        metrics = {"mean_q": float(self._mean_q(data, policy, critic))}
+        mean_q, q_and_returns = self._held_out_values(data, policy, critic)
+        metrics = {"mean_q": float(mean_q)}
         if self.config.fitted_q.updates:
             metrics["fitted_q"] = float(self._fitted_q(data, policy))
         environment = self.environment
@@ -253,7 +254,7 @@ class Offline(OffPolicy[Config]):
             q, returns = np.asarray(self._policy_returns(data, policy, critic))
             if returns.std() > 0.0:  # more than one scenario
                 metrics["q_error"] = float(np.sqrt(np.mean((q - returns) ** 2)) / returns.std())
-            metrics["q_rank"] = rank_correlation(*np.asarray(self._episode_returns(data, policy, critic)))
+            metrics["q_rank"] = rank_correlation(*np.asarray(q_and_returns))
         return metrics
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
@@ -284,23 +285,23 @@ class Offline(OffPolicy[Config]):
         return jnp.stack([value(first), returns + discount * value(final)])
 
     @partial(jax.jit, static_argnums=0)
-    def _episode_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 B"]:
-        """Return Q of a fixed set of held-out steps, and the returns of their episodes from there."""
+    def _held_out_values(
+        self, data: Experience, policy: Any, critic: Any
+    ) -> tuple[Float[Array, ""], Float[Array, "2 B"]]:
+        """Return the mean Q of the policy, and Q and returns to go of logged actions, over fixed sets of steps."""
         environment, expert = require_log(self.environment), data.expert
         rows, last = jnp.arange(len(expert.usable)), expert.usable.shape[1] - 1
         final = jnp.minimum(last - jnp.argmax(expert.usable[:, ::-1], axis=1) + 1, last)
-        observe = partial(environment.observe_recorded, data.data)
-        final_value = self._policy_value(policy, critic, observe((rows, final)))
-        index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES,))
-        q = self.smaller_q(critic, observe(index), expert.action[index])
-        returns = returns_to_go(expert, final_value, self.config.gamma)
-        return jnp.stack([q, returns[index]])
-
-    @partial(jax.jit, static_argnums=0)
-    def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
-        index = sample_steps(data.critic, jax.random.key(0), (_SAMPLES,))
-        observation = require_log(self.environment).observe_recorded(data.data, index)
-        return jnp.mean(self._policy_value(policy, critic, observation))
+        key = jax.random.key(0)
+        drawn, uniform = (sample_steps(which, key, (_SAMPLES,)) for which in (data.critic, data.uniform))
+        # In one call, because tracing an observation takes long.
+        index = jax.tree.map(lambda *parts: jnp.concatenate(parts), drawn, uniform, (rows, final))
+        observation = environment.observe_recorded(data.data, index)
+        value = self._policy_value(policy, critic, observation)
+        logged = jax.tree.map(lambda leaf: leaf[_SAMPLES : 2 * _SAMPLES], observation)
+        q = self.smaller_q(critic, logged, expert.action[uniform])
+        returns = returns_to_go(expert, value[2 * _SAMPLES :], self.config.gamma)
+        return value[:_SAMPLES].mean(), jnp.stack([q, returns[uniform]])
 
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
