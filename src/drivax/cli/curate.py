@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from drivax.curation.methods import METHODS
 from drivax.errors import UsageError
 from drivax.escaping import escape_controls, show
 from drivax.files import check_output
@@ -19,10 +18,6 @@ if TYPE_CHECKING:
     from drivax.curation.methods import Request
     from drivax.curation.scores import ScoreTable
     from drivax.scenario.store import ScenarioSet
-
-    MethodName = str
-else:
-    MethodName = tyro.extras.literal_type_from_choices(METHODS)
 
 #: Number of the most critical scenarios to print.
 _PRINTED_SCENARIOS = 10
@@ -40,7 +35,17 @@ class Curate:
 
     action_rarity: inverse density of the logged driver's action (action_rarity_published: with the published bins).
 
-    uniform: equal scores. random_matched: the scores of --like, permuted. oracle: labels of the built-in world.
+    query: 1 at steps where a condition holds: --where "cut_in < 20 and speed > 10".
+
+    novelty: distance to the nearest steps of other recordings, in an embedding.
+
+    failures: failures and near misses of planners in evaluations of the set (--runs).
+
+    mixture: the scores of several --tables. random_matched: those of --like, permuted. uniform: equal scores.
+
+    oracle: labels of the built-in world.
+
+    package.module:name: your own function or dataclass.
 
     Example: drivax curate kinematic --data sets/world --out scores.npz --export sets/critical 500
 
@@ -51,7 +56,7 @@ class Curate:
     Example: drivax curate kinematic --data sets/world --out near.npz --again scores.npz --weights urgency 1 braking 0.5
     """
 
-    method: Annotated[MethodName, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
+    method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
     """Name of the method."""
     data: Path
     """Scenario set."""
@@ -59,6 +64,8 @@ class Curate:
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
     """Write the N most critical scenarios, at most one per recording, as the set TOP with scores.npz."""
+    diverse: bool = False
+    """Choose for TOP those of the 4 N most critical scenarios that differ most (k-center), without duplicates."""
     all_windows: bool = False
     """Allow several scenarios of one recording in TOP; with --export."""
     weights: dict[str, float] | None = None
@@ -71,6 +78,15 @@ class Curate:
     """Scores of the same set and METHOD, to combine their components again without scoring."""
     like: Path | None = None
     """Scores of the same set, for random_matched to permute."""
+    tables: tuple[Path, ...] = ()
+    """Scores of the same set, for mixture to combine: --weights kinematic 0.7 ensemble 0.3."""
+    runs: tuple[Path, ...] = ()
+    """Evaluations of DATA, for failures."""
+    members: Path | None = None
+    """Folder of an ensemble: if it exists, its members score DATA; otherwise they are trained and written there. For
+    novelty and --diverse, the first member embeds the steps."""
+    trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
+    """Run code of this module of yours that a saved ensemble names; repeat it to trust several."""
     egos: Egos = "recorded"
     """Vehicles to score: the recorded ego, or all egos of a set made with --egos (moving)."""
     seed: int | None = None
@@ -84,14 +100,14 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and print statistics of scores and weights."""
     from drivax import settings
-    from drivax.curation.methods import Request, check_combination
+    from drivax.curation.methods import Request, check_combination, find_method
     from drivax.curation.scores import read_scores, write_scores
     from drivax.curation.subset import check_top
     from drivax.scenario.store import ScenarioSet
 
-    config = METHODS[args.method].config
-    _check_flags(args, overrides, config is not None)
-    if config is not None:
+    config = find_method(args.method).config
+    _check_flags(args, overrides, is_dataclass(config))
+    if is_dataclass(config):
         seed = ["--seed", str(args.seed)] if args.method == "ensemble" and args.seed is not None else []
         config = settings.load(type(config), args.config or {}, [*overrides, *seed])
     changes = {"weights": args.weights, "scenario": args.scenario}
@@ -108,7 +124,10 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
             )
         check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
-        request = Request(data, args.like, args.seed or 0, config, egos=args.egos)
+        request = Request(
+            data, args.like, args.seed or 0, args.tables, args.runs, config,
+            egos=args.egos, members=args.members, trust=args.trust_code,
+        )  # fmt: skip
         table = score_with_progress(args.method, request)
     else:
         table = read_scores(args.again, data)
@@ -119,7 +138,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     write_scores(table, args.out, args.overwrite)
     _print_statistics(table, args.out)
     if args.export is not None:
-        _export(table, data, *args.export, args.overwrite, args.all_windows)
+        embedding = _embedding(args, data, table) if args.diverse else None
+        _export(table, data, *args.export, args.overwrite, args.all_windows, embedding)
     return 0
 
 
@@ -140,18 +160,26 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
 def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
     """Refuse flags that the method or --again would ignore."""
     again, subject = args.again is not None, args.method
+    is_saved = args.method == "ensemble" and args.members is not None and args.members.exists()
     ignored_values: dict[str, object] = {}
+    if is_saved:
+        subject, has_settings = f"{args.members}, which is trained,", False
+    if not args.diverse and (again or args.method not in ("ensemble", "novelty")):
+        ignored_values["--members"] = args.members
     if again:
         subject = f"{args.again}, which is not scored again,"
         ignored_values["--like"] = args.like
+        ignored_values["--tables"] = args.tables or None
+        ignored_values["--runs"] = args.runs or None
     if again or not has_settings:
         ignored_values["--config"] = args.config
-    if again or args.method not in ("ensemble", "random_matched"):
+    if again or is_saved or args.method not in ("ensemble", "random_matched"):
         ignored_values["--seed"] = args.seed
-    if again or args.method == "random_matched":
+    if again or args.method in ("random_matched", "mixture"):
         ignored_values["--egos"] = None if args.egos == "recorded" else args.egos
-    if args.all_windows and args.export is None:
-        raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
+    for flag, is_given in (("--all-windows", args.all_windows), ("--diverse", args.diverse)):
+        if is_given and args.export is None:
+            raise UsageError(f"{flag} without a subset to choose", cure="pass --export TOP N")
     ignored_flags = [flag for flag, value in ignored_values.items() if value is not None]
     if again or not has_settings:
         ignored_flags += overrides
@@ -164,8 +192,24 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
         )
 
 
+def _embedding(args: Curate, data: ScenarioSet, table: ScoreTable) -> Any:
+    """Return an embedding of every scenario of the set."""
+    from drivax.curation.methods import Request, embedding_of
+    from drivax.curation.novelty import NoveltyConfig, scenario_embeddings
+
+    egos = "recorded" if table.egos == 1 else "moving"
+    request = Request(data, egos=egos, members=args.members, trust=args.trust_code)
+    return scenario_embeddings(embedding_of(NoveltyConfig(), request), data, table.valid)
+
+
 def _export(
-    table: ScoreTable, data: ScenarioSet, top: Path, count: int, overwrite: bool, all_windows: bool
+    table: ScoreTable,
+    data: ScenarioSet,
+    top: Path,
+    count: int,
+    overwrite: bool,
+    all_windows: bool,
+    embedding: Any,
 ) -> None:
     """Write the subset, and print its path and its first scenarios."""
     from drivax.curation.scores import OWN_SCORES, read_scores
@@ -174,11 +218,14 @@ def _export(
     from drivax.tracking.progress import Progress
 
     with Progress("exporting", "scenarios", count) as bar:
-        write_top(table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows)
+        write_top(
+            table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows, embedding
+        )
     file = top / OWN_SCORES
     subset_scores = read_scores(file, ScenarioSet.open(top))
     limit = "" if all_windows else ", at most one per recording"
-    show(f"{top}: the {count:,} most critical scenarios{limit}")
+    kind = "most critical" if embedding is None else "different critical"
+    show(f"{top}: the {len(subset_scores.scenario_ids):,} {kind} scenarios{limit}")
     show(f"{file}: their scores")
     show("  rank  score  scenario")
     for rank, row in enumerate(subset_scores.order[:_PRINTED_SCENARIOS], start=1):

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -21,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.checks import check_at_least, check_at_most
 from drivax.curation.logged import Progress, map_batches
 from drivax.curation.rarity import KernelRarity, rarity_steps
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.evaluation.memory import free_memory
+from drivax.files import check_output, replace_folder
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving, Egos, check_learnable
@@ -38,13 +40,17 @@ from drivax.learning.program import all_finite, trained_leaves
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
+from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet
+from drivax.seal import seal
 from drivax.simulator.simulator import Simulator
 from drivax.stats.clusters import recordings_of
 from drivax.tasks.features import Features
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
+from drivax.tracking.checkpoints import pack, unpack
+from drivax.tracking.run_folder import RUN_FILE, RunFolder, training_sets
 
 #: Logs per batch of observations.
 _LOG_BATCH = 8
@@ -52,10 +58,12 @@ _LOG_BATCH = 8
 _BLOCK_SIZE = 4096
 #: Actions sampled from every member to estimate the mutual information.
 _SAMPLES = 16
+#: File of the members in the folder of a saved ensemble.
+_MEMBERS = "members.npz"
 #: Largest number of members.
 MOST_FOLDS = 1000
 #: Observation without past steps and the last action, which a policy could copy.
-_OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
+OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
 _NETWORK = NetworkConfig(encoder=EntityConfig(), activation="relu")
 
@@ -85,7 +93,7 @@ class EnsembleConfig:
     learn_from: int | None = None
     total_steps: int = 384_000
     weighted: Literal["plain", "rarity"] = "plain"
-    task: Task = field(default_factory=lambda: Task(observation=_OBSERVATION, metrics="none"))
+    task: Task = field(default_factory=lambda: Task(observation=OBSERVATION, metrics="none"))
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -161,7 +169,7 @@ class Ensemble:
 
     def predictions(self, data: ScenarioSet, progress: Progress | None = None) -> Predictions:
         """Return the predictions on a set, which may differ from the training set."""
-        values = map_batches(data, lambda bank: self._predict_bank(self.parameters, bank), progress)
+        values = map_batches(data, lambda bank, _: self._predict_bank(self.parameters, bank), progress)
         return Predictions(**{"information": None, **values})
 
     @partial(jax.jit, static_argnums=0)
@@ -181,6 +189,55 @@ class Ensemble:
         expert = environment.expert_steps(bank)
         values = jax.lax.map(predict, jnp.arange(len(expert.usable)), batch_size=_LOG_BATCH)
         return {**values, "expert": expert.action, "known": expert.usable & ~expert.clipped}
+
+
+def save_ensemble(ensemble: Ensemble, out: Path) -> None:
+    """Write an ensemble as a folder, for :func:`load_ensemble`.
+
+    Raises:
+        UsageError: ``out`` exists.
+    """
+    check_output(out, False, folder=True)
+    data = [{"hash": ensemble.set_hash, "scenarios": len(ensemble.fold)}]
+    with replace_folder(out) as partial_folder:
+        deviation = [float(number) for number in ensemble.deviation]
+        folder = RunFolder.create(partial_folder, ensemble.config, overwrite=True, kind="ensemble")
+        folder.note(data=data, deviation=deviation)
+        arrays = {"parameters": ensemble.parameters, "fold": ensemble.fold.astype(np.int32)}
+        pack(partial_folder / _MEMBERS, arrays)
+        seal(partial_folder, _MEMBERS)
+
+
+def load_ensemble(
+    path: str | Path, data: ScenarioSet, egos: Egos = "recorded", trust: Sequence[str] = ()
+) -> Ensemble:
+    """Load an ensemble to score a set, which need not be that of its training.
+
+    ``trust`` are the modules outside drivax whose code its settings may name.
+
+    Raises:
+        DataError: The folder is missing or damaged, or no ensemble.
+        UsageError: It names code that is not trusted.
+    """
+    folder = RunFolder.open(path)
+    if folder.kind != "ensemble":
+        cure = "name a folder that drivax curate ensemble --members wrote"
+        raise DataError(f"is of kind {folder.kind!r}, not ensemble", file=path, cure=cure)
+    config = folder.config(EnsembleConfig, trust=trust)
+    with explain_damage(folder.path / RUN_FILE, "train the ensemble again"):
+        (source,) = training_sets(folder.info)
+        set_hash, scenarios = str(source["hash"]), int(source["scenarios"])
+        deviation = np.array(folder.info["deviation"], np.float64)
+        if deviation.shape != (config.task.actions.size,) or not (deviation > 0.0).all():
+            raise ValueError("a deviation is missing or not above 0")
+    bank = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data))
+    learner = config.cloning.build(Driving(Simulator(config.task), egos=egos), bank, config.iterations)
+    keys = jax.random.split(jax.random.key(0), config.folds)
+    parameters = jax.eval_shape(jax.vmap(lambda key: learner.init(bank, key).parameters), keys)
+    template = {"parameters": parameters, "fold": jax.ShapeDtypeStruct((scenarios,), jnp.int32)}
+    arrays = unpack(folder.path / _MEMBERS, template)
+    fold = np.asarray(arrays["fold"], np.int64)
+    return Ensemble(config, learner, arrays["parameters"], set_hash, fold, deviation)
 
 
 def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batch"]:
@@ -276,13 +333,9 @@ def experience_of(
     return experience, np.maximum(action[usable].std(axis=0), 1e-6)
 
 
-_all_finite = jax.jit(jax.vmap(all_finite))
-
-
-def _check_finite(step: int, state: Any, logs: dict[str, Array]) -> None:
-    """Raise DivergenceError if a loss or a trained leaf of a member is not finite."""
-    # This is a separate program, because fused with the update it could change the rounding of parameters.
-    losses, is_finite = jax.device_get((logs, _all_finite(list(trained_leaves(state).values()))))
+def _check_finite(step: int, state: Any, logs: dict[str, Array], finite: Bool[Array, " K"]) -> None:
+    """Raise DivergenceError if a loss of a member, or a trained leaf by ``finite``, is not finite."""
+    losses, is_finite = jax.device_get((logs, finite))
     for number in range(len(is_finite)):
         problem = nonfinite_log({name: float(values[number]) for name, values in losses.items()})
         if problem is None and not is_finite[number]:
@@ -331,19 +384,26 @@ def fit(
         return jax.lax.map(update_member, (jnp.arange(config.folds), states), batch_size=size)
 
     @partial(jax.jit, donate_argnums=2)
-    def iterate(experience: Experience, fold: Array, states: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+    def iterate(
+        experience: Experience, fold: Array, states: Any, key: Array
+    ) -> tuple[Any, dict[str, Array], Bool[Array, " K"]]:
         keys = jax.random.split(key, cloning.updates)
         states, logs = jax.lax.scan(partial(update, experience, fold), states, keys)
-        return states, {f"loss/{name}": values.mean(axis=0) for name, values in logs.items()}
+        means = {f"loss/{name}": values.mean(axis=0) for name, values in logs.items()}
+        # Fused with the update, the check could change how parameters are rounded.
+        leaves = jax.lax.optimization_barrier(list(trained_leaves(states).values()))
+        return states, means, jax.vmap(all_finite)(leaves)
 
     network_key, key = jax.random.split(jax.random.key(config.seed))
     keys = jax.random.split(network_key, config.folds)
     state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
     states = (state.parameters, state.optimiser)
     for iteration in range(config.iterations):
-        states, logs = iterate(experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration))
+        states, logs, finite = iterate(
+            experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration)
+        )
         state = replace(state, parameters=states[0], optimiser=states[1])
-        _check_finite((iteration + 1) * cloning.steps_per_iteration, state, logs)
+        _check_finite((iteration + 1) * cloning.steps_per_iteration, state, logs, finite)
         if log is not None:
             log(iteration + 1, config.iterations)
     return states[0]

@@ -90,14 +90,18 @@ def check_positive(values: dict[str, float]) -> None:
             raise UsageError(f"{name} is {value}", cure="use a positive number, but not inf")
 
 
+def scale_urgency(ttc_s: Float[Array, "*steps"], urgent_s: float) -> Float[Array, "*steps"]:
+    """Return the scaled inverse of times to collision: 0 from the horizon of 5 s on, 1 up to ``urgent_s``."""
+    low, high = 1.0 / TTC_HORIZON_S, 1.0 / urgent_s
+    return jnp.clip((1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low), 0.0, 1.0)
+
+
 def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]:
-    """Return the scaled inverse time to collision: 0 above 5 s or at standstill, 1 up to ``urgent_s``."""
+    """Return the scaled inverse time to collision, 0 at standstill."""
 
     def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
-        low, high = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
         ttc_s = time_to_collision(frame, log.slot, ignored)
-        share = (1.0 / jnp.maximum(ttc_s, 1e-3) - low) / (high - low)
-        return jnp.where(motion[3] >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
+        return jnp.where(motion[3] >= STOPPED_MPS, scale_urgency(ttc_s, config.urgent_s), 0.0)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
 
@@ -116,11 +120,23 @@ def _braking_at_step(
 ) -> Float[Array, ""]:  # fmt: skip
     """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's path.
 
-    An agent is on the path if its box overlaps a strip of ego's width along it, on ego's level, up to about 75 m ahead.
-    Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if
-    no agent is on the path, or if ego does not approach it. A gap below 0.1 m, or an overlap, counts as 0.1 m.
+    Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if no agent is on the
+    path, or if ego does not approach it. A gap below 0.1 m, or an overlap, counts as 0.1 m.
 
     ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the path.
+    """
+    gap, agent_mps = gaps_on_path(log, frame, counts, along_m)
+    nearest = jnp.argmin(gap)
+    closing_mps = jnp.maximum(speed_mps - jnp.maximum(agent_mps[nearest], 0.0), 0.0)
+    return closing_mps * closing_mps / (2.0 * jnp.maximum(gap[nearest], 0.1))
+
+
+def gaps_on_path(
+    log: LoggedScenario, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""]
+) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
+    """Return the gap (m) to each agent ahead on ego's path, infinite for others, and its speed along it (m/s).
+
+    An agent is on the path if its box overlaps a strip of ego's width along it, on ego's level, up to about 75 m ahead.
     """
     ego_box, xy = frame.box[log.slot], frame.box[:, :2]
 
@@ -142,10 +158,7 @@ def _braking_at_step(
     on_path = projections.distance_m < jnp.abs(sin) * half_length + jnp.abs(cos) * half_width + ego_box[5] / 2
     gap = projections.along_m - along_m - (jnp.abs(cos) * half_length + sin * half_width) - ego_box[4] / 2
     gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
-    nearest = jnp.argmin(gap)
-    leader_speed_mps = jnp.maximum(jnp.sum(frame.velocity[nearest] * projections.heading[nearest]), 0.0)
-    closing_mps = jnp.maximum(speed_mps - leader_speed_mps, 0.0)
-    return closing_mps * closing_mps / (2.0 * jnp.maximum(gap[nearest], 0.1))
+    return gap, jnp.sum(frame.velocity * projections.heading, axis=-1)
 
 
 def crowding(log: LoggedScenario, crowd: int) -> Float[Array, " T"]:

@@ -166,23 +166,26 @@ def score_steps(
     Raises:
         DataError: A scenario has no future.
     """
-    return map_batches(data, lambda bank: score_bank(score, bank, egos), progress)
+    return map_batches(data, lambda bank, _: score_bank(score, bank, egos), progress)
 
 
 def map_batches(
-    data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
-) -> dict[str, Numbers]:
+    data: ScenarioSet, function: Callable[[ScenarioBank, Numbers], dict[str, Any]],
+    progress: Progress | None = None,
+) -> dict[str, Numbers]:  # fmt: skip
     """Apply a function to banks of one shape, up to ``BATCH`` scenarios each; return results by name, ``[M, ...]``.
 
-    The function returns equally many values for each scenario, in the order of the scenarios.
+    The function also takes the rows of the scenarios in the set. It returns equally many values for each scenario, in
+    the order of the scenarios.
     """
     sizes, batches = Sizes.used(data), list[dict[str, Any]]()
     for first in range(0, len(data), BATCH):
         scenarios = data[first : first + BATCH]
-        count = len(scenarios)
+        count, rows = len(scenarios), np.arange(first, first + len(scenarios))
         if len(data) > BATCH:
             scenarios += [scenarios[-1]] * (BATCH - count)
-        result = function(ScenarioBank.from_scenarios(scenarios, trim=sizes))
+            rows = np.pad(rows, (0, BATCH - count), mode="edge")
+        result = function(ScenarioBank.from_scenarios(scenarios, trim=sizes), rows)
         # Stack the next bank while this one is computed; at most one result is pending.
         jax.block_until_ready(batches[-1:])
         batches.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,14 +14,26 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax import settings
-from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
+from drivax.curation.ensemble import (
+    Ensemble,
+    EnsembleConfig,
+    load_ensemble,
+    save_ensemble,
+    train_ensemble,
+)
+from drivax.curation.failures import FailureConfig, failure_components
 from drivax.curation.kinematic import KinematicConfig, PublishedConfig
-from drivax.curation.logged import Progress, score_steps, valid_steps
+from drivax.curation.logged import LoggedScenario, Progress, score_steps, valid_steps
+from drivax.curation.novelty import Embedding, NoveltyConfig, novelty
+from drivax.curation.query import Quantities, QueryConfig
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.curation.scores import Combination, ScoreTable, read_scores
 from drivax.curation.weights import permute_scores
 from drivax.errors import DataError, UsageError, did_you_mean
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.learning.driving import Egos, count_egos
+from drivax.plugins import check_arguments, find_named, is_dotted
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
@@ -39,7 +51,18 @@ PUBLISHED = Combination(
 )  # fmt: skip
 #: Action rarity; a scenario is scored by its 95th percentile, because the rarest steps may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
+#: Novelty; a scenario is scored by its ten most novel steps.
+NOVELTY = Combination({"novelty": 1.0}, "top10")
+#: Failures and near misses of planners.
+FAILURES = Combination({"failure": 0.7, "near_miss": 0.3}, "max")
 _ALL = Combination({"all": 1.0})
+#: Argument of a request that a method needs, with its flag.
+_ARGUMENTS = {
+    "random_matched": ("like", "--like SCORES"), "mixture": ("tables", "--tables SCORES SCORES"),
+    "failures": ("runs", "--runs RUN"),
+}  # fmt: skip
+#: Aggregator of a user's method without a combination.
+_TOP = "top10"
 #: Percentile of a set's disagreement that scores 0.5.
 _SCALE_PERCENTILE = 99.0
 
@@ -52,19 +75,28 @@ class Request:
         data: The scenario set.
         like, seed: Table to match, and seed of the permutation (only ``random_matched``; an ensemble has its own
             seed).
+        tables: Tables of the set to combine (only ``mixture``).
+        runs: Run folders of evaluations on the set (only ``failures``).
         config: Settings of the method, of the type of ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
         egos: Vehicles to score: the recorded ego of each scenario, or all egos of a set made with ``--egos`` (moving).
+        members: Folder of an ensemble. For ``ensemble``, it scores the set if it exists, and is written otherwise; for
+            ``novelty``, its first member embeds the steps.
+        trust: Modules outside drivax whose code the settings of a saved ensemble may name.
     """
 
     data: ScenarioSet
     like: Path | None = None
     seed: int = 0
+    tables: Sequence[Path] = ()
+    runs: Sequence[Path] = ()
     config: Any = None
     progress: Progress | None = None
     training: Progress | None = None
     egos: Egos = "recorded"
+    members: Path | None = None
+    trust: Sequence[str] = ()
 
     @property
     def most_egos(self) -> int:
@@ -78,38 +110,65 @@ class Request:
 
 @dataclass(frozen=True)
 class Method:
-    """A registered method; ``config`` are its default settings, None for a method without settings.
+    """A method; ``config`` are its default settings, None for a method without settings.
 
     ``score`` takes the name of the method and a request. ``combination`` and ``extra_components`` take settings, and
-    return the combination of the components and the names of further components, which have no weight.
+    return the combination of the components (None: their mean, and :data:`_TOP` of a scenario's steps) and the names of
+    further components, which have no weight.
     """
 
     name: str
     score: Callable[[str, Request], ScoreTable]
     config: Any = None
-    combination: Callable[[Any], Combination] = lambda _: _ALL
+    combination: Callable[[Any], Combination | None] = lambda _: _ALL
     extra_components: Callable[[Any], tuple[str, ...]] = lambda _: ()
 
 
+def find_method(name: str) -> Method:
+    """Return a method by its name, or a user's by its dotted name.
+
+    The latter is a function ``(bank, log) -> {component: [T]}`` of a scenario bank and a
+    :class:`~drivax.curation.logged.LoggedScenario`, with values in [0, 1], or a frozen dataclass with such a
+    ``__call__``, whose fields are its settings. An attribute ``combination`` combines the components.
+
+    Raises:
+        UsageError: The method is unknown, or is neither.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    if not is_dotted(name):
+        cure = did_you_mean(name, [*sorted(METHODS), "package.module:name"])
+        raise UsageError(f"unknown method {name!r}", cure=cure)
+    score = find_named(name)
+    score = score() if isinstance(score, type) else score
+    try:
+        check_arguments(score, name, (ScenarioBank, LoggedScenario))
+    except ValueError as error:
+        raise UsageError(str(error), cure="write a function of a bank and a log") from error
+    return Method(name, _components, score, lambda config: getattr(config, "combination", None))
+
+
 def curate(name: str, request: Request) -> ScoreTable:
-    """Score a set.
+    """Score a set by a built-in method, or by a user's (:func:`find_method`).
 
     Raises:
         UsageError: The method is unknown, lacks an argument, or takes settings of another type.
         DataError: The method cannot score this set.
     """
-    if name not in METHODS:
-        raise UsageError(f"unknown method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
-    if (request.like is not None) != (name == "random_matched"):
-        problem = "random_matched needs --like, a table of the same set, and no other method takes it"
-        cure = "pass --like SCORES" if request.like is None else "leave out --like"
-        raise UsageError(problem, cure=cure)
-    default = METHODS[name].config
+    method = find_method(name)
+    for owner, (argument, flag) in _ARGUMENTS.items():
+        is_given = bool(getattr(request, argument))
+        if is_given != (name == owner):
+            problem = f"{owner} needs {flag}, and no other method takes it"
+            raise UsageError(problem, cure=f"leave out --{argument}" if is_given else f"pass {flag}")
+    if name == "mixture" and len(request.tables) < 2:
+        raise UsageError("a single table to mix", cure="pass --tables SCORES SCORES")
+    default = method.config
     config = default if request.config is None else request.config
     if type(config) is not type(default):
         cure = "remove them" if default is None else f"use {type(default).__name__}"
         raise UsageError(f"{name} has no settings of type {type(config).__name__}", cure=cure)
-    table = METHODS[name].score(name, replace(request, config=config))
+    table = method.score(name, replace(request, config=config))
     if request.progress is not None:
         request.progress(len(request.data), len(request.data))
     return table
@@ -131,8 +190,9 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
             config_of_table |= _rename_fields(config_of_table, config, expected_values)
         except UsageError as error:
             raise DataError(error.problem, file=file, cure="score again with `drivax curate`") from error
-    if table.components:
-        expected_values["combination"] = asdict(method.combination(config))
+    combination = method.combination(config)
+    if table.components and combination is not None:
+        expected_values["combination"] = asdict(combination)
     for name, value in expected_values.items():
         if config_of_table.get(name) != value:
             problem = f"scores of {table.method!r} have {name} {config_of_table.get(name)}, not {value}"
@@ -152,8 +212,10 @@ def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> Non
     Raises:
         UsageError: A component is unknown, or a weight or aggregator is invalid.
     """
-    default, extra = METHODS[name].combination(config), METHODS[name].extra_components(config)
-    replace(default, **changes).check_components({*default.weights, *extra})
+    method = find_method(name)
+    default, extra = method.combination(config), method.extra_components(config)
+    if default is not None:  # otherwise the components are not known yet
+        replace(default, **changes).check_components({*default.weights, *extra})
 
 
 def make_table(
@@ -167,9 +229,10 @@ def make_table(
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data, egos)
-    zeros, values = np.zeros(valid.shape), {**({} if config is None else plain(config)), **details}
+    zeros, values = np.zeros(valid.shape), {**(plain(config) if is_dataclass(config) else {}), **details}
     table = ScoreTable(name, values, data.hash, ids, valid, zeros, np.zeros(len(ids)), components, egos)
-    return table.recombine(METHODS[name].combination(config))
+    combination = find_method(name).combination(config)
+    return table.recombine(combination or Combination(dict.fromkeys(components, 1.0), _TOP))
 
 
 def ensemble_table(
@@ -238,7 +301,7 @@ def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
     return tuple(f"action_{index}" for index in range(size))
 
 
-def _heuristic(name: str, request: Request) -> ScoreTable:
+def _components(name: str, request: Request) -> ScoreTable:
     components = score_steps(request.data, request.config, request.progress, request.most_egos)
     return make_table(name, request.config, request.data, components, egos=request.most_egos)
 
@@ -250,7 +313,12 @@ def _rarity(name: str, request: Request) -> ScoreTable:
 
 
 def _ensemble(_: str, request: Request) -> ScoreTable:
-    ensemble = train_ensemble(request.config, request.data, request.training, request.egos)
+    if request.members is not None and request.members.exists():
+        ensemble = load_ensemble(request.members, request.data, request.egos, request.trust)
+    else:
+        ensemble = train_ensemble(request.config, request.data, request.training, request.egos)
+        if request.members is not None:
+            save_ensemble(ensemble, request.members)
     return ensemble_table(ensemble, request.data, request.progress)
 
 
@@ -293,14 +361,74 @@ def _permute_like(_: str, request: Request) -> ScoreTable:
     return permute_scores(read_scores(request.like, request.data), request.seed)
 
 
+def _mix(name: str, request: Request) -> ScoreTable:
+    """Return a table whose components are the quantiles of the step scores of tables."""
+    components, egos = dict[str, Any](), set[int]()
+    for path in request.tables:
+        table = read_scores(path, request.data)
+        key = table.method if table.method not in components else f"{table.method}_{path.stem}"
+        if key in components:
+            raise UsageError(f"two tables are called {key}", file=path, cure="rename one of the files")
+        components[key] = _quantiles(table.steps, table.valid)
+        egos.add(table.egos)
+    if len(egos) > 1:
+        raise UsageError("tables have different --egos", cure="score all of them with the same")
+    details = {"tables": [str(path) for path in request.tables]}
+    return make_table(name, None, request.data, components, details, egos.pop())
+
+
+def _query(name: str, request: Request) -> ScoreTable:
+    quantities = score_steps(request.data, Quantities(), request.progress, request.most_egos)
+    matches = request.config.matches(quantities, valid_steps(request.data, request.most_egos))
+    components = {"match": matches.astype(np.float64)}
+    return make_table(name, request.config, request.data, components, egos=request.most_egos)
+
+
+def embedding_of(config: NoveltyConfig, request: Request) -> Embedding:
+    """Return the embedding of a request's set, by the first member of its ensemble if it has one."""
+    ensemble = None
+    if request.members is not None:
+        ensemble = load_ensemble(request.members, request.data, request.egos, request.trust)
+    return Embedding.of(config, request.data, ensemble, request.egos)
+
+
+def _novelty(name: str, request: Request) -> ScoreTable:
+    distance = novelty(request.config, embedding_of(request.config, request), request.data, request.progress)
+    egos = request.most_egos
+    scale = float(np.percentile(distance[valid_steps(request.data, egos)], _SCALE_PERCENTILE))
+    components = {"novelty": distance / (distance + max(scale, np.finfo(np.float32).tiny))}
+    details = {"scale": scale, "members": None if request.members is None else str(request.members)}
+    return make_table(name, request.config, request.data, components, details, egos)
+
+
+def _fail(name: str, request: Request) -> ScoreTable:
+    if request.egos != "recorded":
+        raise UsageError("planners drive the recorded ego", cure="leave out --egos")
+    runs = [EpisodeTable.read(path) for path in request.runs]
+    components = failure_components(request.config, runs, request.data, request.progress)
+    details = {"runs": [str(path) for path in request.runs], "planners": [run.name for run in runs]}
+    return make_table(name, request.config, request.data, components, details)
+
+
+def _quantiles(steps: Float[np.ndarray, "M T"], valid: Bool[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
+    """Return the share of valid steps with a lower score (of equal scores, half), 0 at steps that are not valid."""
+    scores = np.sort(steps[valid])
+    low, high = (np.searchsorted(scores, steps, side) for side in ("left", "right"))
+    return np.where(valid, (low + high) / (2.0 * max(len(scores), 1)), 0.0)
+
+
 _METHODS = (
-    Method("kinematic", _heuristic, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
-    Method("published", _heuristic, PublishedConfig(), lambda _: PUBLISHED),
+    Method("kinematic", _components, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
+    Method("published", _components, PublishedConfig(), lambda _: PUBLISHED),
     Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
     Method("action_rarity", _rarity, KernelRarity(), lambda _: RARITY),
     Method("action_rarity_published", _rarity, PublishedRarity(), lambda _: RARITY),
     Method("uniform", _uniform),
     Method("random_matched", _permute_like),
+    Method("novelty", _novelty, NoveltyConfig(), lambda _: NOVELTY),
+    Method("query", _query, QueryConfig(), lambda _: Combination({"match": 1.0})),
+    Method("mixture", _mix, combination=lambda _: None),
+    Method("failures", _fail, FailureConfig(), lambda _: FAILURES),
     Method("oracle", _oracle),
 )
 #: All methods by name.

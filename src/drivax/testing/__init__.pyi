@@ -1,4 +1,5 @@
 from .contract import BrokenContract as BrokenContract
+from .criticality import check_criticality as check_criticality
 from .learning import check_algorithm as check_algorithm
 from .learning import check_encoder as check_encoder
 from .simulation import check_planner as check_planner

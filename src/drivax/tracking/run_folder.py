@@ -41,7 +41,7 @@ _RERUN = "run the command again"
 _ENTRIES: dict[str, Any] = {
     **dict.fromkeys(("kind", "planner", "traffic", "started", "command", "weights"), str),
     **dict.fromkeys(("own_metrics", "networks_from", "versions", "divergence"), dict), "data": list | dict,
-    **dict.fromkeys(("trained_on", "edited", "critics", "runs"), list),
+    **dict.fromkeys(("trained_on", "edited", "critics", "runs", "deviation"), list),
     **dict.fromkeys(("seeds", "seed", "devices", "episodes"), int),
     "validation": str | dict, "sealed": bool,
 }  # fmt: skip
@@ -49,7 +49,7 @@ _TRAINING_KINDS = ("training", "seeds")
 #: Groups of kinds that replace each other; all others form a group.
 _GROUPS = {"training": "training", "seeds": "training", "episodes": "episodes"}
 #: Kinds of runs whose data sets have hashes; tables of other programs may lack them.
-_HASHED_KINDS = (*_TRAINING_KINDS, "policy", "study")
+_HASHED_KINDS = (*_TRAINING_KINDS, "policy", "study", "ensemble")
 #: Largest number of seeds that is read, far more than a device trains; resuming creates a folder for each.
 _MOST_SEEDS = 10_000
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
