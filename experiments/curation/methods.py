@@ -8,7 +8,7 @@
 
 ``events`` scores both test sets and stores the result; ``table`` writes it to the page.
 ``check`` ranks scenarios of other sets by ``kinematic``: those used to choose its weights, and new ones (``drivax
-generate sets/fresh --scenarios 1024 --seed 20261124 --rare_rate 0.5``).
+generate sets/fresh --scenarios 1024 --seed 20261129 --rare_rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. Measures are weighted to
 the natural share of events, so precision is that of an ordinary set. The density of actions comes from ``test`` alone;
 ensembles are trained on ``train``. ``--method`` scores only these methods and keeps the other results.

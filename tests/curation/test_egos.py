@@ -79,7 +79,8 @@ def test_scores_are_those_of_a_recorded_ego(worlds, score):
                     values[name][row, steps], own_steps[steps], atol=tolerance, err_msg=name
                 )
     if isinstance(score, KinematicConfig):
-        assert all(np.ptp(own) > 0.05 for own in own_values.values())  # more than constants are compared
+        # More than constants are compared; no paths cross here.
+        assert all(np.ptp(own) > 0.05 for name, own in own_values.items() if name != "encroachment")
 
 
 def test_a_scenario_is_as_critical_as_its_most_critical_ego(worlds, table):

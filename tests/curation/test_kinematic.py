@@ -1,12 +1,12 @@
 """Criticality of hand-made scenes against hand-computed values; constant speeds keep formulas short."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from drivax.curation import logged as scoring
-from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.kinematic import KinematicConfig, post_encroachment_time
 from drivax.curation.logged import score_bank, score_steps
 from drivax.curation.methods import KINEMATIC
 from drivax.errors import UsageError
@@ -221,7 +221,7 @@ def test_default_weights_rank_stopped_above_oncoming_car(components):
     }
     scored, scenarios = KINEMATIC.combine(both, valid)
     assert sum(KINEMATIC.weights.values()) == pytest.approx(1.0)
-    assert scored[0, NOW] > 0.5 and scored[1].max() < 0.01 and scenarios[0] > 2 * scenarios[1]
+    assert scored[0, NOW] > 0.25 and scored[1].max() < 0.01 and scenarios[0] > 2 * scenarios[1]
 
 
 @pytest.mark.slow
@@ -249,3 +249,43 @@ def test_batches_do_not_change_scores(tmp_path, components, monkeypatch):
 def test_scales_are_checked(wrong):
     with pytest.raises(UsageError, match=next(iter(wrong))):
         KinematicConfig(**wrong)
+
+
+def crossing(step, speed=5.0, **others):
+    """A car that crosses ego's path at x = 20.4 m upwards, with its centre on the path at a step."""
+    return car(x=20.4, y=-(step - NOW) * 0.1 * speed, heading=np.pi / 2, speed=speed, **others)
+
+
+@pytest.mark.parametrize(
+    ("cars", "gap_s", "begin", "end"),
+    [
+        # The crossing car is within 3.4 m of the path's line for 6 steps before and after. Ego's front reaches 20 m at
+        # step 28, its rear has left 21 m at step 34.
+        ([car(speed=10.0), crossing(10)], 1.2, 0, 28),
+        ([car(speed=10.0), crossing(50)], 1.0, 8, 44),
+        ([car(speed=10.0), crossing(32)], 0.0, 8, 28),
+        ([car(speed=10.0), crossing(5), crossing(50)], 1.0, 8, 44),
+        ([car(speed=10.0), crossing(10, speed=0.0)], None, 0, 0),
+        ([car(speed=10.0), car(x=30.0, speed=10.0)], None, 0, 0),
+        ([car(speed=10.0), car(x=40.0, y=3.7, heading=np.pi, speed=10.0)], None, 0, 0),
+        ([car(speed=2.0), crossing(10)], None, 0, 0),
+    ],
+)
+def test_post_encroachment_time_of_crossing_cars(cars, gap_s, begin, end):
+    bank = bank_of(straight_road(cars))
+    values = np.asarray(score_bank(PostEncroachment(), bank)["time"])[0]
+    if gap_s is None:
+        assert np.isinf(values).all()
+        return
+    assert values.min() == pytest.approx(gap_s, abs=1e-6)
+    np.testing.assert_array_equal(np.flatnonzero(values == values.min()), np.arange(max(begin, 0), end + 1))
+    score = np.asarray(score_bank(CONFIG, bank)["encroachment"])[0]
+    np.testing.assert_allclose(score, np.clip(1.0 - values / 1.5, 0.0, 1.0), atol=1e-6)
+
+
+@dataclass(frozen=True)
+class PostEncroachment:
+    """The time alone, as a score function."""
+
+    def __call__(self, bank, log):
+        return {"time": post_encroachment_time(bank, log)}

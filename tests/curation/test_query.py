@@ -61,7 +61,10 @@ def test_unknown_quantities_are_named():
 
 
 def test_quantities_of_a_cut_in():
-    values = {name: np.asarray(x)[0] for name, x in score_bank(Quantities(), bank_of(straight_road(cutting_in()))).items()}
+    values = {
+        name: np.asarray(x)[0]
+        for name, x in score_bank(Quantities(), bank_of(straight_road(cutting_in()))).items()
+    }
     assert set(values) == set(QUANTITIES)
     np.testing.assert_allclose(values["speed"], 10.0, atol=1e-3)
     # Boxes of 4.8 x 2 m: on the path while the centre is less than 2 m to the side.

@@ -114,7 +114,7 @@ def lively(tmp_path_factory):
 
 #: By method that needs no training: the scores of the scenario ``lively``, and of every twelfth step.
 FROZEN = {
-    "kinematic": [0.4294, 0.1504, 0.0496, 0.2123, 0.254, 0.0595, 0.1475, 0.1588, 0.3365],
+    "kinematic": [0.2344, 0.0837, 0.0270, 0.1151, 0.1369, 0.0317, 0.0829, 0.0876, 0.1839],
     "published": [0.5311, 0.2493, 0.1308, 0.6747, 0.6327, 0.2418, 0.5099, 0.5612, 0.3822],
     "action_rarity": [0.0856, 0.0484, 0.0356, 0.0728, 0.0767, 0.0, 0.0771, 0.0399, 0.0338],
     "action_rarity_published": [0.1771, 0.0936, 0.0323, 0.1771, 0.1771, 0.0, 0.1214, 0.1214, 0.0434],
@@ -248,7 +248,7 @@ def test_command_writes_scores(data, tmp_path, capsys):
     assert main([*command, "--out", str(out), "--export", str(top), "1"]) == 0
     printed = capsys.readouterr().out
     result = read_scores(out, data)
-    assert result.scenarios[1] > result.scenarios[0] and result.steps[1].max() > 0.5
+    assert result.scenarios[1] > result.scenarios[0] and result.steps[1].max() > 0.25
     for words in ("2 scenarios, kinematic", "effective sample", "the 1 most critical"):
         assert words in printed
     assert max(map(len, printed.replace(str(tmp_path), "").splitlines())) < 100

@@ -27,7 +27,8 @@ _PRINTED_SCENARIOS = 10
 class Curate:
     """Score how critical every scenario and step of a set is.
 
-    kinematic: time to collision, required braking, volatility and position of the logged driver.
+    kinematic: time to collision, post-encroachment time, required braking, volatility and position of the logged
+    driver.
 
     published: the published kinematic heuristic, for comparison.
 

@@ -140,7 +140,7 @@ def times_to_collision(
 
     def episode(index: Int[Array, ""], motion: Float[Array, "S 4"]) -> Float[Array, " S"]:
         state = simulator.reset(bank, index, start_step)
-        action = jnp.zeros(simulator.task.actions.size)
+        action = jnp.zeros(_TASK.actions.size)
 
         def step(state: Any, pose: Array) -> tuple[Any, Array]:
             after, _ = simulator.replay(bank, state, pose, action)

@@ -7,6 +7,9 @@ Components of every step, all in [0, 1]:
   (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), over the car's maximum deceleration (brake threat number
   of Braennstroem, Sjoeberg and Coelingh, 2008). Oncoming agents count as standing, because ego's braking cannot reduce
   their share of the closing speed;
+- encroachment: post-encroachment time, the time between one of two vehicles leaving the area where their paths cross,
+  and the other entering it (Allen, Shin and Cooper, Transportation Research Record 667, 1978), scaled from 0 at
+  ``encroachment_s`` to 1 at 0, from 2 s before the first of them enters until the last enters it;
 - volatility: the larger of jerk and yaw acceleration, relative to twice nuPlan's limits, from a Savitzky-Golay filter
   (1964) around the action of the step;
 - off_road: closeness of the car's corners to the road edge, 1 beyond it;
@@ -14,12 +17,14 @@ Components of every step, all in [0, 1]:
 - density: number of agents.
 
 Time to collision detects crossing traffic, but assumes fixed headings and therefore reports oncoming traffic in bends.
-Required braking follows the path through bends, but only considers agents on it.
+Required braking follows the path through bends, but only considers agents on it. The post-encroachment time is that of
+the motion that was driven: it finds turning and crossing traffic that ego just passed, but not agents that ego follows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -32,13 +37,19 @@ from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
 from drivax.scenario.bank import queries
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
 from drivax.simulator.types import Frame
 
 #: Centres of two route windows that cover about 75 m of the path ahead, m.
 _WINDOWS_M = (6.0, 45.0)
+#: Largest cosine between crossing paths (26 degrees), least speed of ego at a conflict (m/s), and steps before it.
+_CROSSING_COS, _REACHES_MPS, _BEFORE_STEPS = 0.9, 3.0, 20
+#: Distance of the path's points that are searched for the nearest one, and number of points around it, 1 m apart.
+_COARSE, _FINE = 8, 32
 #: Filter window of 1.5 s, as nuPlan's for jerk, and nuPlan's orders for jerk and yaw acceleration.
 _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
@@ -49,6 +60,7 @@ class KinematicConfig:
 
     Attributes:
         urgent_s: Time to collision; the bound of the metric ``ttc_ok``.
+        encroachment_s: Post-encroachment time at which encroachment is 0.
         full_braking_mps2: Required deceleration; the limit of the physical action space.
         full_jerk_mps3, full_yaw_rps2: Jerk, and yaw acceleration (rad/s2); twice nuPlan's limits.
         edge_m: Distance of a corner inside the road edge at which off_road is 0.
@@ -57,6 +69,7 @@ class KinematicConfig:
     """
 
     urgent_s: float = 0.95
+    encroachment_s: float = 1.5
     full_braking_mps2: float = 6.0
     full_jerk_mps3: float = 2 * JERK_MPS3
     full_yaw_rps2: float = 2 * YAW_ACCELERATION_RPS2
@@ -68,13 +81,22 @@ class KinematicConfig:
         if not 0.0 < self.urgent_s < TTC_HORIZON_S:
             cure = f"use more than 0 and less than {TTC_HORIZON_S}"
             raise UsageError(f"urgent_s is {self.urgent_s}", cure=cure)
-        names = ("full_braking_mps2", "full_jerk_mps3", "full_yaw_rps2", "edge_m", "lane_m", "crowd")
+        names = (
+            "encroachment_s",
+            "full_braking_mps2",
+            "full_jerk_mps3",
+            "full_yaw_rps2",
+            "edge_m",
+            "lane_m",
+            "crowd",
+        )
         check_positive({name: getattr(self, name) for name in names})
 
     def __call__(self, bank: ScenarioBank, log: LoggedScenario) -> dict[str, Float[Array, " T"]]:
         """Return the components of every step of a log."""
         return {
             "urgency": _urgency(self, log),
+            "encroachment": jnp.clip(1.0 - post_encroachment_time(bank, log) / self.encroachment_s, 0.0, 1.0),
             "braking": jnp.clip(_required_braking(log) / self.full_braking_mps2, 0.0, 1.0),
             "volatility": _volatility(self, log, bank.last_step[log.row]),
             "off_road": _edge_nearness(self, bank, log),
@@ -104,6 +126,68 @@ def _urgency(config: KinematicConfig, log: LoggedScenario) -> Float[Array, " T"]
         return jnp.where(motion[3] >= STOPPED_MPS, scale_urgency(ttc_s, config.urgent_s), 0.0)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
+
+
+def post_encroachment_time(bank: ScenarioBank, log: LoggedScenario) -> Float[Array, " T"]:
+    """Return the shortest post-encroachment time (s) of the conflicts of every step, infinite without one.
+
+    An agent conflicts if its box moves over a strip of ego's width along ego's path, at more than 26 degrees to it, and
+    ego reaches this place at 3 m/s or more. Its time is the shortest over all steps at which it is there, 0 if both are
+    there at once. It belongs to the steps from 2 s before the first of both enters until the last does.
+    """
+    slots = bank.agents.shape[2]  # parked agents follow
+    frame = log.frame
+    box, valid, z, velocity = (leaf[:, :slots] for leaf in (frame.box, frame.valid, frame.z, frame.velocity))
+    ego, steps = frame.box[:, log.slot], jnp.arange(len(frame.box))
+    length, half_width = ego[0, 4], ego[0, 5] / 2
+    level = jnp.abs(z - frame.z[:, log.slot, None]) <= queries.LEVEL_M
+    counts = valid & level & (norm(velocity) >= STOPPED_MPS) & ~log.ignored[:, :slots]
+    counts &= jnp.arange(slots) != log.slot
+    first_m, last_m, cos = jax.vmap(jax.vmap(partial(_covered_interval, log, half_width)))(box, counts)
+    # Ego's front enters the area at the first of these steps, and its rear has left it at the second.
+    enters = jnp.searchsorted(log.along_m + length / 2, first_m)
+    leaves = jnp.searchsorted(log.along_m - length / 2, last_m, side="right")
+    speed_mps = log.motion[jnp.minimum(enters, len(ego) - 1), 3]
+    conflicts = (jnp.abs(cos) < _CROSSING_COS) & (enters < len(ego)) & (speed_mps >= _REACHES_MPS)
+    step = steps[:, None]
+    gap = jnp.maximum(jnp.maximum(enters - step, step - leaves), 0) * DT_S
+    gap = jnp.where(conflicts, gap, jnp.inf)
+    nearest, slot = jnp.argmin(gap, axis=0), jnp.arange(slots)
+    begin = jnp.minimum(nearest, enters[nearest, slot]) - _BEFORE_STEPS
+    end = jnp.maximum(nearest, enters[nearest, slot])
+    return jnp.where((step >= begin) & (step <= end), gap[nearest, slot], jnp.inf).min(axis=1)
+
+
+def _covered_interval(
+    log: LoggedScenario, half_width: Float[Array, ""], box: Float[Array, "6"], counts: Bool[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Return first and last arc length of ego's path that a box covers, and the cosine of the angle between both.
+
+    Only the points within 16 m of the nearest one are considered. Without an overlap, or if the box does not count, the
+    first is infinite, and the cosine 1.
+    """
+    points, cos, sin = len(log.path), box[2], box[3]
+    coarse = log.path[::_COARSE, RouteColumn.XY]
+    is_path = jnp.arange(len(coarse)) * _COARSE < log.path_points
+    distance = jnp.sum((coarse - box[:2]) ** 2, axis=-1)
+    nearest = first_smallest(jnp.where(is_path, distance, jnp.inf)) * _COARSE
+    size = min(_FINE, points)
+    start = jnp.clip(nearest - size // 2, 0, points - size)
+    path = jax.lax.dynamic_slice(log.path, (start, 0), (size, RouteColumn.LIMIT))
+    offset, heading = path[:, RouteColumn.XY] - box[:2], path[:, RouteColumn.HEADING]
+    ahead, left = offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin
+    # Components of the path's normal along and across the box: half of ego's width reaches as far.
+    across = heading[:, 0] * cos + heading[:, 1] * sin
+    along = heading[:, 1] * cos - heading[:, 0] * sin
+    covers = jnp.abs(ahead) <= box[4] / 2 + half_width * jnp.abs(along)
+    covers &= jnp.abs(left) <= box[5] / 2 + half_width * jnp.abs(across)
+    point = start + jnp.arange(size)
+    covers &= counts & (point < log.path_points)
+    first = jnp.min(jnp.where(covers, point, points))
+    last = jnp.max(jnp.where(covers, point, -1))
+    middle = jnp.max(jnp.where(covers & (point <= (first + last) // 2), point, -1)) - start
+    angle = jnp.where(last >= 0, across[jnp.clip(middle, 0, size - 1)], 1.0)
+    return jnp.where(last >= 0, first.astype(jnp.float32), jnp.inf), last.astype(jnp.float32), angle
 
 
 def _required_braking(log: LoggedScenario) -> Float[Array, " T"]:

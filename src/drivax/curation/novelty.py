@@ -66,7 +66,7 @@ class _Encoder:
     graph: Any
 
     @partial(jax.jit, static_argnums=0)
-    def embed(self, parameters: Any, bank: ScenarioBank, steps: Int[Array, "M K"]) -> Float[Array, "M K D"]:
+    def values(self, parameters: Any, bank: ScenarioBank, steps: Int[Array, "M K"]) -> Float[Array, "M K D"]:
         """Return the embeddings of steps of the logs of a bank."""
         network: Any = nnx.merge(self.graph, parameters)
         encoder, observe = getattr(network, "encoder", network), self.environment.observe_recorded
@@ -128,7 +128,7 @@ class Embedding:
         def reference(bank: ScenarioBank, rows: Numbers) -> dict[str, Array]:
             log = (rows[:, None] * logs + np.arange(logs)).reshape(-1)
             steps = jnp.asarray(order[log])
-            return {"embedding": encoder.embed(parameters, bank, steps)}
+            return {"embedding": encoder.values(parameters, bank, steps)}
 
         values = map_batches(data, reference)["embedding"][is_reference][kept]
         mean, deviation = values.mean(axis=0), np.maximum(values.std(axis=0), 1e-6)
@@ -142,7 +142,7 @@ class Embedding:
         """Return the embedding of every step of the logs of a bank."""
         logs = bank.most_egos if self.encoder.environment.egos == "moving" else 1
         steps = jnp.broadcast_to(jnp.arange(bank.steps), (len(bank) * logs, bank.steps))
-        return (self.encoder.embed(self.parameters, bank, steps) - self.mean) / self.deviation
+        return (self.encoder.values(self.parameters, bank, steps) - self.mean) / self.deviation
 
 
 def _random_encoder(config: NoveltyConfig, environment: Driving, data: ScenarioSet) -> tuple[Any, Any]:

@@ -82,7 +82,7 @@ class QueryConfig:
             raise UsageError("no query", cure='pass --where "cut_in < 20 and speed > 10"')
         holds = evaluate(self.where, quantities) & valid
         steps = max(round(self.for_s / DT_S), 1)
-        # A step matches if it lies in a run of at least so many steps.
+        # A step matches if it lies in a run of at least that many steps.
         last = np.pad(holds, ((0, 0), (1, 0))).cumsum(axis=1)
         full = last[:, steps:] - last[:, :-steps] == steps if holds.shape[1] >= steps else holds[:, :0]
         result = np.zeros(holds.shape, bool)

@@ -295,7 +295,7 @@ class Offline(OffPolicy[Config]):
         key = jax.random.key(0)
         drawn, uniform = (sample_steps(which, key, (_SAMPLES,)) for which in (data.critic, data.uniform))
         # In one call, because tracing an observation takes long.
-        index = jax.tree.map(lambda *parts: jnp.concatenate(parts), drawn, uniform, (rows, final))
+        index = jax.tree.map(lambda *sets: jnp.concatenate(sets), drawn, uniform, (rows, final))
         observation = environment.observe_recorded(data.data, index)
         value = self._policy_value(policy, critic, observation)
         logged = jax.tree.map(lambda leaf: leaf[_SAMPLES : 2 * _SAMPLES], observation)
