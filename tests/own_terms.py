@@ -240,7 +240,7 @@ class FullBrake(Memoryless):
 jax.tree_util.register_static(FullBrake)
 
 
-def nearness(bank, log):
+def proximity(bank, log):
     """A criticality method without settings or weights: how close the nearest other agent is, within 20 m."""
     box = log.frame.box
     offset = box[:, :, :2] - box[:, log.slot, None, :2]

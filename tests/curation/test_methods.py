@@ -89,11 +89,11 @@ def test_scores_of_methods(data, tables):
 
 def test_own_methods_score_by_dotted_name(data, tmp_path, capsys):
     out = tmp_path / "near.npz"
-    call = ["curate", "own_terms:nearness", "--data", str(data.path)]
+    call = ["curate", "own_terms:proximity", "--data", str(data.path)]
     assert main([*call, "--out", str(out)]) == 0
     table = read_scores(out, data)
     # Straight ahead: 20 m, then by 15 m/s less in each second, until the cars overlap.
-    assert table.method == "own_terms:nearness" and table.components["near"][1, 10] == 0.0
+    assert table.method == "own_terms:proximity" and table.components["near"][1, 10] == 0.0
     assert table.components["near"][1, 18] == pytest.approx(1.0 - 8.0 / 20.0, abs=1e-3)
     np.testing.assert_allclose(table.steps[1], table.components["near"][1] * table.valid[1])
     assert table.combination == Combination({"near": 1.0}, "top10")
@@ -105,7 +105,7 @@ def test_own_methods_score_by_dotted_name(data, tmp_path, capsys):
     assert table.config["full_mps"] == 30.0 and table.combination == Combination({"speed": 1.0}, "mean")
     capsys.readouterr()
     for name, words in (
-        ("own_terms:nearnes", "did you mean 'nearness'"),
+        ("own_terms:proximit", "did you mean 'proximity'"),
         ("own_terms:hurry", "takes (before, now, around)"),
         ("kinematics", "unknown method 'kinematics'; did you mean 'kinematic'"),
     ):

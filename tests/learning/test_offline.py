@@ -203,6 +203,20 @@ def test_relative_penalty_follows_the_values(batch, policy_batch):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), gradient, expected)
 
 
+@pytest.mark.parametrize("config", [IQL, AWAC], ids=["iql", "awac"])
+def test_relative_advantages_do_not_depend_on_the_scale(config, batch, policy_batch):
+    learner, *_ = build_learner(config)
+    relative, trained, _ = build_learner(replace(config, relative=True))
+    advantage = jax.random.normal(jax.random.key(3), (COUNT,))
+    expected = learner.imitation(trained, policy_batch, advantage / jnp.std(advantage))
+    for scale in (0.01, 50.0):
+        result = relative.imitation(trained, policy_batch, scale * advantage)
+        assert float(result[0]) == pytest.approx(float(expected[0]), rel=1e-4)
+        assert float(result[1]["weight"]) == pytest.approx(float(expected[1]["weight"]), rel=1e-4)
+    constant = relative.imitation(trained, policy_batch, jnp.zeros(COUNT))
+    assert float(constant[1]["weight"]) == 1.0
+
+
 def test_iql_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(IQL, largest_weight=1.05))
     total, logs = losses(learner, trained, target, batch, policy_batch, step_keys(1)[1])

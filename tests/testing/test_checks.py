@@ -269,9 +269,9 @@ def test_valid_criticality_methods_pass(name):
 
 
 def test_valid_criticality_function_passes():
-    check_criticality("own_terms:nearness")
+    check_criticality("own_terms:proximity")
 
 
-@pytest.mark.parametrize("words", WRONG_CRITICALITIES)
+@pytest.mark.parametrize("words", some(WRONG_CRITICALITIES, "gives no dict", "changes when"))
 def test_wrong_criticality_methods_are_refused(words):
     refused(check_criticality, WRONG_CRITICALITIES[words], words)

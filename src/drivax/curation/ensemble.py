@@ -399,11 +399,9 @@ def fit(
     state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
     states = (state.parameters, state.optimiser)
     for iteration in range(config.iterations):
-        states, logs, finite = iterate(
-            experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration)
-        )
+        states, *values = iterate(experience, jnp.asarray(fold), states, jax.random.fold_in(key, iteration))
         state = replace(state, parameters=states[0], optimiser=states[1])
-        _check_finite((iteration + 1) * cloning.steps_per_iteration, state, logs, finite)
+        _check_finite((iteration + 1) * cloning.steps_per_iteration, state, *values)
         if log is not None:
             log(iteration + 1, config.iterations)
     return states[0]

@@ -11,7 +11,11 @@ from jaxtyping import Array, Float
 from drivax.checks import check_above_zero, check_at_least
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
+from drivax.learning.program import mean_over_devices
 from drivax.rl.equations import advantage_weights
+
+#: Least standard deviation that advantages are divided by.
+_LEAST_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -20,11 +24,14 @@ class AdvantageWeightedConfig(OfflineConfig):
 
     Attributes:
         inverse_temperature: ``beta`` of the imitation weights ``exp(beta A)``; 0: uniform weights.
+        relative: Divide advantages by their standard deviation over the batch, so that weights do not depend on the
+            scale of rewards.
         largest_weight: Upper bound of the weights.
         loss: Imitation loss: ``likelihood``, as published, or ``mse`` of the mode, in action units.
     """
 
     inverse_temperature: float = 3.0
+    relative: bool = False
     largest_weight: float = 100.0
     loss: Literal["likelihood", "mse"] = "likelihood"
 
@@ -47,6 +54,9 @@ class AdvantageWeighted(Offline[Config]):
     ) -> tuple[Array, dict[str, Array]]:
         """Return the imitation loss, and values to log, given the advantages of the logged actions."""
         config, (observation, expert) = self.config, policy_batch
+        if config.relative:
+            centred = advantage - mean_over_devices(advantage)
+            advantage = advantage / jnp.maximum(jnp.sqrt(mean_over_devices(centred**2)), _LEAST_DEVIATION)
         weights = advantage_weights(advantage, config.inverse_temperature, config.largest_weight)
         policy = self.distribution(trained["policy"], observation)
         error = policy.mode() - expert
