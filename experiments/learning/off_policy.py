@@ -23,6 +23,7 @@ import numpy as np
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_json
 from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig, estimate_return
+from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.critic_health import policy_returns
 from drivax.learning.driving import Driving
@@ -80,7 +81,8 @@ def estimates(
     environment: Any, data: Experience, config: TrainConfig, act: Any, behaviour: Any
 ) -> dict[str, float]:
     """Return the estimated returns of a policy, its true return, and the least effective number of episodes."""
-    network = config.algorithm.networks  # type: ignore[union-attr]
+    assert isinstance(config.algorithm, OfflineConfig)
+    network = config.algorithm.networks
     evaluation = FittedQ(FittedQConfig(updates=UPDATES), network, environment, GAMMA)
     policy, source = partial(kernel, act), partial(kernel, behaviour)
 

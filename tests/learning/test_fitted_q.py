@@ -1,5 +1,6 @@
 """Fitted-Q evaluation where the answer is known."""
 
+import math
 from dataclasses import replace
 
 import jax
@@ -11,11 +12,17 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.iql import IqlConfig
-from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig
+from drivax.learning.algorithms.off_policy_evaluation import (
+    MOST_RATIO,
+    FittedQ,
+    FittedQConfig,
+    estimate_return,
+)
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
 from drivax.learning.training_log import rank
 from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import SquashedGaussian
 from drivax.networks.encoders import MlpConfig
 from recorded import Logged, Table
 
@@ -58,6 +65,58 @@ def test_fitted_q_estimates_returns(table):
         right, left = both(ExperienceConfig().of(Logged(), data))
         assert float(right) == pytest.approx(worth, rel=0.05)
         assert float(left) == pytest.approx(0.0, abs=0.1)
+
+
+def test_estimates_of_returns_against_plain_loops(table):
+    """A target that prefers right, from a neutral behaviour policy; Q is constant, so that its mean is known."""
+    scale, q = 0.5, 1.5
+    steps = jnp.asarray(np.random.default_rng(1).random(table.reward.shape) < 0.2)
+    data = ExperienceConfig().of(Logged(), table)
+    data = replace(data, expert=replace(data.expert, clipped=steps))
+
+    def gaussian(loc):
+        def policy(observation):
+            shape = (*observation["pendulum"].shape[:-1], 1)
+            return SquashedGaussian(jnp.full(shape, loc), jnp.full(shape, scale))
+
+        return policy
+
+    def constant(observation, action):
+        return jnp.full(observation["pendulum"].shape[:-1], q)
+
+    loc = math.atanh(0.5)
+    result = estimate_return(Logged(), data, gaussian(loc), gaussian(0.0), constant, GAMMA)
+    raw = np.arctanh(np.asarray(table.action[..., 0], np.float64))
+    ratio = np.exp((raw**2 - (raw - loc) ** 2) / (2 * scale**2))
+    assert ratio.min() > 0.1 and ratio.max() < 10.0
+    ratio = np.where(np.asarray(steps), 1.0, ratio)
+    reward, count = np.asarray(table.reward), len(table.reward)
+    before, sampling, robust = np.full(count, 1 / count), 0.0, 0.0
+    for step in range(LENGTH):
+        product = ratio[:, : step + 1].prod(axis=1)
+        weight = product / product.sum()
+        sampling += GAMMA**step * (weight * reward[:, step]).sum()
+        robust += GAMMA**step * (weight * (reward[:, step] - q) + before * q).sum()
+        before = weight
+    assert float(result["weighted_importance_sampling"].value) == pytest.approx(sampling, rel=1e-3)
+    assert float(result["doubly_robust"].value) == pytest.approx(robust, rel=1e-3)
+
+
+def test_ratios_of_estimates_are_limited(table):
+    """Two policies so far apart that every ratio is 10 or 0.1."""
+    data = ExperienceConfig().of(Logged(), table)
+
+    def policy(loc):
+        return lambda o: SquashedGaussian(*(jnp.full((*o["pendulum"].shape[:-1], 1), x) for x in (loc, 0.01)))
+
+    result = estimate_return(
+        Logged(), data, policy(0.5), policy(-0.5), lambda o, a: jnp.zeros(o["pendulum"].shape[:-1]), GAMMA
+    )
+    right = np.asarray(table.reward[:, :LENGTH])
+    product = np.cumprod(np.where(right > 0, MOST_RATIO, 1 / MOST_RATIO), axis=1)
+    weight = product / product.sum(axis=0)
+    expected = (weight * right).sum(axis=0) @ GAMMA ** np.arange(LENGTH)
+    assert float(result["weighted_importance_sampling"].value) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -5,12 +5,16 @@ import shutil
 from dataclasses import replace
 
 import gymnasium
+import h5py
 import jax
+import minari
 import numpy as np
 import pytest
+from minari.data_collector import DataCollector
 
 from drivax import settings
 from drivax.adapters.gym import DrivingEnv
+from drivax.adapters.minari import read_minari, write_minari
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
@@ -26,12 +30,6 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
-
-minari = pytest.importorskip("minari")
-import h5py  # noqa: E402
-from minari.data_collector import DataCollector  # noqa: E402
-
-from drivax.adapters.minari import read_minari, write_minari  # noqa: E402
 
 #: Of missing descriptions, and of the temporary folder of a collector.
 MINARI_WARNS = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::ResourceWarning")
@@ -246,6 +244,10 @@ def test_best_stored_episodes_of_unknown_scenarios_are_chosen_among_all(data):
         (lambda f: f["episode_0/actions"].__setitem__((0, 0), np.nan), "a number is not finite"),
         (lambda f: f["episode_0/terminations"].__setitem__(0, True), "goes on after its termination"),
         (lambda f: f.__setitem__("episode_1", h5py.ExternalLink("/etc/passwd", "/")), "episode_1 is a link"),
+        (
+            lambda f: f.create_dataset("x", (3,), "u1", external=[("/etc/passwd", 0, 3)]),
+            "x lies in another file",
+        ),
         (lambda f: f.create_dataset("x", (2**40,), "f4", chunks=True, compression="gzip"), "bytes of memory"),
     ],
 )
@@ -256,6 +258,19 @@ def test_damaged_and_hostile_minari_data_are_refused(tmp_path, damage, words):
     with h5py.File(out / "data" / "main_data.hdf5", "a") as file:
         damage(file)
     with pytest.raises(DataError, match=words):
+        read_minari(out)
+
+
+def test_padding_counts_towards_the_memory(tmp_path, monkeypatch):
+    """One long episode among short ones: 51 x 1,001 x 4 numbers of 4 bytes."""
+    out = tmp_path / "tiny-v0"
+    write_minari(out, TASK, [tiny(1000, False), *[tiny(1, False)] * 50])
+    monkeypatch.setattr("drivax.adapters.minari._MOST_RATIO", 0)
+    size = 51 * 1001 * 4 * 4
+    monkeypatch.setattr("drivax.adapters.minari._MOST_BYTES", size)
+    assert read_minari(out).steps.usable.shape == (51, 1001)
+    monkeypatch.setattr("drivax.adapters.minari._MOST_BYTES", size - 1)
+    with pytest.raises(DataError, match=f"needs {size:,} bytes of memory"):
         read_minari(out)
 
 

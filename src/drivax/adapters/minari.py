@@ -31,8 +31,8 @@ except ModuleNotFoundError as error:
 
 _DATA_FILE = "main_data.hdf5"
 _CURE = "download or export the data set again"
-#: Largest size of the arrays that are read, bytes.
-_MOST_BYTES = 16 * 2**30
+#: Largest size of the arrays that are read, bytes, or as a multiple of the file if that is more.
+_MOST_BYTES, _MOST_RATIO = 2**30, 16
 #: Episodes that are written at once.
 _CHUNK = 256
 
@@ -123,7 +123,8 @@ def read_minari(path: str | Path) -> StoredEpisodes:
         problem = f"its format is {metadata['data_format']}"
         raise UsageError(problem, file=folder, cure="convert it to hdf5, Minari's default")
     with explain_damage(folder, _CURE, "cannot be read"):
-        _check_content(folder / _DATA_FILE)
+        most_bytes = max(_MOST_BYTES, _MOST_RATIO * (folder / _DATA_FILE).stat().st_size)
+        _check_content(folder / _DATA_FILE, most_bytes)
         storage = MinariStorage.read(folder)
         low, high = _bounds(storage.action_space, folder)
         observations = storage.observation_space
@@ -138,14 +139,17 @@ def read_minari(path: str | Path) -> StoredEpisodes:
         ]
     if not episodes:
         raise DataError("contains no episodes", file=folder, cure=_CURE)
+    # Episodes are padded to the longest one.
+    floats = sum(values[0].size for values in episodes[0].observation.values()) + len(low) + 1
+    _check_bytes(4 * floats * len(episodes) * max(len(e.reward) + 1 for e in episodes), most_bytes, folder)
     return StoredEpisodes.of(episodes)
 
 
-def _check_content(file: Path) -> None:
+def _check_content(file: Path, most_bytes: int) -> None:
     """Check a file of HDF5.
 
     Raises:
-        DataError: It contains links, or its arrays are too large.
+        DataError: It contains links, or its arrays are too large, or lie in other files.
     """
     size = 0
     with h5py.File(file) as content:
@@ -155,11 +159,18 @@ def _check_content(file: Path) -> None:
             for name in group:
                 if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                     raise DataError(f"{name} is a link", file=file, cure=_CURE)
-                if isinstance(item := group[name], h5py.Group):
+                item: Any = group[name]
+                if isinstance(item, h5py.Group):
                     groups.append(item)
+                elif item.external or item.is_virtual:
+                    raise DataError(f"{name} lies in another file", file=file, cure=_CURE)
                 else:
                     size += item.size * item.dtype.itemsize
-    if size > _MOST_BYTES:
+    _check_bytes(size, most_bytes, file)
+
+
+def _check_bytes(size: int, most_bytes: int, file: Path) -> None:
+    if size > most_bytes:
         raise DataError(f"needs {size:,} bytes of memory", file=file, cure="take a smaller data set")
 
 

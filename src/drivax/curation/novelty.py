@@ -148,8 +148,8 @@ class Embedding:
 def _random_encoder(config: NoveltyConfig, environment: Driving, data: ScenarioSet) -> tuple[Any, Any]:
     """Return structure and random parameters of the configured encoder."""
     shapes = environment.shapes(ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)))
-    graph = graph_of(nnx.eval_shape(lambda: config.encoder.build(shapes, nnx.Rngs(config.seed))))
-    return graph, nnx.state(config.encoder.build(shapes, nnx.Rngs(config.seed)), nnx.Param)
+    encoder = config.encoder.build(shapes, nnx.Rngs(config.seed))
+    return graph_of(encoder), nnx.state(encoder, nnx.Param)
 
 
 def novelty(

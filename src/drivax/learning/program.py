@@ -152,9 +152,7 @@ class Program:
             specs = (PartitionSpec(), PartitionSpec(_SEEDS))
             run = jax.shard_map(run, in_specs=specs, out_specs=specs[1], check_vma=False)
         after, logs = run(data, state)
-        # Fused with the iteration, the check could change how parameters are rounded.
-        leaves = jax.lax.optimization_barrier(list(trained_leaves(after).values()))
-        return after, logs, self.seeds.all_finite(leaves)
+        return after, logs, self.seeds.all_finite(isolated_leaves(after))
 
     def account(self, validation: Any = None) -> MemoryAccount:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
@@ -187,6 +185,14 @@ def trained_leaves(state: Any) -> dict[str, Any]:
         for path, leaf in jax.tree.leaves_with_path(state)
         if jnp.issubdtype(leaf.dtype, jnp.floating) and _listed_field(path) is None
     }
+
+
+def isolated_leaves(state: Any) -> list[Array]:
+    """Return the trained leaves of a state, for a check in the program of its iteration.
+
+    Fused with the iteration, the check could change how parameters are rounded.
+    """
+    return jax.lax.optimization_barrier(list(trained_leaves(state).values()))
 
 
 def all_finite(leaves: Sequence[Array]) -> Bool[Array, ""]:

@@ -7,7 +7,6 @@ programs need the transitions of one task.
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -208,12 +207,7 @@ def write_npz(out: Path, episodes: Iterable[StoredEpisode]) -> tuple[int, int]:
             columns.setdefault(name, []).append(rows)
         count += 1
     transitions = sum(map(len, columns.get("rewards", ())))
-    with (
-        atomic_write(out) as file,
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        arrays = ((name, np.concatenate(parts)) for name, parts in columns.items())
-        for name, values in (*arrays, ("layout", np.array(json.dumps(layout)))):
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, values, allow_pickle=False)
+    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
+    with atomic_write(out) as file:
+        np.savez_compressed(file, allow_pickle=False, layout=np.array(json.dumps(layout)), **arrays)
     return count, transitions
