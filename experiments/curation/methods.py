@@ -40,7 +40,13 @@ from drivax.curation.methods import (
     make_table,
     permute_scores,
 )
-from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
+from drivax.curation.rarity import (
+    ExpertActions,
+    KernelRarity,
+    PublishedRarity,
+    known_actions,
+    rarity_steps,
+)
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
@@ -174,11 +180,10 @@ def score_methods(
         return
     actions = [score_steps(data, ExpertActions()) for data in sets]
     for name, config in rarities.items():
-        test_actions = actions[0]["action"][actions[0]["known"]].astype(np.float64)
+        histogram = config.histogram(known_actions(actions[0]["action"], actions[0]["known"]))
         tables = []
         for data, expert in zip(sets, actions, strict=True):
-            known, steps = expert["known"], np.zeros(expert["known"].shape)
-            steps[known] = config.scores(test_actions, expert["action"][known].astype(np.float64))
+            steps = rarity_steps(config, expert["action"], expert["known"], histogram)
             tables.append(make_table(name, config, data, {"rarity": steps}))
         yield name, tables[0], concatenate_tables(tables)
 

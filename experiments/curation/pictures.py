@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from drivax.curation.ensemble import EnsembleConfig, train_ensemble
 from drivax.curation.logged import score_steps
 from drivax.curation.methods import Request, curate, ensemble_table
-from drivax.curation.rarity import ExpertActions, KernelRarity
+from drivax.curation.rarity import ExpertActions, KernelRarity, known_actions
 from drivax.curation.scores import ScoreTable
 from drivax.report.pictures.palette import LIGHT, SERIES
 from drivax.report.pictures.still import draw_on
@@ -113,7 +113,8 @@ def rarity(data: ScenarioSet, out: Path) -> None:
     action, known = np.asarray(expert["action"]), np.asarray(expert["known"])
     ticks = np.linspace(-1.0, 1.0, 201)
     grid = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    density = KernelRarity().density(action[known], grid).reshape(201, 201)
+    kernel = KernelRarity()
+    density = kernel.density(kernel.histogram(known_actions(action, known)), grid).reshape(201, 201)
 
     def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         mesh: Any = axes[0].pcolormesh(ticks, ticks, np.log10(density + 1e-4), cmap="Greys", rasterized=True)

@@ -115,7 +115,7 @@ def test_saved_ensemble_scores_as_the_trained_one_and_other_sets(data, ensemble,
     table = read_scores(scores, ScenarioSet.open(other))
     assert table.config["trained_on"] == data.hash and table.config["folds"] == 3
     assert main([*call, "--out", str(tmp_path / "x.npz"), "--folds", "4"]) == 2
-    assert "members, which is trained, has no such setting; leave out --folds 4" in capsys.readouterr().err
+    assert "members, which exists, has no such setting; leave out --folds 4" in capsys.readouterr().err
     assert main(["curate", "kinematic", "--data", str(other), "--members", str(out), "--out", "x.npz"]) == 2
     assert "leave out --members" in capsys.readouterr().err
 
@@ -320,7 +320,7 @@ def test_rare_actions_are_drawn_by_the_inverse_of_their_density(data):
     chance = np.diff(np.asarray(experience.critic.cumulative, np.float64), prepend=0.0).reshape(usable.shape)
     assert chance[usable].all() and not chance[~usable].any()
     kernel = KernelRarity()
-    density = kernel.density(action, action)
+    density = kernel.density(kernel.histogram(action), action)
     inverse = np.minimum(np.median(density) / density, kernel.most)
     np.testing.assert_allclose(chance[usable] / chance.sum(), inverse / inverse.sum(), rtol=1e-5)
 

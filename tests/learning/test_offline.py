@@ -1,5 +1,6 @@
 """Offline algorithms: losses against NumPy on the networks' own outputs, and what they learn of small worlds."""
 
+import json
 from dataclasses import replace
 from functools import partial
 
@@ -7,14 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 from scipy import special
 
 from drivax import settings
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.offline import read_statistics
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
@@ -23,7 +26,7 @@ from drivax.learning.policies import load_policy
 from drivax.learning.replay import Transitions
 from drivax.learning.training_set import TrainingSet
 from drivax.networks.actor_critic import NetworkConfig
-from drivax.networks.encoders import MlpConfig
+from drivax.networks.encoders import MlpConfig, NormalisedEncoder, group_names
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.log import LogTraffic
@@ -285,6 +288,64 @@ def test_awac_against_numpy(batch, policy_batch):
     assert total == pytest.approx(critic + policy, rel=1e-4)
 
 
+@pytest.mark.parametrize("config", [IQL, AWAC], ids=["iql", "awac"])
+def test_advantages_of_logged_returns(config, batch):
+    """The advantage is that of the batch's rewards and next states; values and critics learn as before."""
+    learner, trained, target = build_learner(config)
+    hindsight, *_ = build_learner(replace(config, advantage="return"))
+    (next_keys, policy_keys), keys = step_keys(2)
+    own = batch.observation, batch.action
+    before, logs = (losses(each, trained, target, batch, own, keys)[1] for each in (learner, hindsight))
+
+    @jax.jit
+    def values(trained):
+        if config is IQL:
+            return [learner._value(trained["value"], seen) for seen in (batch.next_observation, own[0])]
+        pairs = (
+            (batch.next_observation, next_keys, target["critic"]),
+            (own[0], policy_keys, trained["critic"]),
+        )
+        return [
+            learner.smaller_q(
+                critic, seen, jnp.tanh(draw_raw(learner.distribution(trained["policy"], seen), own_keys))
+            )
+            for seen, own_keys, critic in pairs
+        ]
+
+    then, now = (np.asarray(value, np.float64) for value in values(trained))
+    advantage = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, then) - now
+    assert logs["advantage"] == pytest.approx(advantage.mean(), rel=1e-3)
+    weights = np.minimum(np.exp(config.inverse_temperature * advantage), 100.0)
+    assert logs["weight"] == pytest.approx(weights.mean(), rel=1e-3)
+    assert abs(before["advantage"] - logs["advantage"]) > 0.05
+    assert before["critic"] == logs["critic"] and before.get("value") == logs.get("value")
+
+
+def test_n_step_returns_end_with_the_episode():
+    """Two episodes of five steps, of which the second ends by failure after three."""
+    reward = np.random.default_rng(4).normal(size=(2, 6))
+    usable = np.arange(6) < np.array([[5], [3]])
+    terminated, last = np.zeros((2, 6), bool), np.array([4, 2])
+    terminated[1, 2] = True
+    truncated = np.zeros((2, 6), bool)
+    truncated[0, 4] = True
+    seen = np.arange(12.0).reshape(2, 6, 1) + np.zeros(3)
+    table = Table(*map(jnp.asarray, (seen, np.zeros((2, 6, 1)), reward, terminated, truncated, usable)))
+    learner = replace(IQL, steps=3, batch=256).build(Logged(), table, 1)
+    experience = training_data(learner.config, Logged(), table, None)
+    drawn, _ = jax.jit(learner._draw)(experience, jax.random.key(0))
+    places = np.asarray(drawn.observation["pendulum"])[:, 0].astype(int)
+    assert sorted(set(places)) == [0, 1, 2, 3, 4, 6, 7, 8]
+    for number, place in enumerate(places):
+        episode, step = divmod(place, 6)
+        end = min(step + 3, last[episode] + 1)
+        expected = sum(0.9 ** (t - step) * reward[episode, t] for t in range(step, end))
+        assert float(drawn.reward[number]) == pytest.approx(expected, rel=1e-5)
+        assert float(drawn.discount[number]) == pytest.approx(0.9 ** (end - step), rel=1e-6)
+        assert float(drawn.next_observation["pendulum"][number, 0]) == episode * 6 + end
+        assert bool(drawn.terminated[number]) == (episode == 1 and end == 3)
+
+
 def test_td3_bc_against_numpy(batch, policy_batch):
     learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3))
     _, keys = step_keys(1)
@@ -453,6 +514,11 @@ def test_impossible_settings_are_refused():
         (partial(CqlConfig, relative=True, gap=1.0), "a gap replaces the weight of the penalty"),
         (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0, .*; use more than 0, or no gap"),
         (partial(Td3BcConfig, delay=0), "delay is 0; use 1 or more"),
+        (partial(CqlConfig, steps=0), "steps is 0; use 1 or more"),
+        (
+            partial(AwacConfig, advantage="return", records=ExperienceConfig(weighted="policy")),
+            "advantage: return needs the transitions .*; set records.weighted to all",
+        ),
     ):
         with pytest.raises(UsageError, match=words):
             config()
@@ -566,3 +632,31 @@ def test_former_key_of_the_decay_share_is_read(kind):
     assert config.algorithm.decay_share == 0.25
     changed = settings.load(TrainConfig, f"offline/{kind}", ["--algorithm.falling", "0.25"])
     assert changed.algorithm.decay_share == 0.25
+
+
+def test_statistics_of_a_file_normalise_features(bandit, tmp_path):
+    file, data = tmp_path / "statistics.json", bandit
+    spec = Logged().shapes(data)
+    rows = [
+        {"group": group, "name": f"{column}", "mean": 3.0 + column, "std": None if column else 2.0}
+        for group in group_names(spec)
+        for column in range(spec[group][-1])
+    ]
+    file.write_text(json.dumps({"features": rows}))
+    learner = replace(TD3_BC, normalise=str(file)).build(Logged(), data, 2)
+    state = learner.init(training_data(learner.config, Logged(), data, None), jax.random.key(0))
+    policy = nnx.merge(learner.graphs["policy"], state.parameters)
+    (encoder,) = (node for _, node in nnx.iter_graph(policy) if isinstance(node, NormalisedEncoder))
+    for group in group_names(spec):
+        size = spec[group][-1]
+        np.testing.assert_array_equal(encoder.mean[group][...], 3.0 + np.arange(size))
+        np.testing.assert_array_equal(encoder.deviation[group][...], [2.0, *[1.0] * (size - 1)])
+    for damage, words in (
+        ({"features": rows[1:]}, "the observation has other features"),
+        ({"features": [*rows[:-1], {**rows[-1], "std": -1.0}]}, "a deviation of -1"),
+        ({"features": 3}, "no statistics of observations"),
+        ([], "no statistics of observations"),
+    ):
+        file.write_text(json.dumps(damage))
+        with pytest.raises(DataError, match=rf"statistics.json.*{words}.*drivax inspect SET --observations"):
+            read_statistics(file, spec)

@@ -86,6 +86,9 @@ class Curate:
     members: Path | None = None
     """Folder of an ensemble: if it exists, its members score DATA; otherwise they are trained and written there. For
     novelty and --diverse, the first member embeds the steps."""
+    actions: Path | None = None
+    """File of a histogram of actions: if it exists, action_rarity scores DATA by it; otherwise that of DATA is written
+    there."""
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
     """Run code of this module of yours that a saved ensemble names; repeat it to trust several."""
     egos: Egos = "recorded"
@@ -127,7 +130,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     if args.again is None:
         request = Request(
             data, args.like, args.seed or 0, args.tables, args.runs, config,
-            egos=args.egos, members=args.members, trust=args.trust_code,
+            egos=args.egos, members=args.members, actions=args.actions,
+            trust=args.trust_code,
         )  # fmt: skip
         table = score_with_progress(args.method, request)
     else:
@@ -161,10 +165,14 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
 def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
     """Refuse flags that the method or --again would ignore."""
     again, subject = args.again is not None, args.method
-    is_saved = args.method == "ensemble" and args.members is not None and args.members.exists()
     ignored_values: dict[str, object] = {}
+    is_rarity = args.method in ("action_rarity", "action_rarity_published")
+    source = args.members if args.method == "ensemble" else args.actions if is_rarity else None
+    is_saved = source is not None and source.exists()
     if is_saved:
-        subject, has_settings = f"{args.members}, which is trained,", False
+        subject, has_settings = f"{source}, which exists,", False
+    if again or not is_rarity:
+        ignored_values["--actions"] = args.actions
     if not args.diverse and (again or args.method not in ("ensemble", "novelty")):
         ignored_values["--members"] = args.members
     if again:

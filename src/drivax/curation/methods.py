@@ -26,7 +26,15 @@ from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import LoggedScenario, Progress, score_steps, valid_steps
 from drivax.curation.novelty import Embedding, NoveltyConfig, novelty
 from drivax.curation.query import Quantities, QueryConfig
-from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
+from drivax.curation.rarity import (
+    ExpertActions,
+    KernelRarity,
+    PublishedRarity,
+    known_actions,
+    rarity_steps,
+    read_actions,
+    write_actions,
+)
 from drivax.curation.scores import Combination, ScoreTable, read_scores
 from drivax.curation.weights import permute_scores
 from drivax.errors import DataError, UsageError, did_you_mean
@@ -87,6 +95,8 @@ class Request:
         egos: Vehicles to score: the recorded ego of each scenario, or all egos of a set made with ``--egos`` (moving).
         members: Folder of an ensemble. For ``ensemble``, it scores the set if it exists, and is written otherwise; for
             ``novelty``, its first member embeds the steps.
+        actions: File of a histogram of actions. For ``action_rarity`` and ``action_rarity_published``, it scores the
+            set if it exists, and is written otherwise.
         trust: Modules outside drivax whose code the settings of a saved ensemble may name.
     """
 
@@ -100,6 +110,7 @@ class Request:
     training: Progress | None = None
     egos: Egos = "recorded"
     members: Path | None = None
+    actions: Path | None = None
     trust: Sequence[str] = ()
 
     @property
@@ -311,9 +322,16 @@ def _components(name: str, request: Request) -> ScoreTable:
 
 
 def _rarity(name: str, request: Request) -> ScoreTable:
+    config, histogram, file = request.config, None, request.actions
+    if file is not None and file.exists():
+        config, histogram = read_actions(config, file)
     expert = score_steps(request.data, ExpertActions(), request.progress, request.most_egos)
-    components = {"rarity": rarity_steps(request.config, expert["action"], expert["known"])}
-    return make_table(name, request.config, request.data, components, egos=request.most_egos)
+    if file is not None and histogram is None:
+        histogram = config.histogram(known_actions(expert["action"], expert["known"]))
+        write_actions(config, histogram, file)
+    components = {"rarity": rarity_steps(config, expert["action"], expert["known"], histogram)}
+    details = {} if file is None else {"actions": str(file)}
+    return make_table(name, config, request.data, components, details, egos=request.most_egos)
 
 
 def _ensemble(_: str, request: Request) -> ScoreTable:

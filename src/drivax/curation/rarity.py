@@ -1,11 +1,14 @@
 """Action rarity: inverse density of the expert's action among all expert actions of a set.
 
-Actions are in units of the action space, [-1, 1] in both dimensions.
+Actions are in units of the action space, [-1, 1] in both dimensions. A histogram of the actions of one set can be saved
+and score others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,10 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax import settings
 from drivax.curation.kinematic import check_positive
 from drivax.curation.logged import LoggedScenario
 from drivax.errors import DataError, UsageError
+from drivax.files import atomic_write, check_output
 from drivax.planners.simple import expert_action
+from drivax.reading import explain_damage, parse_json, read_arrays
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.tasks.actions import Physical
 
@@ -24,9 +30,28 @@ Actions = Float[np.ndarray[Any, Any], "n 2"]
 Values = Float[np.ndarray[Any, Any], " n"]
 QueryActions = Float[np.ndarray[Any, Any], "m 2"]
 QueryValues = Float[np.ndarray[Any, Any], " m"]
+Cells = Int[np.ndarray[Any, Any], " m"]
 
 #: The default action space of imitation and offline learning.
 _SPACE = Physical()
+#: Maximum number of bins along each dimension, and of bytes of a file.
+_MOST_CELLS, _MOST_BYTES = 4096, 256 << 20
+_CURE = "write it with `drivax curate action_rarity --actions FILE`"
+
+
+@dataclass(frozen=True, eq=False)
+class ActionHistogram:
+    """Counts of the expert's actions of a set.
+
+    Attributes:
+        counts: Number of actions in each bin of acceleration and of curvature.
+        edges: Edges of the bins along both dimensions, in units of the action space.
+        median: Density of the action of median density (only of :class:`KernelRarity`; otherwise 0).
+    """
+
+    counts: Int[np.ndarray[Any, Any], "rows columns"]
+    edges: tuple[Values, Values]
+    median: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -67,29 +92,33 @@ class KernelRarity:
 
     def __post_init__(self) -> None:
         check_positive({"bandwidth": self.bandwidth})
-        if self.cells < 2:
-            raise UsageError(f"cells is {self.cells}", cure="use 2 or more")
+        if not 2 <= self.cells <= _MOST_CELLS:
+            raise UsageError(f"cells is {self.cells}", cure=f"use 2 to {_MOST_CELLS:,}")
         if not 0.0 <= self.temper <= 1.0:
             raise UsageError(f"temper is {self.temper}", cure="use 0 to 1")
         if not 1.0 <= self.most < float("inf"):
             raise UsageError(f"most is {self.most}", cure="use 1 or more, but not inf")
 
-    def density(self, actions: Actions, at: QueryActions) -> QueryValues:
-        """Return the density of ``actions`` at the points ``at``, per unit of area; both are in [-1, 1]."""
+    def histogram(self, actions: Actions) -> ActionHistogram:
+        """Return the histogram of actions, which are in [-1, 1]."""
+        edges = np.linspace(-1.0, 1.0, self.cells + 1)
+        counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0].astype(np.int64)
+        histogram = ActionHistogram(counts, (edges, edges))
+        return replace(histogram, median=float(np.median(self.density(histogram, actions))))
+
+    def density(self, histogram: ActionHistogram, at: QueryActions) -> QueryValues:
+        """Return the density of a set's actions at the points ``at``, per unit of area."""
         from scipy.ndimage import gaussian_filter, map_coordinates  # takes 0.1 s to import
 
-        edges = np.linspace(-1.0, 1.0, self.cells + 1)
-        counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0]
-        cell = 2.0 / self.cells
+        counts, cell = histogram.counts.astype(np.float64), 2.0 / self.cells
         kernel_sum = gaussian_filter(counts, self.bandwidth / cell, mode="reflect", truncate=6.0)
         position = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
-        return map_coordinates(kernel_sum, position, order=1, mode="nearest") / (len(actions) * cell * cell)
+        return map_coordinates(kernel_sum, position, order=1, mode="nearest") / (counts.sum() * cell * cell)
 
-    def scores(self, actions: Actions, at: QueryActions) -> QueryValues:
-        """Return the scores of the actions ``at``, in [0, 1], from the density of ``actions``."""
-        median_density = np.median(self.density(actions, actions))
+    def scores(self, histogram: ActionHistogram, at: QueryActions) -> QueryValues:
+        """Return the scores of the actions ``at``, in [0, 1], from a set's histogram."""
         with np.errstate(divide="ignore", over="ignore"):  # a density of 0 gives infinity, which is clipped
-            rarity = (median_density / self.density(actions, at)) ** self.temper
+            rarity = (histogram.median / self.density(histogram, at)) ** self.temper
         return np.minimum(rarity, self.most) / self.most
 
 
@@ -118,34 +147,101 @@ class PublishedRarity:
         curvature = [np.linspace(-1, -0.2, 25), np.linspace(-0.2, 0.2, 40), np.linspace(0.2, 1, 25)]
         return np.concatenate(acceleration), np.concatenate(curvature)
 
-    def scores(self, actions: Actions, at: QueryActions) -> QueryValues:
-        """Return the scores of the actions ``at``, in [0, 1], from the counts of ``actions`` in their cells."""
-        cells = 89 * 89
-        weight = 1.0 / (np.bincount(self._cell(actions), minlength=cells) + 1.0)
+    def histogram(self, actions: Actions) -> ActionHistogram:
+        """Return the histogram of actions, which are in [-1, 1]; its edges are in m/s2 and 1/m."""
+        counts = np.zeros((89, 89), np.int64)
+        np.add.at(counts, self._cell(actions), 1)
+        return ActionHistogram(counts, self.edges)
+
+    def scores(self, histogram: ActionHistogram, at: QueryActions) -> QueryValues:
+        """Return the scores of the actions ``at``, in [0, 1], from the counts of a set in their bins."""
+        weight = 1.0 / (histogram.counts + 1.0)
         rarity = np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
         return np.minimum(rarity + 0.01, 1.0)
 
-    def _cell(self, actions: QueryActions) -> Int[np.ndarray[Any, Any], " m"]:
+    def _cell(self, actions: QueryActions) -> tuple[Cells, Cells]:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
         pairs = zip(self.edges, values, strict=True)
         row, column = (np.searchsorted(edges, value, side="right") - 1 for edges, value in pairs)
-        return row * 89 + column
+        return row, column
+
+
+def known_actions(
+    actions: Float[np.ndarray[Any, Any], "N T 2"], known: Bool[np.ndarray[Any, Any], "N T"]
+) -> Actions:
+    """Return the known actions of a set.
+
+    Raises:
+        DataError: There is none.
+    """
+    if not known.any():
+        raise DataError("no log has three consecutive steps, so no action is known", cure="check the set")
+    return np.asarray(actions[known], np.float64)
 
 
 def rarity_steps(
     config: KernelRarity | PublishedRarity,
     actions: Float[np.ndarray[Any, Any], "N T 2"],
     known: Bool[np.ndarray[Any, Any], "N T"],
+    histogram: ActionHistogram | None = None,
 ) -> Float[np.ndarray[Any, Any], "N T"]:
-    """Return the score of every step of a set; 0 where the expert's action is unknown.
+    """Return the score of every step of a set, by the histogram of its own actions or by a given one.
+
+    Steps at which the expert's action is unknown score 0.
 
     Raises:
         DataError: No action is known.
     """
-    if not known.any():
-        raise DataError("no log has three consecutive steps, so no action is known", cure="check the set")
-    known_actions = np.asarray(actions[known], np.float64)
+    expert = known_actions(actions, known)
     steps = np.zeros(known.shape)
-    steps[known] = config.scores(known_actions, known_actions)
+    steps[known] = config.scores(config.histogram(expert) if histogram is None else histogram, expert)
     return steps
+
+
+def write_actions(config: KernelRarity | PublishedRarity, histogram: ActionHistogram, out: Path) -> None:
+    """Write the histogram of a set's actions and the settings that score by it, as ``.npz``.
+
+    The arrays are ``settings`` (JSON), ``counts``, ``acceleration_edges``, ``curvature_edges`` and ``median``.
+
+    Raises:
+        UsageError: ``out`` exists.
+    """
+    check_output(out, False)
+    names = ("acceleration_edges", "curvature_edges")
+    arrays = dict(zip(names, histogram.edges, strict=True)) | {"counts": histogram.counts}
+    text = json.dumps({"kind": type(config).__name__, **settings.plain(config)})
+    with atomic_write(out) as file:
+        np.savez_compressed(
+            file, allow_pickle=False, settings=np.array(text), median=np.array(histogram.median), **arrays
+        )
+
+
+def read_actions(
+    default: KernelRarity | PublishedRarity, file: Path
+) -> tuple[KernelRarity | PublishedRarity, ActionHistogram]:
+    """Read settings of the kind of ``default``, and a histogram, that :func:`write_actions` wrote.
+
+    Raises:
+        DataError: The file is missing or damaged, or of another kind.
+    """
+    arrays = read_arrays(file, _CURE, _MOST_BYTES)
+    with explain_damage(file, _CURE, "not a histogram of actions, or damaged"):
+        values = parse_json(str(arrays["settings"][()]).encode())
+        kind = values.pop("kind")
+        counts, median = arrays["counts"], float(arrays["median"])
+        edges = arrays["acceleration_edges"], arrays["curvature_edges"]
+        if kind == type(default).__name__:
+            try:
+                config = settings.load(type(default), values, trust=())
+            except UsageError as error:
+                raise ValueError(error.problem) from error
+            expected = config.histogram(np.zeros((1, 2)))
+            same_bins = all(np.array_equal(*pair) for pair in zip(edges, expected.edges, strict=True))
+            if not same_bins or counts.shape != expected.counts.shape or counts.dtype != np.int64:
+                raise ValueError("bins and settings differ")
+            if counts.min() < 0 or counts.sum() < 1 or not 0.0 <= median < float("inf"):
+                raise ValueError("a count or the median is invalid")
+            return config, ActionHistogram(counts, edges, median)
+    method = {"KernelRarity": "action_rarity", "PublishedRarity": "action_rarity_published"}.get(str(kind))
+    raise DataError(f"is a histogram of {method}", file=file, cure=f"use curate {method}, or another file")

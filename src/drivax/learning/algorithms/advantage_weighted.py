@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.checks import check_above_zero, check_at_least
+from drivax.errors import UsageError
 from drivax.learning.algorithms.off_policy import Trained
 from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.program import mean_over_devices
@@ -26,12 +27,16 @@ class AdvantageWeightedConfig(OfflineConfig):
         inverse_temperature: ``beta`` of the imitation weights ``exp(beta A)``; 0: uniform weights.
         relative: Divide advantages by their standard deviation over the batch, so that weights do not depend on the
             scale of rewards.
+        advantage: ``critic``: Q of the logged action minus the value, as published; ``return``: its n-step return
+            (``steps``) minus the value, as in advantage-weighted regression (Peng et al. 2019, arXiv 1910.00177). A
+            single action of 0.1 s hardly changes Q; the logged actions after it are likely to be similar.
         largest_weight: Upper bound of the weights.
         loss: Imitation loss: ``likelihood``, as published, or ``mse`` of the mode, in action units.
     """
 
     inverse_temperature: float = 3.0
     relative: bool = False
+    advantage: Literal["critic", "return"] = "critic"
     largest_weight: float = 100.0
     loss: Literal["likelihood", "mse"] = "likelihood"
 
@@ -41,6 +46,9 @@ class AdvantageWeightedConfig(OfflineConfig):
         check_above_zero(self, "largest_weight")
         if self.loss == "mse":
             self.check_gradient()
+        if self.advantage == "return" and self.records.weighted == "policy":
+            problem = "advantage: return needs the transitions of the steps that the policy imitates"
+            raise UsageError(problem, cure="set records.weighted to all")
 
 
 Config = TypeVar("Config", bound=AdvantageWeightedConfig)

@@ -15,11 +15,12 @@ from drivax.learning.algorithms.off_policy import Trained, q_logs, sample_each
 from drivax.learning.algorithms.offline import PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
+from drivax.rl.equations import td_target
 
 
 @dataclass(frozen=True)
 class AwacConfig(AdvantageWeightedConfig):
-    """AWAC. The advantage is that over a sampled action of the policy, by the critics themselves."""
+    """AWAC. The value that an advantage is relative to is Q of a sampled action, by the critics themselves."""
 
     kind: Literal["awac"] = "awac"
     inverse_temperature: float = 1.0
@@ -47,6 +48,8 @@ class Awac(AdvantageWeighted[AwacConfig]):
         policy = self.distribution(parameters, observation)
         actions = jnp.stack([expert, policy.action(sample_each(policy, policy_keys))])
         logged_q, policy_q = self.smaller_q(critic, observation, actions)
+        if self.config.advantage == "return":
+            logged_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         imitation, logs = self.imitation(trained, policy_batch, logged_q - policy_q)
         return critic_loss + imitation, logs | {
             "critic": critic_loss,

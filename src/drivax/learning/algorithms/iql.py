@@ -19,7 +19,7 @@ from drivax.learning.algorithms.offline import PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Value
-from drivax.rl.equations import expectile_loss
+from drivax.rl.equations import expectile_loss, td_target
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,8 @@ class Iql(AdvantageWeighted[IqlConfig]):
         next_value = jax.lax.stop_gradient(self._value(trained["value"], batch.next_observation))
         critic_loss, q = self.critic_loss(trained, batch, next_value)
 
+        if self.config.advantage == "return":
+            target_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         advantage = target_q - value
         if observation is not batch.observation:
             policy_value = self._value(trained["value"], observation)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
 import jax
@@ -14,7 +16,14 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
-from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_at_most, check_shares
+from drivax.checks import (
+    MOST_RETURN_STEPS,
+    MOST_SAMPLES,
+    check_above_zero,
+    check_at_least,
+    check_at_most,
+    check_shares,
+)
 from drivax.errors import UsageError
 from drivax.learning.algorithms.off_policy import (
     Carry,
@@ -40,7 +49,15 @@ from drivax.learning.recorded_episodes import RecordedEpisodes
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETERISED
-from drivax.networks.encoders import NormalisedConfig, Statistics, feature_statistics, set_statistics
+from drivax.networks.encoders import (
+    GroupSpec,
+    NormalisedConfig,
+    Statistics,
+    feature_statistics,
+    group_names,
+    set_statistics,
+)
+from drivax.reading import explain_damage, read_json
 from drivax.scenario.record import record
 from drivax.stats.ranking import rank_correlation
 
@@ -58,12 +75,15 @@ class OfflineConfig:
         batch: Steps per update.
         updates: Updates per iteration.
         gamma: Discount.
+        steps: Length of n-step returns, in decisions (Sutton 1988); those of logged actions, also where the policy
+            would act differently.
         tau: Polyak averaging rate of target networks.
         policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
         last_rate: Final learning rates relative to the initial ones; 1: constant.
         decay_share: Share of the run over which the rates decay linearly; they are constant afterwards.
         gradient_norm: Maximum global norm of each network's gradient.
-        normalise: Normalise every feature of an observation by its mean and standard deviation over logged steps.
+        normalise: Normalise every feature of an observation by its mean and standard deviation: over logged steps
+            (true), or as in a file that ``drivax inspect --observations --json`` wrote (its path).
         fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
     """
 
@@ -72,21 +92,23 @@ class OfflineConfig:
     batch: int = 256
     updates: int = 50
     gamma: float = 0.99
+    steps: int = 1
     tau: float = 0.005
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     last_rate: float = 1.0
     decay_share: float = 1.0
     gradient_norm: float = 10.0
-    normalise: bool = False
+    normalise: bool | str = False
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
 
     #: Former key.
     renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "batch", "updates")
+        check_at_least(self, 1, "batch", "updates", "steps")
         check_at_most(self, MOST_SAMPLES, "batch", "updates")
+        check_at_most(self, MOST_RETURN_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
         check_shares(self, "gamma", "tau")
         check_above_zero(self, "gradient_norm")
@@ -222,7 +244,7 @@ class Offline(OffPolicy[Config]):
         environment, count = require_log(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
         index = sample_steps(data.critic, critic_key, count)
-        observe = partial(transitions, environment, gamma=self.config.gamma)
+        observe = partial(transitions, environment, gamma=self.config.gamma, steps=self.config.steps)
         batch = map_over_devices(observe, data, index)
         if data.policy is None:
             return batch, None
@@ -231,7 +253,9 @@ class Offline(OffPolicy[Config]):
         return batch, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:
-        """Return feature statistics over uniformly drawn steps, the same for every seed."""
+        """Return the feature statistics of the configured file, or over drawn steps, the same for every seed."""
+        if isinstance(self.config.normalise, str):
+            return read_statistics(Path(self.config.normalise), self.spec)
         index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
         observe = partial(require_log(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, index))
@@ -311,6 +335,31 @@ class Offline(OffPolicy[Config]):
         return evaluation.value(
             data, lambda observation: self.distribution(policy, observation).mode(), statistics
         )
+
+
+def read_statistics(file: Path, spec: GroupSpec) -> Statistics:
+    """Read the statistics of all features of an observation from the JSON of ``drivax inspect --observations``.
+
+    A feature without values has the mean 0 and the deviation 1.
+
+    Raises:
+        DataError: The file is missing or damaged, or describes another observation.
+    """
+    cure = "write it with `drivax inspect SET --observations --json`, for the task of the training"
+    content = read_json(file, cure)
+    with explain_damage(file, cure, "no statistics of observations"):
+        features: dict[str, list[tuple[float, float]]] = {}
+        for row in content["features"]:
+            mean, deviation = row["mean"], row["std"]
+            values = (0.0 if mean is None else float(mean), 1.0 if deviation is None else float(deviation))
+            if not (math.isfinite(values[0]) and 0.0 <= values[1] < math.inf):
+                raise ValueError(f"{row['group']} has a deviation of {values[1]:g}")
+            features.setdefault(row["group"], []).append(values)
+        sizes = {name: spec[name][-1] for name in group_names(spec)}
+        if {name: len(rows) for name, rows in features.items()} != sizes:
+            raise ValueError("the observation has other features")
+    columns = {name: jnp.asarray(rows, jnp.float32).T for name, rows in features.items()}
+    return {name: (mean, deviation) for name, (mean, deviation) in columns.items()}
 
 
 def _without_policy(trained: Trained) -> Trained:

@@ -16,6 +16,7 @@ from flax import nnx
 from jaxtyping import Array, Bool
 
 from drivax.checks import (
+    MOST_RETURN_STEPS,
     MOST_SAMPLES,
     MOST_STEPS_PER_ITERATION,
     check_above_zero,
@@ -61,8 +62,6 @@ from drivax.networks.distributions import REPARAMETERISED
 from drivax.rl.equations import soft_value
 from drivax.scenario.record import record
 
-#: Largest number of steps of n-step returns.
-MOST_RETURN_STEPS = 1000
 #: Indices of steps in the replay buffer, and of logged steps or None.
 _BatchIndex = tuple[ReplayIndex, StepIndex | None]
 #: Two keys of each sample ``[batch, 2]``, and that of the auxiliary loss.
