@@ -204,6 +204,15 @@ def test_curation_page_shows_stored_results(script, stored):
     assert shown, "run python -m experiments.curation.methods table, and read what the page says about it"
 
 
+def test_page_of_critical_moments_shows_stored_results(script, stored, repository):
+    moments, result = script("curation.moments"), stored("critical_moments")
+    page = (repository / "docs" / "results" / "critical-moments.md").read_text()
+    assert moments.fill_places(page, "moments.py", moments.page_tables(result)) == page
+    scores = [moment["scenario_score"] for moment in result["moments"]]
+    assert len(scores) == moments.MOMENTS and scores == sorted(scores, reverse=True)
+    assert {moment["scenario"] for moment in result["moments"]} == set(moments.VERDICTS)
+
+
 def test_curation_and_planners_share_the_test_set(stored):
     assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
 

@@ -306,7 +306,7 @@ def test_advantages_of_logged_returns(config, batch):
             (own[0], policy_keys, trained["critic"]),
         )
         return [
-            learner.smaller_q(
+            learner.q_value(
                 critic, seen, jnp.tanh(draw_raw(learner.distribution(trained["policy"], seen), own_keys))
             )
             for seen, own_keys, critic in pairs
@@ -346,8 +346,9 @@ def test_n_step_returns_end_with_the_episode():
         assert bool(drawn.terminated[number]) == (episode == 1 and end == 3)
 
 
-def test_td3_bc_against_numpy(batch, policy_batch):
-    learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3))
+@pytest.mark.parametrize("clipping", [1.0, 0.7])
+def test_td3_bc_against_numpy(clipping, batch, policy_batch):
+    learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3, clipping=clipping))
     _, keys = step_keys(1)
     total, logs = losses(learner, trained, target, batch, policy_batch, keys)
 
@@ -367,7 +368,8 @@ def test_td3_bc_against_numpy(batch, policy_batch):
 
     result = to_numpy(outputs(trained))
     assert (np.abs(result["noise"]) > 0.3).any() and (np.abs(result["noise"]) < 0.3).any()
-    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["target"].min(axis=0))
+    next_q = clipping * result["target"].min(axis=0) + (1.0 - clipping) * result["target"].max(axis=0)
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, next_q)
     critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
     policy = -2.5 * result["judged"].mean() / np.abs(result["judged"]).mean() + (result["off"] ** 2).mean()
     assert logs["critic"] == pytest.approx(critic, rel=1e-4)

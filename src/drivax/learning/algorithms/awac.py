@@ -41,13 +41,13 @@ class Awac(AdvantageWeighted[AwacConfig]):
         parameters, critic = jax.lax.stop_gradient((trained["policy"], trained["critic"]))
         next_policy = self.distribution(parameters, batch.next_observation)
         next_action = next_policy.action(sample_each(next_policy, next_keys))
-        next_value = self.smaller_q(target["critic"], batch.next_observation, next_action)
+        next_value = self.q_value(target["critic"], batch.next_observation, next_action)
         critic_loss, q = self.critic_loss(trained, batch, next_value)
 
         observation, expert = policy_batch
         policy = self.distribution(parameters, observation)
         actions = jnp.stack([expert, policy.action(sample_each(policy, policy_keys))])
-        logged_q, policy_q = self.smaller_q(critic, observation, actions)
+        logged_q, policy_q = self.q_value(critic, observation, actions)
         if self.config.advantage == "return":
             logged_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         imitation, logs = self.imitation(trained, policy_batch, logged_q - policy_q)

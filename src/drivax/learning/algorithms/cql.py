@@ -129,7 +129,7 @@ class Cql(Offline[CqlConfig]):
         next_action = next_policy.action(_samples(next_policy, next_keys, self.config.backup_actions))
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
-        next_value = jnp.max(jnp.min(next_q, axis=0), axis=0)
+        next_value = jnp.max(self.merge(next_q), axis=0)
         target_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         policy = self.distribution(parameters, batch.observation)
         action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_keys)

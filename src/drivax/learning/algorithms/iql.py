@@ -60,7 +60,7 @@ class Iql(AdvantageWeighted[IqlConfig]):
     ) -> tuple[Array, dict[str, Array]]:
         """Return the sum of expectile regression, the critics' loss, and advantage-weighted imitation."""
         (observation, expert), parameters = policy_batch, target["critic"]
-        target_q = self.smaller_q(parameters, batch.observation, batch.action)
+        target_q = self.q_value(parameters, batch.observation, batch.action)
         value = self._value(trained["value"], batch.observation)
         value_loss = jnp.mean(expectile_loss(target_q - value, self.config.expectile))
 
@@ -72,7 +72,7 @@ class Iql(AdvantageWeighted[IqlConfig]):
         advantage = target_q - value
         if observation is not batch.observation:
             policy_value = self._value(trained["value"], observation)
-            advantage = self.smaller_q(parameters, observation, expert) - policy_value
+            advantage = self.q_value(parameters, observation, expert) - policy_value
         imitation, logs = self.imitation(trained, policy_batch, advantage)
         return value_loss + critic_loss + imitation, logs | {
             "value": value_loss,

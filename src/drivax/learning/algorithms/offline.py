@@ -77,6 +77,9 @@ class OfflineConfig:
         gamma: Discount.
         steps: Length of n-step returns, in decisions (Sutton 1988); those of logged actions, also where the policy
             would act differently.
+        clipping: Weight of the smaller critic in the value of both, in targets and advantages; that of the larger one is
+            the rest (Fujimoto et al. 2019, arXiv 1812.02900, eq. 13). 1 is clipped double Q-learning; 0.5, the mean,
+            underestimates less where actions are many and short.
         tau: Polyak averaging rate of target networks.
         policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
         last_rate: Final learning rates relative to the initial ones; 1: constant.
@@ -93,6 +96,7 @@ class OfflineConfig:
     updates: int = 50
     gamma: float = 0.99
     steps: int = 1
+    clipping: float = 1.0
     tau: float = 0.005
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
@@ -110,7 +114,7 @@ class OfflineConfig:
         check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_most(self, MOST_RETURN_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
-        check_shares(self, "gamma", "tau")
+        check_shares(self, "gamma", "tau", "clipping")
         check_above_zero(self, "gradient_norm")
         check_decay_share(self.decay_share)
 
@@ -263,9 +267,9 @@ class Offline(OffPolicy[Config]):
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
         """Return metrics of the critics on held-out data.
 
-        ``mean_q`` is the smaller critic's value of the policy's mode over a fixed set of steps; overestimation raises
+        ``mean_q`` is the value of the policy's mode over a fixed set of steps; overestimation raises
         it. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates. In driving with decisions of one
-        step, ``q_error`` is the root mean square error of the smaller Q from simulated returns of the policy, in
+        step, ``q_error`` is the root mean square error of Q from simulated returns of the policy, in
         standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out episodes.
         """
         policy, critic = state.parameters, state.rest["critic"]
@@ -285,15 +289,20 @@ class Offline(OffPolicy[Config]):
         """Return what is wrong with the critics of a finished run, given the rows of its log; None if not checked."""
         return critic_problems(rows, getattr(self, "target_entropy", None))
 
-    def smaller_q(
+    def q_value(
         self, critic: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
     ) -> Float[Array, "*actions"]:
-        """Return the smaller of both critics' values."""
-        return jnp.min(self.q_values(critic, observation, action), axis=0)
+        """Return one value of both critics (:meth:`merge`)."""
+        return self.merge(self.q_values(critic, observation, action))
+
+    def merge(self, q: Float[Array, "2 *actions"]) -> Float[Array, "*actions"]:
+        """Return one value of both critics', as ``clipping`` says."""
+        smaller, weight = jnp.min(q, axis=0), self.config.clipping
+        return smaller if weight == 1.0 else weight * smaller + (1.0 - weight) * jnp.max(q, axis=0)
 
     def _policy_value(self, policy: Any, critic: Any, observation: dict[str, Array]) -> Float[Array, " B"]:
-        """Return the smaller critic's value of the policy's mode."""
-        return self.smaller_q(critic, observation, self.distribution(policy, observation).mode())
+        """Return the value of the policy's mode."""
+        return self.q_value(critic, observation, self.distribution(policy, observation).mode())
 
     @partial(jax.jit, static_argnums=0)
     def _policy_returns(self, data: Experience, policy: Any, critic: Any) -> Float[Array, "2 N"]:
@@ -323,7 +332,7 @@ class Offline(OffPolicy[Config]):
         observation = environment.observe_recorded(data.data, index)
         value = self._policy_value(policy, critic, observation)
         logged = jax.tree.map(lambda leaf: leaf[_SAMPLES : 2 * _SAMPLES], observation)
-        q = self.smaller_q(critic, logged, expert.action[uniform])
+        q = self.q_value(critic, logged, expert.action[uniform])
         returns = returns_to_go(expert, value[2 * _SAMPLES :], self.config.gamma)
         return value[:_SAMPLES].mean(), jnp.stack([q, returns[uniform]])
 
