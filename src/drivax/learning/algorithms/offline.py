@@ -77,8 +77,8 @@ class OfflineConfig:
         gamma: Discount.
         steps: Length of n-step returns, in decisions (Sutton 1988); those of logged actions, also where the policy
             would act differently.
-        clipping: Weight of the smaller critic in the value of both, in targets and advantages; that of the larger one is
-            the rest (Fujimoto et al. 2019, arXiv 1812.02900, eq. 13). 1 is clipped double Q-learning; 0.5, the mean,
+        clipping: Weight of the smaller critic in the value of both, in targets and advantages; that of the larger one
+            is the rest (Fujimoto et al. 2019, arXiv 1812.02900, eq. 13). 1 is clipped double Q-learning; 0.5, the mean,
             underestimates less where actions are many and short.
         tau: Polyak averaging rate of target networks.
         policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
