@@ -4,10 +4,10 @@ python -m experiments.learning.mixtures run --data BENCHMARK --runs RUNS [--minu
 python -m experiments.learning.mixtures judge --runs RUNS        (means with intervals, stored)
 python -m experiments.learning.mixtures table                    (write the stored results to the page)
 
-BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on 1,024 training
+BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on the training
 scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`; it
 skips what exists, resumes a training, and starts nothing after the minutes given. Checkpoints are not selected: the
-last one is evaluated.
+last one is evaluated. Settings were chosen on the split `validation` (docs/log/2026-11-28-mixtures.md).
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ from experiments.repository import DOCS, RESULTS, fill_places
 
 RESULT = RESULTS / "mixtures.json"
 PAGE = DOCS / "results" / "mixtures.md"
-SCENARIOS, SEEDS = 1024, 3
+SEEDS = 3
 MIXTURES = ("mixed", "expert")
 #: Drivers of `mixed` other than the log.
 DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
-#: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action.
+#: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action, and what the
+#: reward depends on.
 TASK = (
+    "--total_steps", "3072000", "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
     "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
     "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
     "--task.observation.road_behind_m", "5", "--task.observation.road_side_m", "10",
@@ -46,22 +48,27 @@ TASK = (
     "--task.observation.features.road", "[position, direction, length]",
     "--task.observation.features.route", "[position, heading, limit, curvature]",
 )  # fmt: skip
+#: Settings of all critics.
+CRITIC = ("--algorithm.steps", "10", "--algorithm.clipping", "0.5", "--algorithm.tau", "0.02")
+#: Settings of weights by advantages.
+ADVANTAGE = (
+    "--algorithm.advantage", "return", "--algorithm.relative", "true", "--algorithm.inverse_temperature", "3",
+)  # fmt: skip
 #: Preset and settings of each algorithm.
 ALGORITHMS = {
     "bc": ("offline/bc",),
     "filtered_bc": ("offline/bc", "--algorithm.best", "0.25"),
-    "awac": ("offline/awac",),
-    "iql": ("offline/iql",),
-    "td3_bc": ("offline/td3_bc",),
-    "cql_bc": ("offline/cql_bc",),
+    "td3_bc": ("offline/td3_bc", *CRITIC, "--algorithm.q_weight", "2.5"),
+    "awac": ("offline/awac", *CRITIC, *ADVANTAGE),
+    "iql": ("offline/iql", *CRITIC, *ADVANTAGE),
+    "cql_bc": ("offline/cql_bc", *CRITIC),
 }
 METRICS = ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio")
 
 
 def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
     """Yield the output and the arguments of every command, in order."""
-    scenarios, test = runs / "train", data / "test"
-    yield scenarios, ["export", str(data / "train"), str(scenarios), "--limit", str(SCENARIOS)]
+    scenarios, test = data / "train", data / "test"
     for driver in DRIVERS:
         out = runs / "drivers" / driver.replace(":", "-")
         yield out, ["evaluate", "--planner", driver, "--data", str(test), "--out", str(out)]

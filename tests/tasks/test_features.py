@@ -29,6 +29,7 @@ EXAMPLES = (
     "time_gap",
     "stop_line",
     "car_following",
+    "destination",
 )
 EVERYTHING = ObservationConfig(
     agents=3, steps=2, road=150, road_ahead_m=100.0, road_side_m=60.0, lights=2, route=16,
@@ -244,6 +245,22 @@ def test_without_a_route_nothing_shows_the_logged_path():
     assert found["route"]["lights"][0, -1] == 1.0 and found["route"]["stop_line"][2] == 1.0
     np.testing.assert_allclose(found["none"]["car_following"], [90 / 50, 0, 0, 0, 13.4 / 15], atol=1e-6)
     assert found["none"]["lights"][0, -1] == 0.0 and found["none"]["stop_line"][2] == 0.0
+
+
+def test_destination_is_what_is_left_of_the_log():
+    """A log of 8 s at 9 m/s, one that stands, and one without a route on lanes."""
+    own = (OwnGroup(example_features.destination),)
+    simulator = Simulator(Task(observation=replace(GLIMPSE, own=own)))
+    bank = bank_of(straight_road([car(0, 0, 0, 9)]), straight_road([car(0, 0, 0, 0)]))
+    look = jax.jit(
+        lambda b, row, step: simulator.observe(b, simulator.context(b, row, step))["destination"],
+        static_argnums=(1, 2),
+    )
+    np.testing.assert_allclose(look(bank, 0, 10), [72 / 50, 0.0, 0.8], atol=0.01)
+    np.testing.assert_allclose(look(bank, 0, 50), [36 / 50, 0.5, 0.4], atol=0.01)
+    np.testing.assert_allclose(look(bank, 1, 50), [0.0, 1.0, 0.4], atol=1e-6)
+    off_lanes = replace(bank, on_lanes=jnp.array([False, False]))
+    np.testing.assert_allclose(look(off_lanes, 0, 10), [0.0, 1.0, 0.8], atol=1e-6)
 
 
 @pytest.mark.slow

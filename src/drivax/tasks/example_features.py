@@ -16,9 +16,11 @@ from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLaye
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
+from drivax.scenario.schema import CURRENT_STEP, DT_S
 from drivax.simulator.ahead import FALLBACK_LIMIT_MPS, ahead, has_route
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.lights import is_red
+from drivax.simulator.situation import STANDS_M
 from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
@@ -101,6 +103,20 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
     gap = jnp.where(is_ahead, jnp.maximum(position[:, 0] - half_length - extent, 0.0), jnp.inf)
     time = jnp.min(gap) / jnp.maximum(context.history[-1, MOTION_SPEED], _SLOWEST_MPS)
     return jnp.stack([jnp.minimum(time / _LONGEST_S, 1.0), is_ahead.any().astype(jnp.float32)])
+
+
+def destination(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
+    """Return the way that is left to the log's end on the route, its completed share, and the time that is left.
+
+    The way is in units of 50 m, in [-1, 5], the time in units of 10 s. These are what the reward term ``completion``
+    depends on. Without a route on lanes, or if the log stands, the way is 0 and the share 1.
+    """
+    log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
+    left, way = log_m[last] - context.route_m, log_m[last] - log_m[CURRENT_STEP]
+    moves = (way >= STANDS_M) & has_route(bank, context)
+    completed = jnp.where(moves, jnp.clip(1.0 - left / jnp.where(moves, way, 1.0), 0.0, 1.0), 1.0)
+    left = jnp.where(moves, jnp.clip(left / POSITION_M, -1.0, features.MAX_GOAL), 0.0)
+    return jnp.stack([left, completed, (last - context.step) * DT_S / _LONGEST_S])
 
 
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:
