@@ -39,7 +39,7 @@ DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
 #: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action, and what the
 #: reward depends on.
 TASK = (
-    "--total_steps", "3072000", "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
+    "--total_steps", "5120000", "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
     "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
     "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
     "--task.observation.road_behind_m", "5", "--task.observation.road_side_m", "10",
@@ -49,7 +49,7 @@ TASK = (
     "--task.observation.features.route", "[position, heading, limit, curvature]",
 )  # fmt: skip
 #: Settings of all critics.
-CRITIC = ("--algorithm.steps", "10", "--algorithm.clipping", "0.5", "--algorithm.tau", "0.02")
+CRITIC = ("--algorithm.steps", "4", "--algorithm.clipping", "0.5", "--algorithm.tau", "0.02")
 #: Settings of weights by advantages.
 ADVANTAGE = (
     "--algorithm.advantage", "return", "--algorithm.relative", "true", "--algorithm.inverse_temperature", "3",
