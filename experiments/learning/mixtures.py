@@ -39,7 +39,8 @@ DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
 #: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action, and what the
 #: reward depends on.
 TASK = (
-    "--total_steps", "5120000", "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
+    "--total_steps", "3072000", "--algorithm.decay_share", "1.0", "--algorithm.last_rate", "0.01",
+    "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
     "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
     "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
     "--task.observation.road_behind_m", "5", "--task.observation.road_side_m", "10",
@@ -58,7 +59,7 @@ ADVANTAGE = (
 ALGORITHMS = {
     "bc": ("offline/bc",),
     "filtered_bc": ("offline/bc", "--algorithm.best", "0.25"),
-    "td3_bc": ("offline/td3_bc", *CRITIC, "--algorithm.q_weight", "2.5"),
+    "td3_bc": ("offline/td3_bc", *CRITIC, "--algorithm.q_weight", "1.0"),
     "awac": ("offline/awac", *CRITIC, *ADVANTAGE),
     "iql": ("offline/iql", *CRITIC, *ADVANTAGE),
     "cql_bc": ("offline/cql_bc", *CRITIC),
