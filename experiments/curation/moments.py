@@ -3,8 +3,9 @@
 python -m experiments.curation.moments --data ../shared/data [--write]    (--write stores the result, picture and page)
 python -m experiments.curation.moments --table                            (write the stored result to the page)
 
-Every vehicle that moves is the scored agent of its own scenario. Of moments of one recording that are less than 3 s and
-30 m apart, the most critical one counts.
+Every vehicle that is seen at the current step and for 2 s from it on, and ends more than 2 m from where it began, is
+the scored agent of its own scenario (`--egos moving` has at most eight per scenario). Of moments of one recording that
+are less than 3 s and 30 m apart, the most critical one counts.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ VERDICTS = {
 }
 
 
-def of_each_vehicle(recording: Recording) -> Iterator[Recording]:
+def recordings_by_ego(recording: Recording) -> Iterator[Recording]:
     """Yield the recording with each moving vehicle as its ego, where its log suffices."""
     tracks = recording.tracks
     now = recording.current_step
@@ -87,7 +88,7 @@ def write_set(data: Path, out: Path) -> dict[str, Any]:
                 if isinstance(recording, BadRecord):
                     raise SystemExit(str(recording.error()))
                 for vehicle in (
-                    vehicle for window in windows(recording) for vehicle in of_each_vehicle(window)
+                    vehicle for window in windows(recording) for vehicle in recordings_by_ego(window)
                 ):
                     try:
                         scenario = assemble(vehicle)
@@ -131,7 +132,7 @@ def measure(data: Path) -> tuple[dict[str, Any], Figure]:
                 "scenario_score": round(float(scores.scenarios[row]), 3),
                 "step_score": round(float(scores.steps[row, step]), 3),
                 "components": {
-                    name: round(float(scores.components[name][row, step]), 2)
+                    name: round(weight * float(scores.components[name][row, step]), 3)
                     for name, weight in weights.items()
                     if weight
                 },
@@ -171,17 +172,24 @@ def page_tables(result: Mapping[str, Any]) -> dict[str, list[str]]:
             [
                 f"{number}", f"{moment['source']} `{moment['scenario']}`", f"{moment['time_s']:.1f} s",
                 f"{moment['scenario_score']:.2f}",
-                ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in largest if value),
+                ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in largest if value >= 0.005),
                 VERDICTS.get(moment["scenario"], ""),
             ]
         )  # fmt: skip
     quantiles = result["quantiles"]
     counts = (
         f"{result['scenarios']:,} scenarios of moving vehicles from {result['files']} files of "
-        f"{result['recordings']} drives ({result['refused']} more could not be assembled); scores: median "
+        f"{result['recordings']} drives; scores: median "
         f"{quantiles['median']:.2f}, 95 % {quantiles['p95']:.2f}."
     )
-    head = ["", "source and scenario/vehicle", "at", "score", "largest components", "what a person would say"]
+    head = [
+        "",
+        "source and scenario/vehicle",
+        "at",
+        "score",
+        "largest components times their weights",
+        "what a person would say",
+    ]
     return {"counts": [counts], "moments": table(head, rows)}
 
 

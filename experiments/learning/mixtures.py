@@ -7,7 +7,8 @@ python -m experiments.learning.mixtures table                    (write the stor
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on the training
 scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`; it
 skips what exists, resumes a training, and starts nothing after the minutes given. Checkpoints are not selected: the
-last one is evaluated. Settings were chosen on the split `validation` (docs/log/2026-11-28-mixtures.md).
+last one is evaluated. Settings were chosen for TD3+BC on the split `validation`, and hold for all algorithms; three
+seeds of other settings had been evaluated on `test` before (docs/log/2026-11-28-mixtures.md).
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ SEEDS = 3
 MIXTURES = ("mixed", "expert")
 #: Drivers of `mixed` other than the log.
 DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
-#: Settings of all trainings: the actions and the observation of the preset `ppo`, without the last action, and what the
-#: reward depends on.
+#: Budget and learning rates of all trainings.
+TRAINING = ("--total_steps", "3072000", "--algorithm.decay_share", "1.0", "--algorithm.last_rate", "0.01")
+#: Actions and observation: those of the preset `ppo`, with what the reward depends on instead of the last action and
+#: the inputs of a car-following driver.
 TASK = (
-    "--total_steps", "3072000", "--algorithm.decay_share", "1.0", "--algorithm.last_rate", "0.01",
     "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
     "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
     "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
@@ -50,7 +52,7 @@ TASK = (
     "--task.observation.features.route", "[position, heading, limit, curvature]",
 )  # fmt: skip
 #: Settings of all critics.
-CRITIC = ("--algorithm.steps", "4", "--algorithm.clipping", "0.5", "--algorithm.tau", "0.02")
+CRITIC = ("--algorithm.steps", "4", "--algorithm.min_q_weight", "0.5", "--algorithm.tau", "0.02")
 #: Settings of weights by advantages.
 ADVANTAGE = (
     "--algorithm.advantage", "return", "--algorithm.relative", "true", "--algorithm.inverse_temperature", "3",
@@ -84,6 +86,7 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
                     "train",
                     preset,
                     *settings,
+                    *TRAINING,
                     *TASK,
                     "--data",
                     str(scenarios),

@@ -115,6 +115,35 @@ def test_own_methods_score_by_dotted_name(data, tmp_path, capsys):
     assert "unknown component 'spee'" in capsys.readouterr().err
 
 
+def test_histogram_of_one_set_scores_another(data, tables, tmp_path, capsys):
+    other, file = tmp_path / "other", tmp_path / "actions.npz"
+    with ScenarioWriter(other, SMALL) as writer:
+        writer.add(assemble(straight_road([car(speed=4.0), car(x=30.0, speed=8.0)]), SMALL))
+    call = ["curate", "action_rarity", "--actions", str(file), "--out"]
+    assert main([*call, str(tmp_path / "own.npz"), "--data", str(data.path), "--temper", "1"]) == 0
+    assert main([*call, str(tmp_path / "again.npz"), "--data", str(data.path)]) == 0
+    own, again = (read_scores(tmp_path / f"{name}.npz", data) for name in ("own", "again"))
+    np.testing.assert_array_equal(own.steps, again.steps)
+    assert own.config["temper"] == again.config["temper"] == 1.0
+    assert main([*call, str(tmp_path / "other.npz"), "--data", str(other)]) == 0
+    assert read_scores(tmp_path / "other.npz", ScenarioSet.open(other)).config["actions_of"] == data.hash
+    capsys.readouterr()
+    for wrong, words in (
+        (
+            ["action_rarity", "--temper", "0.5"],
+            "actions.npz, which exists, has no such setting; leave out --temper 0.5",
+        ),
+        (["kinematic"], "kinematic has no such setting; leave out --actions"),
+        (
+            ["action_rarity_published"],
+            "is a histogram of action_rarity; use curate action_rarity, or another file",
+        ),
+    ):
+        out = ["--actions", str(file), "--data", str(other), "--out", str(tmp_path / "x.npz")]
+        assert main(["curate", *wrong, *out]) in (1, 2)
+        assert words in capsys.readouterr().err
+
+
 def test_mixtures_combine_the_quantiles_of_tables(data, tables, tmp_path, capsys):
     files = [tmp_path / f"{name}.npz" for name in ("kinematic", "action_rarity")]
     for file in files:

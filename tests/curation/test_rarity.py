@@ -104,15 +104,15 @@ def test_expert_actions_and_their_mask():
 def test_a_histogram_scores_other_actions_after_it_was_read(config, tmp_path):
     known, other = np.ones((1, 40), bool), RNG.uniform(-1, 1, (1, 40, 2))
     histogram = config.histogram(RNG.normal(0.0, 0.2, (500, 2)))
-    write_actions(config, histogram, tmp_path / "actions.npz")
-    stored, read = read_actions(type(config)(), tmp_path / "actions.npz")
-    assert stored == config and read.counts.sum() == 500
+    write_actions(config, histogram, "abc", tmp_path / "actions.npz")
+    stored, read, set_hash = read_actions(type(config)(), tmp_path / "actions.npz")
+    assert stored == config and read.counts.sum() == 500 and set_hash == "abc"
     np.testing.assert_array_equal(
         rarity_steps(stored, other, known, read), rarity_steps(config, other, known, histogram)
     )
     assert np.ptp(rarity_steps(stored, other, known, read) - rarity_steps(config, other, known)) > 0.01
     with pytest.raises(UsageError, match="exists"):
-        write_actions(config, histogram, tmp_path / "actions.npz")
+        write_actions(config, histogram, "abc", tmp_path / "actions.npz")
     wrong = KernelRarity() if isinstance(config, PublishedRarity) else PublishedRarity()
     with pytest.raises(DataError, match=r"is a histogram of action_rarity.*; use curate action_rarity"):
         read_actions(wrong, tmp_path / "actions.npz")
@@ -125,14 +125,17 @@ def test_a_histogram_scores_other_actions_after_it_was_read(config, tmp_path):
         ("counts", np.ones((64, 64))),
         ("counts", np.ones((3, 3), np.int64)),
         ("median", np.array(np.nan)),
+        ("median", np.array(0.0)),
         ("acceleration_edges", np.linspace(0, 1, 65)),
-        ("settings", np.array('{"kind": "KernelRarity", "cells": 100000000}')),
+        ("settings", np.array('{"method": "action_rarity", "set_hash": "abc", "cells": 100000000}')),
+        ("settings", np.array('{"method": "action_rarity", "set_hash": "abc", "bandwidth": 1e9}')),
+        ("settings", np.array('{"method": "mine", "set_hash": "abc"}')),
         ("settings", np.array("[1]")),
     ],
 )
 def test_damaged_histograms_are_refused(name, value, tmp_path):
     config = KernelRarity(cells=64)
-    write_actions(config, config.histogram(np.zeros((3, 2))), tmp_path / "good.npz")
+    write_actions(config, config.histogram(np.zeros((3, 2))), "abc", tmp_path / "good.npz")
     arrays = dict(np.load(tmp_path / "good.npz")) | {name: value}
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(DataError, match=r"bad.npz.*; write it with"):

@@ -303,7 +303,7 @@ def test_advantages_of_logged_returns(config, batch):
             return [learner._value(trained["value"], seen) for seen in (batch.next_observation, own[0])]
         pairs = (
             (batch.next_observation, next_keys, target["critic"]),
-            (own[0], policy_keys, trained["critic"]),
+            (own[0], policy_keys, target["critic"]),
         )
         return [
             learner.q_value(
@@ -346,9 +346,11 @@ def test_n_step_returns_end_with_the_episode():
         assert bool(drawn.terminated[number]) == (episode == 1 and end == 3)
 
 
-@pytest.mark.parametrize("clipping", [1.0, 0.7])
-def test_td3_bc_against_numpy(clipping, batch, policy_batch):
-    learner, trained, target = build_learner(replace(TD3_BC, noise=0.5, noise_bound=0.3, clipping=clipping))
+@pytest.mark.parametrize("min_q_weight", [1.0, 0.7])
+def test_td3_bc_against_numpy(min_q_weight, batch, policy_batch):
+    learner, trained, target = build_learner(
+        replace(TD3_BC, noise=0.5, noise_bound=0.3, min_q_weight=min_q_weight)
+    )
     _, keys = step_keys(1)
     total, logs = losses(learner, trained, target, batch, policy_batch, keys)
 
@@ -368,7 +370,7 @@ def test_td3_bc_against_numpy(clipping, batch, policy_batch):
 
     result = to_numpy(outputs(trained))
     assert (np.abs(result["noise"]) > 0.3).any() and (np.abs(result["noise"]) < 0.3).any()
-    next_q = clipping * result["target"].min(axis=0) + (1.0 - clipping) * result["target"].max(axis=0)
+    next_q = min_q_weight * result["target"].min(axis=0) + (1.0 - min_q_weight) * result["target"].max(axis=0)
     td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, next_q)
     critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
     policy = -2.5 * result["judged"].mean() / np.abs(result["judged"]).mean() + (result["off"] ** 2).mean()
@@ -639,6 +641,7 @@ def test_former_key_of_the_decay_share_is_read(kind):
 def test_statistics_of_a_file_normalise_features(bandit, tmp_path):
     file, data = tmp_path / "statistics.json", bandit
     spec = Logged().shapes(data)
+    names = {group: [f"{column}" for column in range(spec[group][-1])] for group in group_names(spec)}
     rows = [
         {"group": group, "name": f"{column}", "mean": 3.0 + column, "std": None if column else 2.0}
         for group in group_names(spec)
@@ -654,11 +657,19 @@ def test_statistics_of_a_file_normalise_features(bandit, tmp_path):
         np.testing.assert_array_equal(encoder.mean[group][...], 3.0 + np.arange(size))
         np.testing.assert_array_equal(encoder.deviation[group][...], [2.0, *[1.0] * (size - 1)])
     for damage, words in (
-        ({"features": rows[1:]}, "the observation has other features"),
-        ({"features": [*rows[:-1], {**rows[-1], "std": -1.0}]}, "a deviation of -1"),
+        ({"features": rows[1:]}, "the features of pendulum are not 0, 1, 2"),
+        ({"features": rows[::-1]}, "the features of pendulum are not 0, 1, 2"),
+        (
+            {"features": [*rows[:-1], {**rows[-1], "std": -1.0}]},
+            "a mean or a deviation of pendulum is invalid",
+        ),
+        (
+            {"features": [*rows[:-1], {**rows[-1], "mean": "inf"}]},
+            "a mean or a deviation of pendulum is invalid",
+        ),
         ({"features": 3}, "no statistics of observations"),
         ([], "no statistics of observations"),
     ):
         file.write_text(json.dumps(damage))
         with pytest.raises(DataError, match=rf"statistics.json.*{words}.*drivax inspect SET --observations"):
-            read_statistics(file, spec)
+            read_statistics(file, names)

@@ -164,9 +164,11 @@ def score_with_progress(method: str, request: Request) -> ScoreTable:
 
 def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> None:
     """Refuse flags that the method or --again would ignore."""
+    from drivax.curation.rarity import KernelRarity, PublishedRarity
+
     again, subject = args.again is not None, args.method
     ignored_values: dict[str, object] = {}
-    is_rarity = args.method in ("action_rarity", "action_rarity_published")
+    is_rarity = args.method in (KernelRarity.method, PublishedRarity.method)
     source = args.members if args.method == "ensemble" else args.actions if is_rarity else None
     is_saved = source is not None and source.exists()
     if is_saved:

@@ -322,15 +322,15 @@ def _components(name: str, request: Request) -> ScoreTable:
 
 
 def _rarity(name: str, request: Request) -> ScoreTable:
-    config, histogram, file = request.config, None, request.actions
+    config, histogram, file, counted = request.config, None, request.actions, request.data.hash
     if file is not None and file.exists():
-        config, histogram = read_actions(config, file)
+        config, histogram, counted = read_actions(config, file)
     expert = score_steps(request.data, ExpertActions(), request.progress, request.most_egos)
     if file is not None and histogram is None:
         histogram = config.histogram(known_actions(expert["action"], expert["known"]))
-        write_actions(config, histogram, file)
+        write_actions(config, histogram, counted, file)
     components = {"rarity": rarity_steps(config, expert["action"], expert["known"], histogram)}
-    details = {} if file is None else {"actions": str(file)}
+    details = {"actions_of": counted}
     return make_table(name, config, request.data, components, details, egos=request.most_egos)
 
 
@@ -443,8 +443,8 @@ _METHODS = (
     Method("kinematic", _components, KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)),
     Method("published", _components, PublishedConfig(), lambda _: PUBLISHED),
     Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
-    Method("action_rarity", _rarity, KernelRarity(), lambda _: RARITY),
-    Method("action_rarity_published", _rarity, PublishedRarity(), lambda _: RARITY),
+    Method(KernelRarity.method, _rarity, KernelRarity(), lambda _: RARITY),
+    Method(PublishedRarity.method, _rarity, PublishedRarity(), lambda _: RARITY),
     Method("uniform", _uniform),
     Method("random_matched", _permute_like),
     Method("novelty", _novelty, NoveltyConfig(), lambda _: NOVELTY),

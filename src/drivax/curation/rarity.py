@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -34,8 +34,9 @@ Cells = Int[np.ndarray[Any, Any], " m"]
 
 #: The default action space of imitation and offline learning.
 _SPACE = Physical()
-#: Maximum number of bins along each dimension, and of bytes of a file.
-_MOST_CELLS, _MOST_BYTES = 4096, 256 << 20
+#: Maximum number of bins along each dimension, maximum standard deviation of a kernel, and maximum bytes of a file:
+#: smoothing takes seconds with the largest ones.
+_MOST_CELLS, _MOST_BANDWIDTH, _MOST_BYTES = 1024, 0.5, 16 << 20
 _CURE = "write it with `drivax curate action_rarity --actions FILE`"
 
 
@@ -45,7 +46,8 @@ class ActionHistogram:
 
     Attributes:
         counts: Number of actions in each bin of acceleration and of curvature.
-        edges: Edges of the bins along both dimensions, in units of the action space.
+        edges: Edges of the bins along both dimensions: in units of the action space (:class:`KernelRarity`), or in m/s2
+            and 1/m.
         median: Density of the action of median density (only of :class:`KernelRarity`; otherwise 0).
     """
 
@@ -85,13 +87,18 @@ class KernelRarity:
         most: Tempered density ratio at which scores are clipped.
     """
 
+    #: Name of the method with these settings.
+    method: ClassVar[str] = "action_rarity"
+
     bandwidth: float = 0.05
     cells: int = 256
     temper: float = 0.5
     most: float = 20.0
 
     def __post_init__(self) -> None:
-        check_positive({"bandwidth": self.bandwidth})
+        if not 0.0 < self.bandwidth <= _MOST_BANDWIDTH:
+            cure = f"use more than 0, and at most {_MOST_BANDWIDTH}"
+            raise UsageError(f"bandwidth is {self.bandwidth}", cure=cure)
         if not 2 <= self.cells <= _MOST_CELLS:
             raise UsageError(f"cells is {self.cells}", cure=f"use 2 to {_MOST_CELLS:,}")
         if not 0.0 <= self.temper <= 1.0:
@@ -134,6 +141,9 @@ class PublishedRarity:
     Attributes:
         most: Weight at which scores are clipped; no cell reaches 3 while a third of them are empty.
     """
+
+    #: Name of the method with these settings.
+    method: ClassVar[str] = "action_rarity_published"
 
     most: float = 3.0
 
@@ -199,8 +209,10 @@ def rarity_steps(
     return steps
 
 
-def write_actions(config: KernelRarity | PublishedRarity, histogram: ActionHistogram, out: Path) -> None:
-    """Write the histogram of a set's actions and the settings that score by it, as ``.npz``.
+def write_actions(
+    config: KernelRarity | PublishedRarity, histogram: ActionHistogram, set_hash: str, out: Path
+) -> None:
+    """Write the histogram of a set's actions, the set's hash, and the settings that score by it, as ``.npz``.
 
     The arrays are ``settings`` (JSON), ``counts``, ``acceleration_edges``, ``curvature_edges`` and ``median``.
 
@@ -210,7 +222,7 @@ def write_actions(config: KernelRarity | PublishedRarity, histogram: ActionHisto
     check_output(out, False)
     names = ("acceleration_edges", "curvature_edges")
     arrays = dict(zip(names, histogram.edges, strict=True)) | {"counts": histogram.counts}
-    text = json.dumps({"kind": type(config).__name__, **settings.plain(config)})
+    text = json.dumps({"method": config.method, "set_hash": set_hash, **settings.plain(config)})
     with atomic_write(out) as file:
         np.savez_compressed(
             file, allow_pickle=False, settings=np.array(text), median=np.array(histogram.median), **arrays
@@ -219,19 +231,21 @@ def write_actions(config: KernelRarity | PublishedRarity, histogram: ActionHisto
 
 def read_actions(
     default: KernelRarity | PublishedRarity, file: Path
-) -> tuple[KernelRarity | PublishedRarity, ActionHistogram]:
-    """Read settings of the kind of ``default``, and a histogram, that :func:`write_actions` wrote.
+) -> tuple[KernelRarity | PublishedRarity, ActionHistogram, str]:
+    """Read settings of the type of ``default``, a histogram, and the hash of its set, as :func:`write_actions` wrote.
 
     Raises:
-        DataError: The file is missing or damaged, or of another kind.
+        DataError: The file is missing or damaged, or of another method.
     """
     arrays = read_arrays(file, _CURE, _MOST_BYTES)
     with explain_damage(file, _CURE, "not a histogram of actions, or damaged"):
         values = parse_json(str(arrays["settings"][()]).encode())
-        kind = values.pop("kind")
+        method, set_hash = str(values.pop("method")), str(values.pop("set_hash"))
+        if method not in (KernelRarity.method, PublishedRarity.method):
+            raise ValueError(f"unknown method {method}")
         counts, median = arrays["counts"], float(arrays["median"])
         edges = arrays["acceleration_edges"], arrays["curvature_edges"]
-        if kind == type(default).__name__:
+        if method == default.method:
             try:
                 config = settings.load(type(default), values, trust=())
             except UsageError as error:
@@ -240,8 +254,8 @@ def read_actions(
             same_bins = all(np.array_equal(*pair) for pair in zip(edges, expected.edges, strict=True))
             if not same_bins or counts.shape != expected.counts.shape or counts.dtype != np.int64:
                 raise ValueError("bins and settings differ")
-            if counts.min() < 0 or counts.sum() < 1 or not 0.0 <= median < float("inf"):
+            is_valid = counts.min() >= 0 and counts.sum() > 0 and 0.0 <= median < float("inf")
+            if not is_valid or (median == 0.0) == isinstance(default, KernelRarity):
                 raise ValueError("a count or the median is invalid")
-            return config, ActionHistogram(counts, edges, median)
-    method = {"KernelRarity": "action_rarity", "PublishedRarity": "action_rarity_published"}.get(str(kind))
+            return config, ActionHistogram(counts, edges, median), set_hash
     raise DataError(f"is a histogram of {method}", file=file, cure=f"use curate {method}, or another file")

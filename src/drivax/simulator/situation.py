@@ -42,7 +42,7 @@ _ENTRY_STEPS = 16
 #: Steps over which accelerations and yaw rates are differences.
 _RATE_STEPS = 5
 #: Steps in a second; distance below which a log stands still, m, as in ``progress_ratio``.
-_SECOND, STANDS_M = round(1.0 / DT_S), 0.5
+_SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
 #: Facts that compare with the log's schedule.
 _SCHEDULE = frozenset({"late_m", "early_m", "completed"})
 #: Cap of time gaps, s.
@@ -229,6 +229,14 @@ def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, stra
     return {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
 
 
+def completed_share(bank: ScenarioBank, context: AgentContext) -> Scalar:
+    """Return the completed share of the log's path from its current step to its end, in [0, 1]; 1 if it stands."""
+    log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
+    log_gain, gain = log_m[last] - log_m[CURRENT_STEP], context.route_m - log_m[CURRENT_STEP]
+    log_moves = log_gain >= _STANDS_M
+    return jnp.where(log_moves, jnp.clip(gain / jnp.where(log_moves, log_gain, 1.0), 0.0, 1.0), 1.0)
+
+
 def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scalar]:
     """Return the facts that compare the progress on the route with that of the log."""
     log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
@@ -236,9 +244,7 @@ def _schedule_facts(bank: ScenarioBank, context: AgentContext) -> dict[str, Scal
     velocity = bank.agents[context.index, last, bank.ego_slot(context.row), AgentColumn.VELOCITY]
     # After its end the log continues at its last speed.
     later_m = log_m[later_step] + norm(velocity) * (context.step + _SECOND - later_step) * DT_S
-    log_gain, gain = log_m[last] - log_m[CURRENT_STEP], context.route_m - log_m[CURRENT_STEP]
-    log_moves = log_gain >= STANDS_M
-    completed = jnp.where(log_moves, jnp.clip(gain / jnp.where(log_moves, log_gain, 1.0), 0.0, 1.0), 1.0)
+    completed = completed_share(bank, context)
     late_m, early_m = log_m[context.step] - context.route_m, context.route_m - later_m
     return {"late_m": late_m, "early_m": early_m, "completed": completed}
 

@@ -16,11 +16,11 @@ from drivax.scenario.bank.columns import NEVER_M, LightRow, RoadColumn, RoadLaye
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.scenario.schema import CURRENT_STEP, DT_S
+from drivax.scenario.schema import DT_S
 from drivax.simulator.ahead import FALLBACK_LIMIT_MPS, ahead, has_route
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.lights import is_red
-from drivax.simulator.situation import STANDS_M
+from drivax.simulator.situation import completed_share
 from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.features import POSITION_M, SPEED_MPS, Frames, View
@@ -106,17 +106,16 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
 
 
 def destination(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
-    """Return the way that is left to the log's end on the route, its completed share, and the time that is left.
+    """Return the remaining distance along the route to the end of the log, its completed share, and the remaining time.
 
-    The way is in units of 50 m, in [-1, 5], the time in units of 10 s. These are what the reward term ``completion``
-    depends on. Without a route on lanes, or if the log stands, the way is 0 and the share 1.
+    The reward term ``completion`` depends on them. The distance is in units of 50 m, in [-1, 5], the time in units of
+    10 s. Without a route on lanes, the distance is 0 and the share 1.
     """
-    log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
-    left, way = log_m[last] - context.route_m, log_m[last] - log_m[CURRENT_STEP]
-    moves = (way >= STANDS_M) & has_route(bank, context)
-    completed = jnp.where(moves, jnp.clip(1.0 - left / jnp.where(moves, way, 1.0), 0.0, 1.0), 1.0)
-    left = jnp.where(moves, jnp.clip(left / POSITION_M, -1.0, features.MAX_GOAL), 0.0)
-    return jnp.stack([left, completed, (last - context.step) * DT_S / _LONGEST_S])
+    last, on_route = bank.last_step[context.row], has_route(bank, context)
+    distance = (bank.log_progress[context.row][last] - context.route_m) / POSITION_M
+    distance = jnp.where(on_route, jnp.clip(distance, -1.0, features.MAX_GOAL), 0.0)
+    share = jnp.where(on_route, completed_share(bank, context), 1.0)
+    return jnp.stack([distance, share, (last - context.step) * DT_S / _LONGEST_S])
 
 
 def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 5"]:

@@ -47,9 +47,11 @@ class Awac(AdvantageWeighted[AwacConfig]):
         observation, expert = policy_batch
         policy = self.distribution(parameters, observation)
         actions = jnp.stack([expert, policy.action(sample_each(policy, policy_keys))])
-        logged_q, policy_q = self.q_value(critic, observation, actions)
         if self.config.advantage == "return":
             logged_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
+            policy_q = self.q_value(target["critic"], observation, actions[1])
+        else:
+            logged_q, policy_q = self.q_value(critic, observation, actions)
         imitation, logs = self.imitation(trained, policy_batch, logged_q - policy_q)
         return critic_loss + imitation, logs | {
             "critic": critic_loss,

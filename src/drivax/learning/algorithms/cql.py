@@ -46,7 +46,7 @@ class CqlConfig(OfflineConfig):
         penalty_rate: Learning rate of the multiplier.
         actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.
         next_actions: Also sample the penalty's actions from the policy at the next state.
-        backup_actions: Number of actions sampled at the next state; the highest value (of the smaller critic) is backed
+        backup_actions: Number of actions sampled at the next state; the highest value (of both critics) is backed
             up. A single one has a lower value than the expert's action on average, an error that accumulates.
         importance: Weight sampled actions by their inverse density; if false, add the logged action to the samples.
         penalty_temperature: Temperature of the penalty's soft maximum.
@@ -129,7 +129,7 @@ class Cql(Offline[CqlConfig]):
         next_action = next_policy.action(_samples(next_policy, next_keys, self.config.backup_actions))
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
-        next_value = jnp.max(self.merge(next_q), axis=0)
+        next_value = jnp.max(self.combine(next_q), axis=0)
         target_q = td_target(batch.reward, next_value, batch.terminated, batch.discount)
         policy = self.distribution(parameters, batch.observation)
         action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_keys)

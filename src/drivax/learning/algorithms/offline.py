@@ -50,7 +50,6 @@ from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import REPARAMETERISED
 from drivax.networks.encoders import (
-    GroupSpec,
     NormalisedConfig,
     Statistics,
     feature_statistics,
@@ -60,6 +59,7 @@ from drivax.networks.encoders import (
 from drivax.reading import explain_damage, read_json
 from drivax.scenario.record import record
 from drivax.stats.ranking import rank_correlation
+from drivax.tasks.features import Features, feature_names
 
 #: Steps that the mean Q and feature statistics are computed over, and steps per batch.
 _SAMPLES, _BATCH = 2048, 256
@@ -77,16 +77,17 @@ class OfflineConfig:
         gamma: Discount.
         steps: Length of n-step returns, in decisions (Sutton 1988); those of logged actions, also where the policy
             would act differently.
-        clipping: Weight of the smaller critic in the value of both, in targets and advantages; that of the larger one
-            is the rest (Fujimoto et al. 2019, arXiv 1812.02900, eq. 13). 1 is clipped double Q-learning; 0.5, the mean,
-            underestimates less where actions are many and short.
+        min_q_weight: Weight of the smaller critic in the value of both; that of the larger one is the rest (Fujimoto et
+            al. 2019, arXiv 1812.02900, eq. 13). It applies to targets, advantages and validation. 1 is clipped double
+            Q-learning; 0.5, the mean, underestimates less where actions are many and short.
         tau: Polyak averaging rate of target networks.
         policy_rate, critic_rate: Initial learning rates of Adam; a value network uses that of the critics.
         last_rate: Final learning rates relative to the initial ones; 1: constant.
         decay_share: Share of the run over which the rates decay linearly; they are constant afterwards.
         gradient_norm: Maximum global norm of each network's gradient.
         normalise: Normalise every feature of an observation by its mean and standard deviation: over logged steps
-            (true), or as in a file that ``drivax inspect --observations --json`` wrote (its path).
+            (true), or as in a file that ``drivax inspect --observations --json`` wrote (its path; to resume, it must
+            still be there).
         fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
     """
 
@@ -96,7 +97,7 @@ class OfflineConfig:
     updates: int = 50
     gamma: float = 0.99
     steps: int = 1
-    clipping: float = 1.0
+    min_q_weight: float = 1.0
     tau: float = 0.005
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
@@ -114,7 +115,7 @@ class OfflineConfig:
         check_at_most(self, MOST_SAMPLES, "batch", "updates")
         check_at_most(self, MOST_RETURN_STEPS, "steps")
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
-        check_shares(self, "gamma", "tau", "clipping")
+        check_shares(self, "gamma", "tau", "min_q_weight")
         check_above_zero(self, "gradient_norm")
         check_decay_share(self.decay_share)
 
@@ -259,7 +260,14 @@ class Offline(OffPolicy[Config]):
     def _statistics(self, data: Experience) -> Statistics:
         """Return the feature statistics of the configured file, or over drawn steps, the same for every seed."""
         if isinstance(self.config.normalise, str):
-            return read_statistics(Path(self.config.normalise), self.spec)
+            environment = self.environment
+            features = (
+                environment.task.observation.features if isinstance(environment, Driving) else Features()
+            )
+            names = feature_names(features, self.spec)
+            return read_statistics(
+                Path(self.config.normalise), {name: names[name] for name in group_names(self.spec)}
+            )
         index = sample_steps(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
         observe = partial(require_log(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, index))
@@ -292,12 +300,12 @@ class Offline(OffPolicy[Config]):
     def q_value(
         self, critic: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
     ) -> Float[Array, "*actions"]:
-        """Return one value of both critics (:meth:`merge`)."""
-        return self.merge(self.q_values(critic, observation, action))
+        """Return the combined value of both critics (:meth:`combine`)."""
+        return self.combine(self.q_values(critic, observation, action))
 
-    def merge(self, q: Float[Array, "2 *actions"]) -> Float[Array, "*actions"]:
-        """Return one value of both critics', as ``clipping`` says."""
-        smaller, weight = jnp.min(q, axis=0), self.config.clipping
+    def combine(self, q: Float[Array, "2 *actions"]) -> Float[Array, "*actions"]:
+        """Combine the values of both critics by the setting ``min_q_weight``."""
+        smaller, weight = jnp.min(q, axis=0), self.config.min_q_weight
         return smaller if weight == 1.0 else weight * smaller + (1.0 - weight) * jnp.max(q, axis=0)
 
     def _policy_value(self, policy: Any, critic: Any, observation: dict[str, Array]) -> Float[Array, " B"]:
@@ -346,29 +354,30 @@ class Offline(OffPolicy[Config]):
         )
 
 
-def read_statistics(file: Path, spec: GroupSpec) -> Statistics:
-    """Read the statistics of all features of an observation from the JSON of ``drivax inspect --observations``.
+def read_statistics(file: Path, names: Mapping[str, Sequence[str]]) -> Statistics:
+    """Read statistics of features from the JSON of ``drivax inspect --observations``.
 
-    A feature without values has the mean 0 and the deviation 1.
+    ``names`` are those of the features of each group, in order. A feature without values has the mean 0 and the
+    deviation 1.
 
     Raises:
         DataError: The file is missing or damaged, or describes another observation.
     """
     cure = "write it with `drivax inspect SET --observations --json`, for the task of the training"
     content = read_json(file, cure)
+    statistics: dict[str, tuple[Array, Array]] = {}
     with explain_damage(file, cure, "no statistics of observations"):
-        features: dict[str, list[tuple[float, float]]] = {}
-        for row in content["features"]:
-            mean, deviation = row["mean"], row["std"]
-            values = (0.0 if mean is None else float(mean), 1.0 if deviation is None else float(deviation))
-            if not (math.isfinite(values[0]) and 0.0 <= values[1] < math.inf):
-                raise ValueError(f"{row['group']} has a deviation of {values[1]:g}")
-            features.setdefault(row["group"], []).append(values)
-        sizes = {name: spec[name][-1] for name in group_names(spec)}
-        if {name: len(rows) for name, rows in features.items()} != sizes:
-            raise ValueError("the observation has other features")
-    columns = {name: jnp.asarray(rows, jnp.float32).T for name, rows in features.items()}
-    return {name: (mean, deviation) for name, (mean, deviation) in columns.items()}
+        rows = [(str(row["group"]), str(row["name"]), row["mean"], row["std"]) for row in content["features"]]
+        for group, expected in names.items():
+            group_rows = [row for row in rows if row[0] == group]
+            if [name for _, name, *_ in group_rows] != list(expected):
+                raise ValueError(f"the features of {group} are not {', '.join(expected)}")
+            mean = [0.0 if value is None else float(value) for *_, value, _ in group_rows]
+            deviation = [1.0 if value is None else float(value) for *_, value in group_rows]
+            if not all(map(math.isfinite, mean + deviation)) or min(deviation) < 0.0:
+                raise ValueError(f"a mean or a deviation of {group} is invalid")
+            statistics[group] = (jnp.asarray(mean, jnp.float32), jnp.asarray(deviation, jnp.float32))
+    return statistics
 
 
 def _without_policy(trained: Trained) -> Trained:

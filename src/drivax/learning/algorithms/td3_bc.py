@@ -73,7 +73,7 @@ class Td3Bc(Offline[Td3BcConfig]):
         noise = config.noise * jax.vmap(partial(jax.random.normal, shape=next_action.shape[1:]))(keys)
         next_action = smoothed_action(next_action, noise, config.noise_bound)
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
-        critic_loss, q = self.critic_loss(trained, batch, self.merge(next_q))
+        critic_loss, q = self.critic_loss(trained, batch, self.combine(next_q))
 
         observation, expert = policy_batch
         action = self.distribution(trained["policy"], observation).mode()
