@@ -134,6 +134,7 @@ def test_clipped_actions_of_any_replay_of_the_log_are_left_out(data, tmp_path):
     np.testing.assert_array_equal(episodes.steps.clipped, expected.steps.clipped)
 
 
+@pytest.mark.slow
 def test_held_decisions_are_recorded_with_the_sum_of_their_rewards(data, tmp_path):
     task = replace(TASK, hold=5)
     environment, episodes = episodes_of(
@@ -164,6 +165,7 @@ def test_steps_after_a_crash_of_the_planner_are_not_used(data, tmp_path):
     assert usable[:, 10:20].all() and not usable[:, 20:].any()
 
 
+@pytest.mark.slow
 def test_route_actions_steer_as_recorded(data, tmp_path):
     """Executed actions of the space ``route`` are physical; an offset is recovered from them."""
     task = replace(TASK, actions=Route())
@@ -213,6 +215,7 @@ def test_best_drives_have_the_highest_return_of_their_scenario(data, tmp_path):
         ExperienceConfig(best=0.0)
 
 
+@pytest.mark.slow
 def test_drives_of_another_set_traffic_or_start_are_refused(data, tmp_path):
     run = record(IdmPlanner(), data, tmp_path / "run", start_step=12)
     with pytest.raises(UsageError, match="traffic of its episodes is log, not idm; train with it, or"):
@@ -282,6 +285,7 @@ def test_command_records_and_training_learns_from_it(data, tmp_path, capsys):
     assert usable.shape == (3, 91) and usable[:, 10].all() and not usable[:, :10].any()
 
 
+@pytest.mark.slow
 def test_all_checkpoints_of_a_run_are_recorded_and_none_may_be_missing(data, tmp_path):
     values = TINY | {"algorithm": {"kind": "bc", "network": NETWORK, "batch": 8, "updates": 1}}
     config = settings.load(TrainConfig, values | {"total_steps": 24, "evaluate_every": 1, "keep": 3})
@@ -295,6 +299,7 @@ def test_all_checkpoints_of_a_run_are_recorded_and_none_may_be_missing(data, tmp
         read_episodes([out], data, config.task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_episodes", [False, True])
 def test_critics_are_checked_in_reactive_traffic(data, tmp_path, with_episodes):
     """The simulated returns and the replay need the data of the traffic in the held-out scenarios, too."""
@@ -310,6 +315,7 @@ def test_critics_are_checked_in_reactive_traffic(data, tmp_path, with_episodes):
     assert run.info["critics"] is not None
 
 
+@pytest.mark.slow
 def test_held_out_scenarios_without_drives_are_validated_without_metrics_of_critics(data, tmp_path):
     generate(tmp_path / "other", 2, 12, Generation(workers=0))
     config = settings.load(TrainConfig, TINY)
