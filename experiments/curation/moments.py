@@ -25,16 +25,14 @@ from matplotlib.figure import Figure
 
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
-from drivax.datasets.formats import detect, survey
-from drivax.datasets.reader import BadRecord
-from drivax.errors import DataError
 from drivax.files import write_json
 from drivax.report.pictures.still import draw_on
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import Recording, windows
+from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES, CURRENT_STEP, DT_S, LEAST_STEPS, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.tracking.run_folder import versions
+from experiments.data.real_files import read_windows
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, fill_places, save_picture
 
@@ -79,25 +77,16 @@ def recordings_by_ego(recording: Recording) -> Iterator[Recording]:
             )
 
 
-def write_set(data: Path, out: Path) -> dict[str, Any]:
-    """Write a set with a scenario for each moving vehicle; return the source of each scenario, and counts."""
-    files, sources, refused = survey(data).paths(), dict[str, str](), 0
+def write_set(data: Path, out: Path) -> dict[str, str]:
+    """Write a set with a scenario for each moving vehicle; return the file of each scenario by its id."""
+    files = {}
     with ScenarioWriter(out, CAPACITIES["default"]) as writer:
-        for file in files:
-            for recording in detect(file).read(file):
-                if isinstance(recording, BadRecord):
-                    raise SystemExit(str(recording.error()))
-                for vehicle in (
-                    vehicle for window in windows(recording) for vehicle in recordings_by_ego(window)
-                ):
-                    try:
-                        scenario = assemble(vehicle)
-                    except DataError:  # such as a log outside the map
-                        refused += 1
-                        continue
-                    writer.add(scenario)
-                    sources[scenario.id] = file.relative_to(data).parts[0]
-    return {"files": len(files), "refused": refused, "sources": sources}
+        for file, window in read_windows(data):
+            for recording in recordings_by_ego(window):
+                scenario = assemble(recording)
+                writer.add(scenario)
+                files[scenario.id] = file
+    return files
 
 
 def most_critical(scores: ScoreTable, data: ScenarioSet) -> Iterator[tuple[int, int]]:
@@ -119,15 +108,15 @@ def most_critical(scores: ScoreTable, data: ScenarioSet) -> Iterator[tuple[int, 
 def measure(data: Path) -> tuple[dict[str, Any], Figure]:
     """Return the most critical moments of all vehicles, and their pictures."""
     with tempfile.TemporaryDirectory() as folder:
-        counts = write_set(data, out := Path(folder, "set"))
+        files = write_set(data, out := Path(folder, "set"))
         scenarios = ScenarioSet.open(out)
         scores = curate("kinematic", Request(scenarios))
         chosen = list(islice(most_critical(scores, scenarios), MOMENTS))
-        sources, weights = counts.pop("sources"), scores.combination.weights
+        weights = scores.combination.weights
         rows = [
             {
                 "scenario": scenarios[row].id,
-                "source": sources[scenarios[row].id],
+                "source": files[scenarios[row].id].split("/")[0],
                 "time_s": round(step * DT_S, 1),
                 "scenario_score": round(float(scores.scenarios[row]), 3),
                 "step_score": round(float(scores.steps[row, step]), 3),
@@ -141,8 +130,12 @@ def measure(data: Path) -> tuple[dict[str, Any], Figure]:
         ]
         picture = draw([(scenarios[row], step) for row, step in chosen])
     command = "python -m experiments.curation.moments --data ../shared/data --write"
-    counts |= {"recordings": len({entry["segment"] for entry in scenarios.entries})}
-    counts |= {"scenarios": len(scenarios), "quantiles": _quantiles(scores.scenarios)}
+    counts = {
+        "files": len(set(files.values())),
+        "recordings": len({entry["segment"] for entry in scenarios.entries}),
+        "scenarios": len(scenarios),
+        "quantiles": _quantiles(scores.scenarios),
+    }
     return {"command": command, **counts, "moments": rows, "versions": versions()}, picture
 
 

@@ -27,8 +27,8 @@ from drivax.learning.policies import find_traffic
 from drivax.report.episodes import outcome
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.recording import windows
-from drivax.scenario.schema import STEPS, Scenario
+from drivax.scenario.recording import Recording, windows
+from drivax.scenario.schema import STEPS
 from drivax.tracking.run_folder import versions, zoo
 from experiments.learning.tables import label
 from experiments.repository import DOCS, RESULTS
@@ -42,20 +42,21 @@ MODULES = {"search": "search_planner:SearchPlanner"}
 TRAFFIC = ("log", "idm")
 
 
-def read_scenarios(data: Path) -> Iterator[tuple[str, Scenario]]:
-    """Yield every scenario of every file, with the name of the file relative to the folder."""
+def read_windows(data: Path) -> Iterator[tuple[str, Recording]]:
+    """Yield every window of every file, with the name of the file relative to the folder."""
     for file in survey(data).paths():
         for recording in detect(file).read(file):
             if isinstance(recording, BadRecord):
                 raise SystemExit(str(recording.error()))
             for window in windows(recording):
-                yield file.relative_to(data).as_posix(), assemble(window)
+                yield file.relative_to(data).as_posix(), window
 
 
 def measure(data: Path) -> dict[str, Any]:
     """Return outcome, score and progress of every planner by scenario."""
     sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
-    files, scenarios = zip(*read_scenarios(data), strict=True)
+    files, recordings = zip(*read_windows(data), strict=True)
+    scenarios = [assemble(recording) for recording in recordings]
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     rows = [
         {"source": file.split("/")[0], "scenario_id": scenario.id, "steps": int(scenario.steps)}

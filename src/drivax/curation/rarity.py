@@ -106,11 +106,16 @@ class KernelRarity:
         if not 1.0 <= self.most < float("inf"):
             raise UsageError(f"most is {self.most}", cure="use 1 or more, but not inf")
 
+    @property
+    def edges(self) -> tuple[Values, Values]:
+        """Edges of the bins of acceleration and of curvature, in units of the action space."""
+        edges = np.linspace(-1.0, 1.0, self.cells + 1)
+        return edges, edges
+
     def histogram(self, actions: Actions) -> ActionHistogram:
         """Return the histogram of actions, which are in [-1, 1]."""
-        edges = np.linspace(-1.0, 1.0, self.cells + 1)
-        counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0].astype(np.int64)
-        histogram = ActionHistogram(counts, (edges, edges))
+        counts = np.histogram2d(actions[:, 0], actions[:, 1], self.edges)[0].astype(np.int64)
+        histogram = ActionHistogram(counts, self.edges)
         return replace(histogram, median=float(np.median(self.density(histogram, actions))))
 
     def density(self, histogram: ActionHistogram, at: QueryActions) -> QueryValues:
@@ -250,9 +255,9 @@ def read_actions(
                 config = settings.load(type(default), values, trust=())
             except UsageError as error:
                 raise ValueError(error.problem) from error
-            expected = config.histogram(np.zeros((1, 2)))
-            same_bins = all(np.array_equal(*pair) for pair in zip(edges, expected.edges, strict=True))
-            if not same_bins or counts.shape != expected.counts.shape or counts.dtype != np.int64:
+            same_bins = all(np.array_equal(*pair) for pair in zip(edges, config.edges, strict=True))
+            shape = tuple(len(ends) - 1 for ends in config.edges)
+            if not same_bins or counts.shape != shape or counts.dtype != np.int64:
                 raise ValueError("bins and settings differ")
             is_valid = counts.min() >= 0 and counts.sum() > 0 and 0.0 <= median < float("inf")
             if not is_valid or (median == 0.0) == isinstance(default, KernelRarity):

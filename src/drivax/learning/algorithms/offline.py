@@ -275,10 +275,10 @@ class Offline(OffPolicy[Config]):
     def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
         """Return metrics of the critics on held-out data.
 
-        ``mean_q`` is the value of the policy's mode over a fixed set of steps; overestimation raises
-        it. ``fitted_q``, if configured, is the return that :class:`FittedQ` estimates. In driving with decisions of one
-        step, ``q_error`` is the root mean square error of Q from simulated returns of the policy, in
-        standard deviations of these, and ``q_rank`` the rank correlation of Q with returns of the held-out episodes.
+        ``mean_q`` is the value of the policy's mode over a fixed set of steps; overestimation raises it. ``fitted_q``,
+        if configured, is the return that :class:`FittedQ` estimates. In driving with decisions of one step, ``q_error``
+        is the root mean square error of Q from simulated returns of the policy, in standard deviations of these, and
+        ``q_rank`` the rank correlation of Q with returns of the held-out episodes.
         """
         policy, critic = state.parameters, state.rest["critic"]
         mean_q, q_and_returns = self._held_out_values(data, policy, critic)
