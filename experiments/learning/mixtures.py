@@ -5,10 +5,11 @@ python -m experiments.learning.mixtures judge --runs RUNS        (means with int
 python -m experiments.learning.mixtures table                    (write the stored results to the page)
 
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`. ``run`` records the mixtures on the training
-scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`; it
-skips what exists, resumes a training, and starts nothing after the minutes given. Checkpoints are not selected: the
-last one is evaluated. Settings were chosen for TD3+BC on the split `validation`, and hold for all algorithms; three
-seeds of other settings had been evaluated on `test` before (docs/log/2026-11-28-mixtures.md).
+scenarios, trains every algorithm with all seeds on each, and evaluates policies and drivers on the split `test`, those
+of `expert` data on `test-rare`; it skips what exists, resumes a training, and starts nothing after the minutes given.
+Checkpoints are not selected: the last one is evaluated. The presets' settings were chosen for TD3+BC on the split
+`validation`, and hold for all algorithms; three seeds of other settings had been evaluated on `test` before
+(docs/log/2026-11-28-mixtures.md).
 """
 
 from __future__ import annotations
@@ -34,68 +35,32 @@ from experiments.repository import DOCS, RESULTS, fill_places
 RESULT = RESULTS / "mixtures.json"
 PAGE = DOCS / "results" / "mixtures.md"
 SEEDS = 3
-MIXTURES = ("mixed", "expert")
+#: Mixtures, and the split of the benchmark on which their policies are tested: on `expert` data, at events.
+MIXTURES = {"mixed": "test", "expert": "test-rare"}
 #: Drivers of `mixed` other than the log.
 DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
-#: Budget and learning rates of all trainings.
-TRAINING = ("--total_steps", "3072000", "--algorithm.decay_share", "1.0", "--algorithm.last_rate", "0.01")
-#: Actions and observation: those of the preset `ppo`, with what the reward depends on instead of the last action and
-#: the inputs of a car-following driver.
-TASK = (
-    "--task.observation.own", "[{feature: 'drivax.tasks.example_features:destination'}]",
-    "--task.actions.kind", "route", "--task.observation.road", "32", "--task.observation.lanes", "false",
-    "--task.observation.crosswalks", "false", "--task.observation.road_ahead_m", "40",
-    "--task.observation.road_behind_m", "5", "--task.observation.road_side_m", "10",
-    "--task.observation.features.ego_static", "[length, width, route]", "--task.observation.features.agents",
-    "[position, heading, velocity, relative_velocity, length, width, type, route, closing_speed, time_to_overlap]",
-    "--task.observation.features.road", "[position, direction, length]",
-    "--task.observation.features.route", "[position, heading, limit, curvature]",
-)  # fmt: skip
-#: Settings of all critics.
-CRITIC = ("--algorithm.steps", "4", "--algorithm.min_q_weight", "0.5", "--algorithm.tau", "0.02")
-#: Settings of weights by advantages.
-ADVANTAGE = (
-    "--algorithm.advantage", "return", "--algorithm.relative", "true", "--algorithm.inverse_temperature", "3",
-)  # fmt: skip
-#: Preset and settings of each algorithm.
-ALGORITHMS = {
-    "bc": ("offline/bc",),
-    "filtered_bc": ("offline/bc", "--algorithm.best", "0.25"),
-    "td3_bc": ("offline/td3_bc", *CRITIC, "--algorithm.q_weight", "1.0"),
-    "awac": ("offline/awac", *CRITIC, *ADVANTAGE),
-    "iql": ("offline/iql", *CRITIC, *ADVANTAGE),
-    "cql_bc": ("offline/cql_bc", *CRITIC),
-}
+#: Algorithms, each with a preset of this name in ``configs/mixed``.
+ALGORITHMS = ("bc", "filtered_bc", "td3_bc", "awac", "iql", "cql_bc")
 METRICS = ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio")
 
 
 def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
     """Yield the output and the arguments of every command, in order."""
-    scenarios, test = data / "train", data / "test"
+    scenarios = data / "train"
     for driver in DRIVERS:
         out = runs / "drivers" / driver.replace(":", "-")
-        yield out, ["evaluate", "--planner", driver, "--data", str(test), "--out", str(out)]
-    for mixture in MIXTURES:
+        yield out, ["evaluate", "--planner", driver, "--data", str(data / MIXTURES["mixed"]), "--out", str(out)]
+    for mixture, split in MIXTURES.items():
         episodes = runs / "episodes" / mixture
         yield episodes, ["record", mixture, "--data", str(scenarios), "--out", str(episodes)]
-        for name, (preset, *settings) in ALGORITHMS.items():
+        for name in ALGORITHMS:
             # One after the other, because all cores train one seed faster than several.
             for seed in range(SEEDS):
                 folder = runs / mixture / name / f"seed-{seed}"
-                train = [
-                    "train",
-                    preset,
-                    *settings,
-                    *TRAINING,
-                    *TASK,
-                    "--data",
-                    str(scenarios),
-                    "--episodes",
-                    str(episodes),
-                ]
+                train = ["train", f"mixed/{name}", "--data", str(scenarios), "--episodes", str(episodes)]
                 yield folder, [*train, "--seed", str(seed), "--out", str(folder)]
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"
-                yield out, ["evaluate", "--planner", str(folder), "--data", str(test), "--out", str(out)]
+                yield out, ["evaluate", "--planner", str(folder), "--data", str(data / split), "--out", str(out)]
 
 
 def run(data: Path, runs: Path, minutes: float) -> bool:
@@ -135,12 +100,14 @@ def compute_results(runs: Path) -> dict[str, Any]:
         for name, own in episodes.items():
             seeds = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
             others = {key: episodes[key] for key in ("bc", "filtered_bc") if key in episodes and key != name}
+            if mixture == "mixed":
+                others[best] = drivers[best]
             policies[f"{mixture}/{name}"] = {
                 "means": {metric: mean_interval(own, metric).as_dict() for metric in METRICS},
                 "critics": [info.get("critics") for info in seeds],
                 "differences": {
                     other: {metric: mean_interval(own, metric, reference).as_dict() for metric in METRICS}
-                    for other, reference in (others | {best: drivers[best]}).items()
+                    for other, reference in others.items()
                 },
             }
     means = {name: {m: mean_interval(own, m).as_dict() for m in METRICS} for name, own in drivers.items()}

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_json
 from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig, estimate_return
 from drivax.learning.algorithms.offline import OfflineConfig
@@ -119,24 +118,17 @@ def main() -> None:
         for name in ALGORITHMS:
             for seed in range(SEEDS):
                 run = args.runs / mixture / name / f"seed-{seed}"
-                evaluated = args.runs / "evaluated" / mixture / name / f"seed-{seed}"
-                if not evaluated.exists():
+                if not run.exists():
                     continue
                 row = estimates(environment, data, config, action_of(run, bank), behaviour)
-                score = EpisodeTable.read(evaluated).metrics["vmax_score"]
-                rows[f"{mixture}/{name}/seed-{seed}"] = row | {"vmax_score": float(np.nanmean(score))}
-                print(run, rows[f"{mixture}/{name}/seed-{seed}"], flush=True)
-    columns = {
-        key: np.array([row[key] for row in rows.values()]) for key in (*ESTIMATORS, "return", "vmax_score")
-    }
+                rows[f"{mixture}/{name}/seed-{seed}"] = row
+                print(run, row, flush=True)
+    columns = {key: np.array([row[key] for row in rows.values()]) for key in (*ESTIMATORS, "return")}
     runs = np.array([name.rpartition("/")[0] for name in rows])  # seeds of a run are a cluster
     correlations = {
         name: {
-            truth: {
-                "rank_correlation": rank_correlation(columns[name], columns[truth]),
-                "interval": list(correlation_interval(columns[name], columns[truth], runs, 2000)),
-            }
-            for truth in ("return", "vmax_score")
+            "rank_correlation": rank_correlation(columns[name], columns["return"]),
+            "interval": list(correlation_interval(columns[name], columns["return"], runs, 2000)),
         }
         for name in ESTIMATORS
     }
