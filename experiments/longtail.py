@@ -6,8 +6,8 @@ python -m experiments.longtail restore --out STUDY   (restore them to a new fold
 python -m experiments.longtail finish --out STUDY    (write the results to experiments/results/longtail.json)
 python -m experiments.longtail table                 (write the stored results to the page)
 
-`keep` stores each arm's run without checkpoints, its episodes, and the scores without components. Scores are stored
-because another processor rounds differently, and runs trained with other weights belong to another study.
+`keep` stores each arm's run without checkpoints, its episodes, and the scores: another processor rounds differently,
+and runs trained with other weights belong to another study.
 BENCHMARK is the output of `drivax generate BENCHMARK --benchmark`.
 """
 
@@ -22,9 +22,8 @@ import tarfile
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.seal import seal
 from drivax.studies import report
 from drivax.studies.definition import Stratum, Study, StudyConfig, StudySets, load_study
 from drivax.studies.study import is_evaluated
@@ -36,7 +35,7 @@ PAGE = DOCS / "results" / "longtail.md"
 BEGIN, END = "<!-- longtail.py: {} -->", "<!-- longtail.py: end -->"
 DEFINITION = load_study("longtail")
 #: Stored files of a run or evaluation.
-FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
+FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv", "summary.json")
 
 
 def keep(folder: Path) -> None:
@@ -52,11 +51,7 @@ def keep(folder: Path) -> None:
         file = KEPT / f"{arm}-{seed}.tar.xz"
         if not file.exists() and is_evaluated(study, arm, seed):
             _pack([run, *(study.evaluation(name, seed) for name in study.evaluations(arm))], folder, file)
-    (KEPT / "scores").mkdir(exist_ok=True)
-    for file in (folder / "scores").glob("*.npz"):
-        with np.load(file) as table:
-            arrays = {name: table[name] for name in table if not name.startswith("component_")}
-        np.savez_compressed(KEPT / "scores" / file.name, allow_pickle=False, **arrays)
+    shutil.copytree(folder / "scores", KEPT / "scores", dirs_exist_ok=True)
 
 
 def restore(folder: Path) -> None:
@@ -67,6 +62,9 @@ def restore(folder: Path) -> None:
         with tarfile.open(file) as archive:
             archive.extractall(folder, filter="data")
     shutil.copytree(state / "scores", folder / "scores")
+    # Stored files have no local paths, so they differ from those that were sealed.
+    for file in folder.rglob("run.json"):
+        seal(file.parent, *FILES, "trajectories.npz", "crashes.json")
 
 
 def finish(folder: Path) -> None:

@@ -49,7 +49,10 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
     scenarios = data / "train"
     for driver in DRIVERS:
         out = runs / "drivers" / driver.replace(":", "-")
-        yield out, ["evaluate", "--planner", driver, "--data", str(data / MIXTURES["mixed"]), "--out", str(out)]
+        yield (
+            out,
+            ["evaluate", "--planner", driver, "--data", str(data / MIXTURES["mixed"]), "--out", str(out)],
+        )
     for mixture, split in MIXTURES.items():
         episodes = runs / "episodes" / mixture
         yield episodes, ["record", mixture, "--data", str(scenarios), "--out", str(episodes)]
@@ -60,7 +63,10 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
                 train = ["train", f"mixed/{name}", "--data", str(scenarios), "--episodes", str(episodes)]
                 yield folder, [*train, "--seed", str(seed), "--out", str(folder)]
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"
-                yield out, ["evaluate", "--planner", str(folder), "--data", str(data / split), "--out", str(out)]
+                yield (
+                    out,
+                    ["evaluate", "--planner", str(folder), "--data", str(data / split), "--out", str(out)],
+                )
 
 
 def run(data: Path, runs: Path, minutes: float) -> bool:

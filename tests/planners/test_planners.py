@@ -11,11 +11,12 @@ from flax import nnx
 
 from drivax.api import find_planner
 from drivax.errors import UsageError
+from drivax.evaluation.rollout import advance
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import NetworkPlanner
-from drivax.planners.planner import Planner, hold
+from drivax.planners.planner import Planner, hold, scale_speed
 from drivax.planners.simple import (
     ConstantSpeed,
     ConstantVelocity,
@@ -29,7 +30,7 @@ from drivax.planners.simple import (
 from drivax.simulator.ahead import follow_route
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import PHYSICAL, ROUTE, Trajectory, execute
+from drivax.tasks.actions import PHYSICAL, ROUTE, DeltaLocal, Trajectory, execute
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from quick import quick
@@ -212,6 +213,50 @@ def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulat
 
 
 @pytest.mark.slow
+@partial(jax.jit, static_argnums=0)
+def drive_30_steps(simulator, planner, bank):
+    """Return the motions of ego over 30 steps from step 10 on."""
+    state, key = simulator.reset(bank, 0, 10, 0), jax.random.key(0)
+
+    def step(carry, key):
+        state, memory, _ = advance(simulator, planner, bank, *carry, key)
+        return (state, memory), state.context.history[-1]
+
+    start = state, planner.init(bank, state, key)
+    return jax.lax.scan(step, start, jax.random.split(key, 30))[1]
+
+
+def test_a_scaled_planner_drives_the_same_course_at_another_pace(simulator):
+    """On a free road, the speeds of IDM that starts at 10 m/s, times 0.6, are those of scaled IDM from 6 m/s on."""
+    fast, slow = (bank_of(straight_road([car(speed=speed)])) for speed in (10.0, 6.0))
+    expected = np.asarray(drive_30_steps(simulator, IdmPlanner(), fast))
+    scaled = scale_speed(IdmPlanner(), 0.6, PHYSICAL)
+    motion = np.asarray(drive_30_steps(simulator, scaled, slow))
+    np.testing.assert_allclose(motion[:, 3], 0.6 * expected[:, 3], rtol=1e-5)
+    assert expected[-1, 3] > 11.0 and scaled.name == "idm (speed x 0.6)"
+    held = np.asarray(drive_30_steps(simulator, hold(scaled, 2), slow))
+    np.testing.assert_allclose(held[-1, 3], motion[-1, 3], atol=0.1)
+
+
+def test_a_scaled_planner_perceives_scaled_speeds_positions_and_acceleration(simulator):
+    state = simulator.reset(bank_of(straight_road([car(speed=5.0)])), 0, 10, 0)
+    state = replace(state, context=replace(state.context, action=jnp.array([0.2, 0.3])))
+    seen, true = scale_speed(IdmPlanner(), 0.5, PHYSICAL).perceive(state).context, state.context.history
+    np.testing.assert_allclose(seen.history[-1], true[-1] * np.array([1, 1, 1, 2]), rtol=1e-6)
+    np.testing.assert_allclose(seen.history[-1, 0] - seen.history[-4, 0], 2 * 3 * 0.1 * 5.0, rtol=1e-4)
+    np.testing.assert_allclose(seen.action, [0.4, 0.3], rtol=1e-6)
+
+
+def test_a_scaled_planner_needs_accelerations_and_a_positive_scale():
+    assert scale_speed(IdmPlanner(), 1.0, PHYSICAL) == IdmPlanner()
+    with pytest.raises(UsageError, match="scaled by -1"):
+        scale_speed(IdmPlanner(), -1.0, PHYSICAL)
+    with pytest.raises(UsageError, match="replays the log"):
+        scale_speed(Expert(), 0.5, PHYSICAL)
+    with pytest.raises(UsageError, match="no acceleration"):
+        scale_speed(RandomActions(), 0.5, DeltaLocal())
+
+
 def test_held_planner_decides_at_every_other_step(simulator):
     """Gaps shrink from step to step, so that IDM's decision changes at each."""
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)]))

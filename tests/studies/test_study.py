@@ -12,13 +12,23 @@ from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.seal import seal
 from drivax.stats.seeds import CrossedEffect
 from drivax.stats.significance import holm_adjust
 from drivax.studies import study as runner
-from drivax.studies.definition import Arm, Study, StudyConfig, StudyDefinition, StudySets, load_study
+from drivax.studies.definition import (
+    Arm,
+    Claim,
+    Study,
+    StudyConfig,
+    StudyDefinition,
+    StudySets,
+    load_study,
+)
 from drivax.studies.verdicts import (
     Strata,
     ValidationCheck,
@@ -29,6 +39,7 @@ from drivax.studies.verdicts import (
     rates,
     rule_cost,
 )
+from drivax.tracking.run_folder import RunFolder
 from experiment_scripts import load_script
 from scenes import SMALL, car, straight_road
 
@@ -103,6 +114,86 @@ def test_a_claimed_size_is_tested_against_that_size(rate, verdict):
     assert results[SIZE].verdict == verdict
     if verdict == "undecided":
         assert "would decide" in results[SIZE].needed
+
+
+def paces(progress_by_speed, rate_by_speed, rng):
+    """Return values of an arm by speed: progress around a mean, and collisions at a rate."""
+    episodes = {}
+    for speed, progress in progress_by_speed.items():
+        hit = (rng.random((SEEDS, SCENARIOS)) < rate_by_speed[speed]).astype(float)
+        far = progress + 0.1 * rng.normal(size=(SEEDS, SCENARIOS))
+        episodes[speed] = {"collision": hit, "progress_ratio": far - far.mean() + progress}
+    return episodes
+
+
+def equal_progress(arm, reference, **options):
+    """Return the result of a claim at equal progress in all scenarios."""
+    claim = Claim("arm collides less", "arm", "reference", "group", at_equal_progress=True, **options)
+    every = {"arm": arm, "reference": reference}
+    (result,) = decide_claims(
+        [claim],
+        {name: episodes[1.0] for name, episodes in every.items()},
+        Strata([f"r{row}" for row in range(SCENARIOS)], np.zeros(SCENARIOS, bool)),
+        {name: {k: v for k, v in episodes.items() if k < 1.0} for name, episodes in every.items()},
+    )
+    return result
+
+
+def test_slower_driving_is_not_credited_at_equal_progress():
+    """The arm collides a third less, as the reference does at its progress of 0.85, between speeds 0.9 and 0.7."""
+    rng = np.random.default_rng(0)
+    rates_of_reference = {1.0: 0.45, 0.9: 0.36, 0.7: 0.24}
+    reference = paces({1.0: 1.0, 0.9: 0.9, 0.7: 0.7}, rates_of_reference, rng)
+    arm = paces({1.0: 0.85, 0.9: 0.77, 0.7: 0.6}, {1.0: 0.33, 0.9: 0.3, 0.7: 0.25}, rng)
+    result = equal_progress(arm, reference)
+    assert result.verdict == "undecided" and result.slowed == ("reference", pytest.approx(0.85))
+    hits = {speed: values["collision"].mean() for speed, values in reference.items()}
+    interpolated = 0.75 * hits[0.9] + 0.25 * hits[0.7]
+    expected = arm[1.0]["collision"].mean() - interpolated
+    assert result.difference.difference == pytest.approx(expected, abs=1e-9)
+    # The other way round, the arm with more progress is slowed.
+    back = equal_progress(reference, arm)
+    assert back.slowed == ("arm", pytest.approx(0.85))
+    assert back.difference.difference == pytest.approx(-expected, abs=1e-9)
+
+
+def test_intervals_at_equal_progress_include_the_progress():
+    """If collisions follow progress, noise of the progress alone moves the interpolated mean."""
+    rng = np.random.default_rng(1)
+    progress, rate = {1.0: 1.0, 0.8: 0.8}, {1.0: 0.4, 0.8: 0.2}
+    reference, arm = paces(progress, rate, rng), paces({1.0: 0.9, 0.8: 0.7}, rate, rng)
+    for values in (*reference.values(), *arm.values()):
+        values["collision"] = np.full((SEEDS, SCENARIOS), values["collision"].mean())
+    effect = equal_progress(arm, reference).difference
+    assert effect.standard_error > 0.0
+    few = {speed: {n: v[:, ::1] for n, v in values.items()} for speed, values in arm.items()}
+    for values in few.values():
+        values["progress_ratio"] = np.full((SEEDS, SCENARIOS), values["progress_ratio"].mean())
+    assert equal_progress(few, reference).difference.standard_error < effect.standard_error
+
+
+def test_a_claim_at_equal_progress_needs_a_speed_that_is_low_enough():
+    rng = np.random.default_rng(2)
+    fast = paces({1.0: 1.0, 0.9: 0.9}, {1.0: 0.4, 0.9: 0.4}, rng)
+    slow = paces({1.0: 0.5, 0.9: 0.4}, {1.0: 0.2, 0.9: 0.2}, rng)
+    result = equal_progress(slow, fast)
+    assert (result.verdict, result.effect) == ("undecided", None)
+    assert result.needed == "reference makes more progress even at its lowest speed"
+
+
+@pytest.mark.parametrize(
+    ("metric", "rate", "verdict"),
+    [("collision", 0.2, "supported"), ("collision", 0.3, "contradicted"), ("accuracy", 0.2, "supported")],
+)
+def test_a_margin_bounds_how_much_worse_an_arm_may_be(metric, rate, verdict):
+    """Equal arms are not worse by 0.04, one that collides 0.1 more is."""
+    claim = Claim("arm is not worse", "arm", "reference", "group", metric, margin=0.04)
+    episodes = draw_failures({"arm": rate, "reference": 0.2}, np.random.default_rng(0))
+    strata = Strata([f"r{row}" for row in range(SCENARIOS)], np.zeros(SCENARIOS, bool))
+    (result,) = decide_claims([claim], episodes, strata)
+    assert result.verdict == verdict
+    shift = result.effect.difference - result.difference.difference
+    assert shift == pytest.approx(-0.04 if metric == "collision" else 0.04)
 
 
 def test_rare_scenarios_count_as_in_ordinary_traffic():
@@ -306,6 +397,12 @@ def in_process(monkeypatch):
     monkeypatch.setattr(runner, "one_core_each", one_by_one)
 
 
+def write_sealed(file, content):
+    """Replace a sealed JSON file by another one that drivax could have written."""
+    file.write_text(json.dumps(content))
+    seal(file.parent, file.name)
+
+
 @pytest.mark.slow
 def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     out = tmp_path / "study"
@@ -317,9 +414,7 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     output = capsys.readouterr()
     assert "undecided" in output.out and "trained and evaluated random_matched, seed 1" in output.err
     results = json.loads((out / "results.json").read_text())
-    assert (
-        results["about"]["test"] == 4 and results["about"]["rare"] == 2
-    )  # as many without an event as with one
+    assert (results["about"]["test"], results["about"]["rare"]) == (6, 2)
     assert list(results["rates"]) == ["expert", "constant_speed", "idm", "pdm", *results["draws"]]
     assert list(results["draws"]) == ["baseline", "bc", "heuristic", "random_matched"]
     assert results["draws"]["bc"]["effective"] == 1.0
@@ -356,7 +451,9 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     scores = {file.name for file in restored if file.suffix == ".npz"}
     assert scores == {file.name for file in (out / "scores").iterdir()} >= {"kinematic.npz"}
     kept = [file for file in restored if file.suffix != ".npz"]
-    assert {file.name for file in kept} == {"config.yaml", "run.json", "metrics.jsonl", "episodes.csv"}
+    assert {file.name for file in kept} == {
+        "config.yaml", "run.json", "metrics.jsonl", "episodes.csv", "summary.json", "seal.json"
+    }  # fmt: skip
     for file in kept:
         assert str(tmp_path.parent) not in file.read_text(), file
     arguments[arguments.index(str(out))] = str(tmp_path / "restored")
@@ -376,16 +473,73 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     # Runs with other weights, and evaluations older than their run, are refused.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
     info, evaluation = json.loads(run.read_text()), out / "evaluations" / "heuristic" / "seed-0" / "run.json"
-    run.write_text(json.dumps(info | {"weights": "0" * 64}))
+    write_sealed(run, info | {"weights": "0" * 64})
     assert main([*arguments, "--anyway"]) == 2
-    assert "was trained with other settings or weights" in capsys.readouterr().err
-    run.write_text(json.dumps(info))
+    assert "was trained with other settings, weights or episodes" in capsys.readouterr().err
+    write_sealed(run, info)
     old = json.loads(evaluation.read_text()) | {"started": "2020-01-01T00:00:00+00:00"}
-    evaluation.write_text(json.dumps(old))
+    write_sealed(evaluation, old)
     assert main([*arguments, "--anyway"]) == 2
     assert "is older than the run that it evaluates" in capsys.readouterr().err
     assert main([*arguments, "--anyway", "--rare", "0.3"]) == 2
     assert "contains a study with other settings" in capsys.readouterr().err
+
+
+RECORDED = """
+title: Recorded
+baselines: [td3_bc, bc]
+planners: [idm]
+metrics: [collision, progress_ratio]
+checkpoints_by: validation/mean_q
+speeds: [0.9, 0.5]
+groups: {first: First}
+arms:
+  bc: {preset: offline/bc}
+  td3_bc: {preset: offline/td3_bc}
+claims:
+  - {words: td3_bc collides less, arm: td3_bc, reference: bc, group: first, at_equal_progress: true}
+  - {words: td3_bc does not collide more, arm: td3_bc, reference: bc, group: first, margin: 0.1}
+"""
+
+
+@pytest.mark.slow
+def test_a_study_on_recorded_episodes(data, tmp_path, in_process, capsys):
+    record = [
+        "record",
+        "idm",
+        "constant_speed",
+        "--data",
+        str(data.path),
+        "--out",
+        str(tmp_path / "episodes"),
+    ]
+    assert main(record) == 0
+    file, out = tmp_path / "recorded.yaml", tmp_path / "study"
+    file.write_text(RECORDED)
+    sets = ["--data", str(data.path), "--test", str(data.path), "--out", str(out)]
+    settings = [word for word in TINY if word not in ("--arms", TINY[TINY.index("--arms") + 1])]
+    arguments = ["study", str(file), *sets, *settings, "--anyway"]
+    assert main(arguments) == 2
+    assert "no validation or test set" in capsys.readouterr().err
+    arguments += ["--episodes", str(tmp_path / "episodes")]
+    assert main(arguments) == 0
+    names = sorted(path.name for path in (out / "evaluations").iterdir())
+    arms = [f"{arm}{speed}" for arm in ("bc", "td3_bc") for speed in ("", "_at_0.5", "_at_0.9")]
+    assert names == sorted([*arms, "idm", "td3_bc_by_mean_q"])
+    slow = EpisodeTable.read(out / "evaluations" / "bc_at_0.5" / "seed-0")
+    assert slow.planner.startswith("seed-0 (speed x 0.5)")
+    results = json.loads((out / "results.json").read_text())
+    equal, margin = results["claims"]
+    assert equal["slowed"] is not None or "even at its lowest speed" in equal["needed"]
+    assert margin["slowed"] is None and margin["claim"]["margin"] == 0.1
+    run = RunFolder.open(out / "runs" / "bc" / "seed-0").info
+    assert run["recorded_episodes"] and run["validation"]["recordings"]
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert "trained" not in capsys.readouterr().err
+    assert main([*record[:2], *record[3:-1], str(tmp_path / "fewer")]) == 0
+    assert main([*arguments[:-1], str(tmp_path / "fewer")]) == 2
+    assert "other settings, weights or episodes" in capsys.readouterr().err
 
 
 def test_no_file_shadows_a_study(tmp_path, monkeypatch):

@@ -39,7 +39,9 @@ class Study:
     validation: Path | None = None
     """Scenario set for the choice of checkpoints."""
     test: tuple[Path, ...] = ()
-    """Scenario sets of the test; if events are labelled, half of the test scenarios have one."""
+    """Scenario sets of the test; the first has events as often as ordinary traffic."""
+    episodes: tuple[Path, ...] = ()
+    """Recordings of drivax record in the training set, to learn from instead of the logs."""
     seeds: int | None = None
     """Training runs of each arm; by default those of the configuration, or 5."""
     config: Path | None = None
@@ -55,7 +57,7 @@ def run(args: Study, overrides: Sequence[str] = ()) -> int:
     config = settings.load(StudyConfig, args.config or {}, overrides)
     if args.seeds is not None:
         config = replace(config, seeds=args.seeds)
-    sets = StudySets.of(args.data, args.validation, args.test)
+    sets = StudySets.of(args.data, args.validation, args.test, args.episodes)
     results = run_study(
         Plan(load_study(args.study), config, sets, args.out),
         cores=args.cores,

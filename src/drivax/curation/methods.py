@@ -68,6 +68,8 @@ NOVELTY = Combination({"novelty": 1.0}, "top10")
 #: Failures and near misses of planners.
 FAILURES = Combination({"failure": 0.7, "near_miss": 0.3}, "max")
 _ALL = Combination({"all": 1.0})
+#: Labels of the built-in world: steps of an event, or also every step of a recording that begins with a conflict.
+ORACLES = ("oracle", "oracle_critical")
 #: Argument of a request that a method needs, with its flag.
 _ARGUMENTS = {
     "random_matched": ("like", "--like SCORES"), "mixture": ("tables", "--tables SCORES SCORES"),
@@ -350,7 +352,12 @@ def _uniform(name: str, request: Request) -> ScoreTable:
 
 
 def _oracle(name: str, request: Request) -> ScoreTable:
-    steps = np.repeat(event_steps(request.data).astype(np.float64), request.most_egos, axis=0)
+    labels = event_steps(request.data)
+    if name == "oracle_critical":
+        labels |= np.array([entry["tags"].get("critical") == "yes" for entry in request.data.entries])[
+            :, None
+        ]
+    steps = np.repeat(labels.astype(np.float64), request.most_egos, axis=0)
     return make_table(name, None, request.data, {"all": steps}, egos=request.most_egos)
 
 
@@ -451,7 +458,7 @@ _METHODS = (
     Method("query", _query, QueryConfig(), lambda _: Combination({"match": 1.0})),
     Method("mixture", _mix, combination=lambda _: None),
     Method("failures", _fail, FailureConfig(), lambda _: FAILURES),
-    Method("oracle", _oracle),
+    *(Method(name, _oracle) for name in ORACLES),
 )
 #: All methods by name.
 METHODS: Mapping[str, Method] = MappingProxyType({method.name: method for method in _METHODS})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -14,8 +15,8 @@ from drivax.errors import UsageError
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
-from drivax.simulator.types import Action, SimState, Situation
-from drivax.tasks.actions import ActionSpace, action_of
+from drivax.simulator.types import MOTION_SPEED, Action, SimState, Situation
+from drivax.tasks.actions import ActionSpace, Physical, action_of
 
 #: Correlation time of the noise on actions, s.
 _CORRELATION_S = 1.0
@@ -28,7 +29,7 @@ class Planner(Protocol):
     Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
     argument of its compiled program. The compiler removes inputs that ``act`` does not read. A planner that needs
     stored scenarios has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to
-    the scenario.
+    the scenario. A planner that acts on another state than the true one has ``perceive(state)``, which returns it.
     """
 
     @property
@@ -108,6 +109,11 @@ class Held:
         """Whether the planner replays the log."""
         return self.planner.replays
 
+    @property
+    def perceive(self) -> Any:
+        """Perception of the planner, if it has one."""
+        return self.planner.perceive
+
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
         """Return the planner's carry, and zeros in place of the first decision."""
         return self.planner.init(bank, state, key), jnp.zeros_like(state.context.action)
@@ -185,6 +191,80 @@ def add_noise(planner: Planner, deviation: float) -> Planner:
         problem = f"planner {planner.name} replays the log, and has no actions to disturb"
         raise UsageError(problem, cure="use expert_actions")
     return Noisy(planner, deviation) if deviation else planner
+
+
+@record
+class Scaled:
+    """A planner at another pace: it drives as if its speed were ``speed / scale``, and its accelerations are scaled.
+
+    Where it would keep the speed v, it keeps ``scale * v``, on the same path and with the same distances. Positions in
+    the history are scaled, too, around the present one; ``situation.facts`` are not.
+
+    Attributes:
+        planner: The planner.
+        scale: Factor of speeds and accelerations.
+    """
+
+    planner: Any
+    scale: float = static()
+    replays: bool = static(default=False)
+
+    @property
+    def name(self) -> str:
+        """Name of the planner, with the scale."""
+        return f"{self.planner.name} (speed x {self.scale:g})"
+
+    @property
+    def actions(self) -> ActionSpace:
+        """Action space of the planner, if it has one of its own."""
+        return self.planner.actions
+
+    @property
+    def prepare(self) -> Any:
+        """Preparation of the planner, if it needs one."""
+        return self.planner.prepare
+
+    def perceive(self, state: SimState) -> SimState:
+        """Return the state with the speeds that the planner acts on."""
+        context = state.context
+        action, history = context.action, context.history
+        xy = history[-1, :2] + (history[:, :2] - history[-1, :2]) / self.scale
+        speed = history[:, MOTION_SPEED] / self.scale
+        history = history.at[:, :2].set(xy).at[:, MOTION_SPEED].set(speed)
+        context = replace(context, history=history, action=action.at[0].divide(self.scale))
+        return replace(state, context=context)
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
+        """Return the planner's carry."""
+        return self.planner.init(bank, self.perceive(state), key)
+
+    def act(
+        self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
+        key: Array,
+    ) -> tuple[Action, Any]:  # fmt: skip
+        """Return the planner's action in the perceived state, with a scaled acceleration."""
+        action, carry = self.planner.act(carry, bank, state, situation, observation, key)
+        return action.at[0].set(self.scale * jnp.clip(action[0], -1.0, 1.0)), carry
+
+
+def scale_speed(planner: Planner, scale: float, actions: ActionSpace) -> Planner:
+    """Return a planner that drives at ``scale`` times its speed; 1: the planner.
+
+    Raises:
+        UsageError: The scale is not positive, the planner replays the log, or its actions are no accelerations.
+    """
+    if scale == 1.0:
+        return planner
+    if not 0.0 < scale < math.inf:
+        raise UsageError(f"speed is scaled by {scale:g}", cure="use a positive number")
+    if planner.replays:
+        problem = f"planner {planner.name} replays the log, at the speed of the log"
+        raise UsageError(problem, cure="use expert_actions")
+    if not isinstance(actions, Physical):
+        raise UsageError(
+            "the action space has no acceleration to scale", cure="use physical, or leave it out"
+        )
+    return Scaled(planner, scale)
 
 
 def hold(planner: Planner, steps: int) -> Planner:

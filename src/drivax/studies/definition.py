@@ -16,7 +16,7 @@ import numpy as np
 
 from drivax import settings
 from drivax.curation.ensemble import EnsembleConfig
-from drivax.curation.methods import METHODS
+from drivax.curation.methods import METHODS, ORACLES
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import Scale, WeightConfig, permute_scores, sampling_weights
 from drivax.errors import UsageError, did_you_mean
@@ -72,7 +72,7 @@ class Arm:
                 f"scores of {table.method!r} for an arm with the method {self.method!r}",
                 cure=f"drivax curate {self.method} --data {data.path} --out SCORES",
             )
-        if self.method == "oracle" and not table.steps.any():
+        if self.method in ORACLES and not table.steps.any():
             raise UsageError(
                 "no scenario has a labelled event", file=data.path, cure="use an arm without labels"
             )
@@ -93,6 +93,9 @@ class Claim:
         metric: Metric of the comparison.
         rows: Scenarios of the comparison.
         change: Minimum claimed relative change; None for a claim about its direction alone.
+        margin: The arm is claimed to be not worse by more than this (non-inferiority), instead of better.
+        at_equal_progress: Compare at the arm's progress (``progress_ratio``): the reference drives slower, or the arm
+            if it makes more progress.
     """
 
     words: str
@@ -102,10 +105,16 @@ class Claim:
     metric: str = "collision"
     rows: Stratum = "ordinary"
     change: float | None = None
+    margin: float | None = None
+    at_equal_progress: bool = False
 
     def __post_init__(self) -> None:
         if self.change is not None and not -1 < self.change < math.inf:
             raise ValueError(f"the claim {self.words!r} has the change {self.change}; use a number above -1")
+        if self.margin is not None and not (0 < self.margin < math.inf and self.change is None):
+            raise ValueError(
+                f"the claim {self.words!r} has the margin {self.margin}; use a positive number, and no change"
+            )
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,7 @@ class StudyDefinition:
         claims: The claims.
         checkpoints_by: Training metric whose maximum chooses checkpoints by another rule; the report has the cost of
             this rule for the first baseline.
+        speeds: Scales below 1 of the speed at which arms are also evaluated, for claims at equal progress.
     """
 
     title: str
@@ -133,8 +143,13 @@ class StudyDefinition:
     arms: dict[str, Arm]
     claims: tuple[Claim, ...]
     checkpoints_by: str
+    speeds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if not all(0.0 < speed < 1.0 for speed in self.speeds) or len(set(self.speeds)) < len(self.speeds):
+            raise ValueError(f"speeds are {self.speeds}; use different numbers between 0 and 1")
+        if not self.speeds and any(claim.at_equal_progress for claim in self.claims):
+            raise ValueError("claims at equal progress need speeds")
         if len(set(self.baselines[:2])) < 2:
             raise ValueError("a study needs two different baselines")
         methods = [arm.method for arm in self.arms.values()]
@@ -223,37 +238,48 @@ class StudySets:
 
     Attributes:
         train: Training set.
-        validation: Validation set, for the choice of checkpoints.
-        test: Test sets. If only some scenarios have a labelled event, the test has equally many with and without. The
-            first set has events as often as ordinary traffic.
+        validation: Validation set, for the choice of checkpoints; None: recordings of the training set are held out.
+        test: Test sets; all their scenarios are tested. The first set has events as often as ordinary traffic.
+        episodes: Recordings of ``drivax record`` in the training set, to learn from instead of the logs.
     """
 
     train: Path
-    validation: Path
+    validation: Path | None
     test: tuple[Path, ...]
+    episodes: tuple[Path, ...] = ()
 
     @classmethod
-    def of(cls, data: Path, validation: Path | None, test: Sequence[Path]) -> StudySets:
+    def of(
+        cls, data: Path, validation: Path | None, test: Sequence[Path], episodes: Sequence[Path] = ()
+    ) -> StudySets:
         """Return the sets at these paths, or those of a benchmark's folder.
+
+        With ``episodes``, the validation set is held out of the training set, whose episodes critics are checked with.
 
         Raises:
             UsageError: A set is missing.
         """
         if (data / "train").is_dir():
             test_sets = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
-            validation, test = validation or data / "validation", tuple(test) or test_sets
+            test = tuple(test) or test_sets
+            validation = validation or (None if episodes else data / "validation")
             data = data / "train"
         if not data.is_dir():
             raise UsageError(
                 "scenario set not found", file=data, cure="name a scenario set, or a benchmark's folder"
             )
-        if validation is None or not test:
+        if (validation is None and not episodes) or not test:
             raise UsageError(
                 "no validation or test set",
                 file=data,
                 cure="pass --validation and --test, or a folder of `drivax generate --benchmark`",
             )
-        return cls(data, validation, tuple(test))
+        return cls(data, validation, tuple(test), tuple(episodes))
+
+    def open(self) -> list[ScenarioSet]:
+        """Return the sets: for training, for validation if there is one, and for the test."""
+        paths = (self.train, self.validation, *self.test)
+        return [ScenarioSet.open(path) for path in paths if path is not None]
 
 
 @dataclass(frozen=True)
@@ -297,9 +323,21 @@ class Study:
         """Return the evaluation folder of an arm with one seed, or of a planner."""
         return inside(self.folder, "evaluations", name, *([] if seed is None else [f"seed-{seed}"]))
 
-    def evaluations(self, arm: str) -> tuple[str, ...]:
-        """Return the names of an arm's evaluations: the first baseline is evaluated at other checkpoints, too."""
-        return (arm, self.rule_evaluation) if arm == self.definition.baselines[0] else (arm,)
+    def evaluations(self, arm: str) -> dict[str, float]:
+        """Return the scale of the speed in each of an arm's evaluations, by name.
+
+        The first baseline is also evaluated at other checkpoints, and arms of claims at equal progress at lower speeds.
+        """
+        evaluations = {arm: 1.0}
+        if arm == self.definition.baselines[0]:
+            evaluations[self.rule_evaluation] = 1.0
+        if any(claim.at_equal_progress and arm in (claim.arm, claim.reference) for claim in self.claims):
+            evaluations |= {self.slower(arm, speed): speed for speed in self.definition.speeds}
+        return evaluations
+
+    def slower(self, arm: str, speed: float) -> str:
+        """Return the name of an arm's evaluation at a lower speed."""
+        return f"{arm}_at_{speed:g}"
 
     @property
     def rule_evaluation(self) -> str:

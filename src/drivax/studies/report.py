@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from drivax.curation.methods import ORACLES
 from drivax.curation.scores import ScoreTable
 from drivax.files import write_text
 from drivax.metrics.catalogue import METRICS
@@ -58,7 +59,8 @@ def write_report(
     sections = {
         "Before the comparison": _conditions(definition, results),
         "Verdicts": _verdicts(definition, results),
-        "Evaluation of the arms": "".join(_rates(definition, results, stratum) for stratum in _STRATA),
+        "Evaluation of the arms": "".join(_rates(definition, results, stratum) for stratum in _STRATA)
+        + _events(definition, results),
         "Distribution of the sampling weights": draws_table(results).html(),
         "Are the methods different?": _rankings(results),
         f"Choosing checkpoints by the highest {rule}": _rule_cost(results, rule),
@@ -133,8 +135,11 @@ def claims_table(results: Results, group: str) -> Table:
 def _claim_row(result: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the cells of a claim, from :meth:`ClaimResult.plain`; undefined values are empty."""
     claim, interval, change, p = (result[name] for name in ("claim", "interval", "change", "adjusted"))
+    slowed, words = result.get("slowed"), claim["words"]
+    if slowed is not None:
+        words += f" ({slowed[0]} at {slowed[1]:.2f} of its speed)"
     return (
-        claim["words"],
+        words,
         _label(claim["metric"]),
         "" if interval is None else _interval(result["difference"], interval, "+.3f"),
         "" if change is None else _interval(change[0], change[1:], "+.0%"),
@@ -157,6 +162,17 @@ def rates_table(results: Results, stratum: Stratum) -> Table:
 
 def _rate(rate: Mapping[str, float]) -> str:
     return _interval(rate["mean"], (rate["low"], rate["high"]), ".3f")
+
+
+def events_table(results: Results) -> Table:
+    """Return the mean of the study's first metric in scenarios with each kind and severity of event, by arm."""
+    by_arm = results.get("events", {})
+    groups = list(dict.fromkeys(group for rates in by_arm.values() for group in rates))
+    rows = [
+        (group, *(f"{rates[group]['mean']:.3f}" if group in rates else "" for rates in by_arm.values()))
+        for group in groups
+    ]
+    return _table("dense", ("event", *by_arm), rows)
 
 
 def draws_table(results: Results) -> Table:
@@ -251,6 +267,12 @@ def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> s
     return f"<h3>{_STRATA[stratum]}</h3>{table.html()}{note}"
 
 
+def _events(definition: StudyDefinition, results: Results) -> str:
+    """Return the section of kinds and severities of events, empty without labels."""
+    table = events_table(results)
+    return f"<h3>Events: {escape(_label(definition.metrics[0]))}</h3>{table.html()}" if table.rows else ""
+
+
 def _rankings(results: Results) -> str:
     return rankings_table(results).html() + (
         "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. “They are orthogonal” "
@@ -280,7 +302,7 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
     top_rows = [
         (name, *(table.scenario_ids[row] for row in table.order[:PLAYER_TOP]))
         for name, table in tables.items()
-        if name != "oracle"  # labels do not rank scenarios
+        if name not in ORACLES  # labels do not rank scenarios
     ]
     shown = " and ".join(name for name in PLAYER_METHODS if name in tables)
     link = f"<p>Play those of {shown} in <a href=critical.html>critical.html</a>.</p>" if shown else ""

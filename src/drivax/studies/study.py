@@ -10,17 +10,17 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from drivax import settings
 from drivax.curation.logged import score_steps
-from drivax.curation.methods import Request, check_current, curate, event_kinds
+from drivax.curation.methods import ORACLES, Request, check_current, curate, event_kinds
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows
@@ -34,10 +34,11 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.loop import hashes, train, usable_steps
 from drivax.learning.policies import load_policy
 from drivax.learning.training_log import rank
-from drivax.learning.training_set import TrainingSet
+from drivax.learning.training_set import TrainingSet, episodes_digest, read_episodes
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.select.splits import hold_out
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_lengths
 from drivax.seal import allow_edited, edited_files, is_edited_allowed, seal
 from drivax.stats.clusters import recordings_of
@@ -51,6 +52,7 @@ from drivax.studies.verdicts import (
     decide_claims,
     detectable_differences,
     rates,
+    rates_of_groups,
     rule_cost,
 )
 from drivax.tracking.checkpoints import Checkpoints
@@ -65,23 +67,31 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A training run of a study, with a mask of the logged steps to draw from; ``edited`` allows edited files."""
+    """A training run of a study.
+
+    Attributes:
+        study: The study.
+        arm, seed: Name of the arm, and seed of the training.
+        usable: Mask of the logged steps to draw from.
+        episodes: Digest of the recorded episodes, None without.
+        edited: Whether edited files are allowed.
+    """
 
     study: Study
     arm: str
     seed: int
     usable: Bool[np.ndarray, "M T"]
+    episodes: str | None = None
     edited: bool = False
 
-    def training_set(self) -> TrainingSet:
-        """Return the training set with the arm's weights."""
-        data = ScenarioSet.open(self.study.sets.train)
+    def weights(self, data: ScenarioSet) -> Float[np.ndarray, "M T"]:
+        """Return the arm's weights of the training set."""
 
         def table(method: str) -> ScoreTable:
             return read_scores(self.study.scores(method), data)
 
         arm, config = self.study.arms[self.arm], self.study.config
-        return TrainingSet(data, arm.weigh(data, table, config.weights, self.usable, self.seed))
+        return arm.weigh(data, table, config.weights, self.usable, self.seed)
 
 
 def run_study(
@@ -106,15 +116,16 @@ def run_study(
     _open_folder(study)
     tables = _score(study, log)
     definition, config = study.definition, study.config
-    data, test = ScenarioSet.open(study.sets.train), _test_set(study)
+    training, test = _training_set(study), _test_set(study)
+    data = training.scenarios
     # The presets of all arms must have the same observations and actions.
-    usable = usable_steps(study.train_config(definition.baselines[0], 0), data)
+    usable = usable_steps(study.train_config(definition.baselines[0], 0), training)
     for name in definition.planners:
         if not study.evaluation(name).is_dir():
             log(f"evaluating {name} on the test set")
             run_evaluation(EvaluationConfig(name), make_planner(name), test, study.evaluation(name))
-    edited = is_edited_allowed()
-    jobs = [Job(study, arm, seed, usable, edited) for seed in range(config.seeds) for arm in config.arms]
+    shared = (usable, episodes_digest(training.episodes), is_edited_allowed())
+    jobs = [Job(study, arm, seed, *shared) for seed in range(config.seeds) for arm in config.arms]
     _train_and_evaluate([job for job in jobs if job.arm in definition.baselines], cores, log)
     strata = _strata(study, test)
     differences = _check_baselines(study, strata, anyway, log)
@@ -129,6 +140,12 @@ def run_study(
     _write_pages(study, data, results, tables)
     log(f"wrote {study.folder / 'report.html'}")
     return results
+
+
+def _training_set(study: Study) -> TrainingSet:
+    """Return the training set without weights, with the recorded episodes that it learns from."""
+    data, config = ScenarioSet.open(study.sets.train), study.train_config(study.definition.baselines[0], 0)
+    return TrainingSet(data, episodes=read_episodes(study.sets.episodes, data, config.task))
 
 
 def _check_baselines(study: Study, strata: Strata, anyway: bool, log: Log) -> dict[str, float]:
@@ -177,8 +194,7 @@ def _write_pages(
 
 def _open_folder(study: Study) -> None:
     """Create the folder of a study, or check that it contains this study."""
-    sets = study.sets
-    data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
+    data = study.sets.open()
     check_lengths(*data)
     definition = hashlib.sha256(settings.dump(study.definition).encode()).hexdigest()
     for name in _OUTPUTS:
@@ -186,11 +202,11 @@ def _open_folder(study: Study) -> None:
     if study.folder.exists() and any(study.folder.iterdir()):
         _check_folder(study, data, definition)
         return
-    other_arms = [name for name, arm in study.arms.items() if arm.method != "oracle"]
+    other_arms = [name for name, arm in study.arms.items() if arm.method not in ORACLES]
     if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
         raise UsageError(
             "has no labelled events, which the oracle arms need",
-            file=sets.train,
+            file=study.sets.train,
             cure=f"pass --arms [{','.join(other_arms)}]",
         )
     RunFolder.create(study.folder, study.config, data, kind="study", definition=definition)
@@ -230,19 +246,14 @@ def _score(study: Study, log: Log) -> dict[str, ScoreTable]:
 
 
 def _test_set(study: Study) -> ScenarioSet:
-    """Return the test scenarios as one set; if only some have a labelled event, equally many with and without."""
+    """Return the test scenarios as one set."""
     if not study.test.is_dir():
         test_sets = [ScenarioSet.open(path) for path in study.sets.test]
-        rows = [(scenarios, row) for scenarios in test_sets for row in range(len(scenarios))]
-        has_event = np.concatenate([event_kinds(scenarios) for scenarios in test_sets]) > 0
-        if has_event.any() and not has_event.all():
-            count = min(has_event.sum(), (~has_event).sum())
-            indices = [np.flatnonzero(stratum)[:count] for stratum in (has_event, ~has_event)]
-            rows = [rows[index] for index in np.sort(np.concatenate(indices))]
         source = {"command": "study", "sets": [scenarios.hash for scenarios in test_sets]}
         with ScenarioWriter(study.test, test_sets[0].capacity, source) as writer:
-            for scenarios, row in rows:
-                writer.add(scenarios[row])
+            for scenarios in test_sets:
+                for scenario in scenarios:
+                    writer.add(scenario)
     return ScenarioSet.open(study.test)
 
 
@@ -264,6 +275,17 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
     return Strata(recordings, rare, float(ordinary.mean()) if has_labels else None)
 
 
+def _event_groups(test: ScenarioSet) -> dict[str, Bool[np.ndarray, " scenario"]]:
+    """Return masks of the scenarios with events of each kind, and of each half of the severities."""
+    kinds = np.array([entry["tags"].get("event", "") for entry in test.entries])
+    severity = np.array([float(entry["tags"].get("severity_mps2", "nan")) for entry in test.entries])
+    groups = {kind: kinds == kind for kind in sorted({*kinds.tolist()} - {""})}
+    if groups:
+        middle = float(np.nanmedian(severity))
+        groups |= {f"below {middle:g} m/s2": severity < middle, f"from {middle:g} m/s2": severity >= middle}
+    return groups
+
+
 def _train_and_evaluate(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
     """Run the unfinished jobs, each on one core."""
     pending = [job for job in jobs if not _is_finished(job)]
@@ -282,14 +304,16 @@ def _is_finished(job: Job) -> bool:
     if not (run / "config.yaml").is_file():
         return False
     folder = RunFolder.open(run)
-    job_hashes = hashes(ScenarioSet.open(job.study.sets.validation), job.training_set().weights)
-    config = job.study.train_config(job.arm, job.seed)
+    data, config = ScenarioSet.open(job.study.sets.train), job.study.train_config(job.arm, job.seed)
+    validation = _validation(job.study)
+    validation = hold_out(data.entries) if isinstance(validation, str) else validation
+    job_hashes = hashes(validation, job.weights(data)) | {"recorded_episodes": job.episodes}
     if folder.config(TrainConfig, trust=settings.modules_of(config)) != config or any(
         folder.info.get(name) != value for name, value in job_hashes.items()
     ):
         evaluations = " and ".join(map(str, _evaluation_folders(job.study, job.arm, job.seed)))
         raise UsageError(
-            "was trained with other settings or weights than those of this study",
+            "was trained with other settings, weights or episodes than those of this study",
             file=run,
             cure=f"remove it and {evaluations}, and run the study again",
         )
@@ -333,19 +357,26 @@ def _train_and_evaluate_arm(job: Job) -> float:
     config, run = study.train_config(job.arm, job.seed), study.run(job.arm, job.seed)
     steps = Checkpoints(inside(run, "checkpoints")).steps()
     _check_not_evaluated(job, steps)
-    validation = ScenarioSet.open(study.sets.validation)
+    training = _training_set(study)
+    training = replace(training, weights=job.weights(training.scenarios))
     # If training is finished, this only deletes what an interruption left.
-    train(config, job.training_set(), run, validation=validation, resume=bool(steps), overwrite=not steps)
+    train(config, training, run, validation=_validation(study), resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])
-    for name in study.evaluations(job.arm):
+    for name, speed in study.evaluations(job.arm).items():
         folder = study.evaluation(name, job.seed)
         if not folder.is_dir():
-            step = None if name == job.arm else _best_step(job)
+            step = _best_step(job) if name == study.rule_evaluation else None
             planner, task = load_policy(run, bank, step=step, trust=settings.modules_of(config))
             planner_name = str(run) if step is None else f"{run}@{step}"
-            run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
+            run_evaluation(EvaluationConfig(planner_name, task=task, speed=speed), planner, test, folder)
     return time.perf_counter() - start
+
+
+def _validation(study: Study) -> ScenarioSet | Literal["held_out"]:
+    """Return the validation set; without one, recordings of the training set are held out."""
+    path = study.sets.validation
+    return "held_out" if path is None else ScenarioSet.open(path)
 
 
 def _check_not_evaluated(job: Job, steps: Sequence[int]) -> None:
@@ -416,6 +447,11 @@ def _results(
         table = EpisodeTable.read(study.evaluation(name))
         episodes[name] = {metric: table.metrics[metric][None] for metric in metrics}
     episodes |= {arm: _episodes(study, arm) for arm in study.arms}
+    slower = {
+        arm: {speed: _episodes(study, study.slower(arm, speed)) for speed in definition.speeds}
+        for arm in study.arms
+        if len(set(study.evaluations(arm).values())) > 1
+    }
     baseline = definition.baselines[0]
     weights = {
         name: arm.weigh(data, tables.__getitem__, study.config.weights, usable)
@@ -430,8 +466,12 @@ def _results(
             "labelled": strata.share is not None,
             "share": strata.share,
         },
-        "claims": [result.plain() for result in decide_claims(study.claims, episodes, strata)],
+        "claims": [result.plain() for result in decide_claims(study.claims, episodes, strata, slower)],
         "rates": {name: rates(values, strata, metrics) for name, values in episodes.items()},
+        "events": {
+            name: rates_of_groups(values, strata, _event_groups(test), metrics[0])
+            for name, values in episodes.items()
+        },
         "draws": {
             name: asdict(draw_statistics(weights[name], usable, len(usable) // len(data)))
             for name in study.arms

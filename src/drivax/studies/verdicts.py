@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from drivax.curation.methods import ORACLES
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
 from drivax.evaluation.episode_table import SHARES
@@ -30,8 +31,8 @@ _LEVEL = 0.05
 _SHARES = (*SHARES, "progress_ratio")
 
 Values = Float[np.ndarray, "seed scenario"]
-#: Values of an arm by metric.
-Episodes = Mapping[str, Values]
+#: Values of an arm by metric; arms may have different numbers of seeds.
+Episodes = Mapping[str, Float[np.ndarray, "_ scenario"]]
 Weights = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
 
@@ -132,6 +133,7 @@ class ClaimResult:
         adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
         needed: What would decide an undecided claim if the estimated effect is true, or why it cannot be tested.
+        slowed: For a claim at equal progress, the arm that drives slower, and the scale of its speed.
     """
 
     claim: Claim
@@ -141,6 +143,7 @@ class ClaimResult:
     adjusted_p: float | None
     verdict: Verdict = "undecided"
     needed: str = ""
+    slowed: tuple[str, float] | None = None
 
     def plain(self) -> dict[str, Any]:
         """Return plain values for ``results.json``."""
@@ -154,14 +157,19 @@ class ClaimResult:
             "p": None if self.effect is None else self.effect.p,
             "adjusted": self.adjusted_p,
             "change": None if self.change is None else list(self.change),
+            "slowed": None if self.slowed is None else list(self.slowed),
         }
 
 
 def decide_claims(
-    claims: Sequence[Claim], episodes: Mapping[str, Episodes], strata: Strata
-) -> list[ClaimResult]:
-    """Test every claim on the values of all arms, with p-values adjusted within its group (Holm)."""
-    results = [_effects(claim, episodes, strata) for claim in claims]
+    claims: Sequence[Claim], episodes: Mapping[str, Episodes], strata: Strata,
+    slower: Mapping[str, Mapping[float, Episodes]] | None = None,
+) -> list[ClaimResult]:  # fmt: skip
+    """Test every claim on the values of all arms, with p-values adjusted within its group (Holm).
+
+    ``slower`` has the values of arms at lower speeds, by scale, for claims at equal progress.
+    """
+    results = [_effects(claim, episodes, strata, slower or {}) for claim in claims]
     groups = [claim.group for claim in claims]
     for group in set(groups):
         members = [index for index, name in enumerate(groups) if name == group]
@@ -173,27 +181,87 @@ def decide_claims(
     return results
 
 
-def _effects(claim: Claim, episodes: Mapping[str, Episodes], strata: Strata) -> ClaimResult:
+def _effects(
+    claim: Claim, episodes: Mapping[str, Episodes], strata: Strata,
+    slower: Mapping[str, Mapping[float, Episodes]],
+) -> ClaimResult:  # fmt: skip
     """Return the effects of a claim, without a verdict."""
-    weights = strata.weights(claim.rows)
-    arm, reference = (episodes[name][claim.metric] for name in (claim.arm, claim.reference))
+    weights, slowed, names = strata.weights(claim.rows), None, (claim.arm, claim.reference)
+    arm, reference = (episodes[name][claim.metric] for name in names)
     if not strata.is_comparable(np.concatenate([arm, reference]), weights):
         return ClaimResult(claim, None, None, None, None)
+    if claim.at_equal_progress:
+        arm_paces, reference_paces = ({1.0: episodes[name], **slower[name]} for name in names)
+        try:
+            arm, reference, slowed = _at_equal_progress(claim, arm_paces, reference_paces, weights)
+        except ValueError as error:
+            return ClaimResult(claim, None, None, None, None, needed=str(error))
     difference = crossed_difference(arm, reference, strata.recordings, weights)
     ratio = log_ratio(arm, reference, strata.recordings, weights)
+    effect: CrossedEffect | None = difference
+    if claim.margin is not None:
+        sign = -1.0 if METRICS[claim.metric].better == "low" else 1.0
+        effect = replace(difference, difference=difference.difference + sign * claim.margin)
     if ratio is None:
-        return ClaimResult(claim, difference if claim.change is None else None, difference, None, None)
-    effect = difference
+        effect = effect if claim.change is None else None
+        return ClaimResult(claim, effect, difference, None, None, slowed=slowed)
     if claim.change is not None:
         effect = replace(ratio, difference=ratio.difference - math.log1p(claim.change))
     low, high = map(math.expm1, ratio.interval())
-    return ClaimResult(claim, effect, difference, (math.expm1(ratio.difference), low, high), None)
+    change = (math.expm1(ratio.difference), low, high)
+    return ClaimResult(claim, effect, difference, change, None, slowed=slowed)
+
+
+def _at_equal_progress(
+    claim: Claim, arm: Mapping[float, Episodes], reference: Mapping[float, Episodes], weights: Weights
+) -> tuple[Values, Values, tuple[str, float]]:
+    """Return the values of arm and reference at the lower progress of both, and who drives slower at which scale.
+
+    ``arm`` and ``reference`` have episodes by scale of the speed. The slower driver's metric is interpolated linearly
+    between the two speeds around that progress: y = metric - slope * (progress - target) of its nearer speed has the
+    interpolated mean, and subtracting the same from the other driver's values lets the variance of y include that of
+    the progress (the delta method, without the error of the slope).
+
+    Raises:
+        ValueError: It makes more progress even at the lowest speed.
+    """
+
+    def mean(values: Values) -> float:
+        return float(np.average(values[:, defined].mean(axis=0), weights=weights[defined]))
+
+    names = ("progress_ratio", claim.metric)
+    everything = [paces[speed][name] for paces in (arm, reference) for speed in paces for name in names]
+    defined = (weights > 0.0) & ~np.isnan(np.concatenate(everything)).any(axis=0)
+    progress = [
+        {speed: mean(e["progress_ratio"]) for speed, e in paces.items()} for paces in (arm, reference)
+    ]
+    is_arm = progress[0][1.0] > progress[1][1.0]
+    (fast, fast_progress), (slow, slow_progress) = (
+        ((arm, progress[0]), (reference, progress[1]))
+        if is_arm
+        else ((reference, progress[1]), (arm, progress[0]))
+    )
+    target, speeds = slow_progress[1.0], sorted(fast, reverse=True)
+    name = claim.arm if is_arm else claim.reference
+    lower = next((k for k in range(1, len(speeds)) if fast_progress[speeds[k]] <= target), None)
+    if lower is None:
+        raise ValueError(f"{name} makes more progress even at its lowest speed")
+    pair = speeds[lower - 1], speeds[lower]
+    high, low = (fast_progress[speed] for speed in pair)
+    gap = (high - low) or 1.0
+    share = (high - target) / gap
+    metric = [mean(fast[speed][claim.metric]) for speed in pair]
+    slope = (metric[0] - metric[1]) / gap
+    nearer = fast[pair[0] if share < 0.5 else pair[1]]
+    slowed, other = (e[claim.metric] - slope * (e["progress_ratio"] - target) for e in (nearer, slow[1.0]))
+    scale = pair[0] + share * (pair[1] - pair[0])
+    return (slowed, other, (name, scale)) if is_arm else (other, slowed, (name, scale))
 
 
 def _decide(result: ClaimResult, tests: int) -> ClaimResult:
     """Return the result with its verdict; its group has ``tests`` claims that can be tested."""
     if result.effect is None or result.adjusted_p is None:
-        needed = "fewer than two recordings define it"
+        needed = result.needed or "fewer than two recordings define it"
         if result.difference is not None:
             needed = "the mean of an arm is not positive: no ratio"
         return replace(result, needed=needed)
@@ -255,6 +323,18 @@ def rates(
     return means
 
 
+def rates_of_groups(
+    episodes: Episodes, strata: Strata, groups: Mapping[str, Bool[np.ndarray, " scenario"]], metric: str
+) -> dict[str, dict[str, float | int | None]]:
+    """Return an arm's mean of a metric, with its interval, in each group of scenarios (a mask) with two recordings."""
+    weights = {name: mask.astype(np.float64) for name, mask in groups.items()}
+    return {
+        name: _rate(episodes[metric], strata, weight, metric in _SHARES)
+        for name, weight in weights.items()
+        if strata.is_comparable(episodes[metric], weight)
+    }
+
+
 def _rate(values: Values, strata: Strata, weights: Weights, is_share: bool) -> dict[str, float | int | None]:
     """Return mean and interval; ``is_share`` keeps the interval in [0, 1]."""
     interval = seeds_interval(values, strata.recordings, weights, share=is_share).as_dict()
@@ -280,11 +360,11 @@ def rule_cost(
 def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]) -> list[dict[str, Any]]:
     """Compare rankings of scenarios by two methods: rank correlation, overlap of the top 5 %, and a verdict.
 
-    Leaves out ``uniform`` and ``oracle``. ``recordings`` has the recording of every scenario; the interval resamples
+    Leaves out ``uniform`` and labels. ``recordings`` has the recording of every scenario; the interval resamples
     recordings. The correlation is None if a method gives all scenarios the same score.
     """
     pairs = []
-    for first, second in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
+    for first, second in combinations([name for name in tables if name not in ("uniform", *ORACLES)], 2):
         scores, other_scores = (tables[name].scenarios for name in (first, second))
         count = max(round(_TOP * len(scores)), 1)
         top_sets = [set(top_rows(tables[name], count)) for name in (first, second)]
