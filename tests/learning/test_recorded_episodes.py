@@ -17,7 +17,7 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import EvaluationConfig, run_evaluation
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
-from drivax.learning.experience import ExperienceConfig, transitions
+from drivax.learning.experience import ExperienceConfig, sample_steps, transitions
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.training_set import TrainingSet, prepare_episodes, read_episodes, recorded_environment
 from drivax.planners.planner import add_noise
@@ -211,6 +211,12 @@ def test_best_drives_have_the_highest_return_of_their_scenario(data, tmp_path):
     kept = np.asarray(ExperienceConfig(best=0.5).of(environment, episodes).usable).any(axis=1).reshape(2, 3)
     np.testing.assert_array_equal(kept.sum(axis=0), 1)
     np.testing.assert_array_equal(kept.argmax(axis=0), returns.argmax(axis=0))
+    alone = ExperienceConfig(best=0.5, weighted="policy").of(environment, episodes)
+    drawn, all_drawn = (np.unique(sample_steps(which, jax.random.key(0), (4096,))[0]) for which in
+        (alone.policy, alone.critic))  # fmt: skip
+    best = np.arange(2)[:, None] == returns.argmax(axis=0)
+    np.testing.assert_array_equal(drawn, np.flatnonzero(best))
+    np.testing.assert_array_equal(all_drawn, np.arange(6))
     with pytest.raises(UsageError, match="best is 0"):
         ExperienceConfig(best=0.0)
 

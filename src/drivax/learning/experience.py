@@ -176,7 +176,8 @@ class ExperienceConfig:
 
     Attributes:
         mask_clipped: Leave out steps at which the expert's action is clipped to the bounds.
-        weighted: What weights apply to: ``all``, or only the ``policy``, with values learned from uniform steps.
+        weighted: What weights and ``best`` apply to: ``all``, or only the ``policy``, with values learned from uniform
+            steps of all episodes.
         best: Share of the episodes of each scenario, those with the highest return, to learn from; at least one.
     """
 
@@ -205,19 +206,18 @@ class ExperienceConfig:
                 raise DataError("no logged step has an expert action", cure="check the set")
             problem = "the expert's action exceeds the bounds at all logged steps"
             raise DataError(problem, cure="choose an action space with wider bounds")
-        uniform = critic = sampler(np.asarray(usable, np.float64))
+        uniform = chosen = sampler(np.asarray(usable, np.float64))
         if self.best < 1.0:
             if expert.scenario is None:
                 problem = f"best is {self.best:g}, but there are no recorded episodes to choose from"
                 raise UsageError(problem, cure="give some with --episodes, or leave out best")
             usable &= _has_high_return(expert, usable, self.best)[:, None]
-            critic = sampler(np.asarray(usable, np.float64))
-        if weights is None:
-            return Experience(data, expert, usable, uniform, critic)
-        by_weight = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
-        if self.weighted == "all":
-            return Experience(data, expert, usable, uniform, by_weight)
-        return Experience(data, expert, usable, uniform, critic, by_weight)
+            chosen = sampler(np.asarray(usable, np.float64))
+        if weights is not None:
+            chosen = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
+        if self.weighted == "all" or chosen is uniform:
+            return Experience(data, expert, usable, uniform, chosen)
+        return Experience(data, expert, usable, uniform, uniform, chosen)
 
 
 def _has_high_return(expert: ExpertSteps, usable: Bool[Array, "M T"], share: float) -> Bool[np.ndarray, " M"]:
