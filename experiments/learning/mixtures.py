@@ -74,7 +74,7 @@ def run(data: Path, runs: Path, minutes: float) -> bool:
     begin = time.monotonic()
     for out, arguments in steps(data, runs):
         is_training = arguments[0] == "train"
-        if out.exists() and not (is_training and not _is_trained(out)):
+        if out.exists() and not (is_training and not is_trained(out)):
             continue
         if time.monotonic() - begin > 60 * minutes:
             return False
@@ -85,7 +85,7 @@ def run(data: Path, runs: Path, minutes: float) -> bool:
     return True
 
 
-def _is_trained(folder: Path) -> bool:
+def is_trained(folder: Path) -> bool:
     """Return whether a training has ended."""
     if not (folder / "metrics.jsonl").is_file():
         return False

@@ -35,7 +35,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.tracking.run_folder import RunFolder, versions
-from experiments.learning.mixtures import ALGORITHMS, MIXTURES, SEEDS
+from experiments.learning.mixtures import ALGORITHMS, MIXTURES, SEEDS, is_trained
 from experiments.repository import RESULTS
 
 RESULT = RESULTS / "off_policy.json"
@@ -118,7 +118,7 @@ def main() -> None:
         for name in ALGORITHMS:
             for seed in range(SEEDS):
                 run = args.runs / mixture / name / f"seed-{seed}"
-                if not run.exists():
+                if not is_trained(run):
                     continue
                 row = estimates(environment, data, config, action_of(run, bank), behaviour)
                 rows[f"{mixture}/{name}/seed-{seed}"] = row

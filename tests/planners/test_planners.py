@@ -16,7 +16,7 @@ from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import NetworkPlanner
-from drivax.planners.planner import Planner, hold, scale_speed
+from drivax.planners.planner import Memoryless, Planner, hold, scale_speed
 from drivax.planners.simple import (
     ConstantSpeed,
     ConstantVelocity,
@@ -27,10 +27,11 @@ from drivax.planners.simple import (
     logged_motion,
     logged_poses,
 )
+from drivax.scenario.record import record, static
 from drivax.simulator.ahead import follow_route
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import PHYSICAL, ROUTE, DeltaLocal, Trajectory, execute
+from drivax.tasks.actions import PHYSICAL, ROUTE, DeltaLocal, Discrete, Trajectory, execute
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from quick import quick
@@ -212,7 +213,6 @@ def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulat
     assert float(follow_route(bank, beyond, jnp.zeros(()))) == pytest.approx(-2 / (10.2**2 + 1), rel=1e-2)
 
 
-@pytest.mark.slow
 @partial(jax.jit, static_argnums=0)
 def drive_30_steps(simulator, planner, bank):
     """Return the motions of ego over 30 steps from step 10 on."""
@@ -245,6 +245,24 @@ def test_a_scaled_planner_perceives_scaled_speeds_positions_and_acceleration(sim
     np.testing.assert_allclose(seen.history[-1], true[-1] * np.array([1, 1, 1, 2]), rtol=1e-6)
     np.testing.assert_allclose(seen.history[-1, 0] - seen.history[-4, 0], 2 * 3 * 0.1 * 5.0, rtol=1e-4)
     np.testing.assert_allclose(seen.action, [0.4, 0.3], rtol=1e-6)
+    braking = replace(state, context=replace(state.context, action=jnp.array([-0.2, 0.3])))
+    seen = scale_speed(IdmPlanner(), 0.5, PHYSICAL).perceive(braking).context
+    np.testing.assert_allclose(seen.action, [-0.2, 0.3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("decided", "executed"), [(0.8, 0.4), (3.0, 0.5), (-0.8, -0.8), (np.inf, np.inf), (np.nan, np.nan)]
+)
+def test_a_scaled_planner_accelerates_less_but_brakes_as_strongly(decided, executed, simulator):
+    @record
+    class Deciding(Memoryless):
+        name: str = static(default="deciding")
+
+        def choose(self, bank, situation, observation, key):
+            return jnp.array([decided, 0.25])
+
+    bank = bank_of(straight_road([car(speed=5.0)]))
+    np.testing.assert_allclose(act(scale_speed(Deciding(), 0.5, PHYSICAL), simulator, bank), [executed, 0.25])
 
 
 def test_a_scaled_planner_needs_accelerations_and_a_positive_scale():
@@ -253,10 +271,12 @@ def test_a_scaled_planner_needs_accelerations_and_a_positive_scale():
         scale_speed(IdmPlanner(), -1.0, PHYSICAL)
     with pytest.raises(UsageError, match="replays the log"):
         scale_speed(Expert(), 0.5, PHYSICAL)
-    with pytest.raises(UsageError, match="no acceleration"):
-        scale_speed(RandomActions(), 0.5, DeltaLocal())
+    for actions in (DeltaLocal(), Discrete()):
+        with pytest.raises(UsageError, match="no continuous acceleration"):
+            scale_speed(RandomActions(), 0.5, actions)
 
 
+@pytest.mark.slow
 def test_held_planner_decides_at_every_other_step(simulator):
     """Gaps shrink from step to step, so that IDM's decision changes at each."""
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)]))

@@ -9,7 +9,7 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.curation.scores import ScoreTable
 from drivax.studies.definition import load_study
-from drivax.studies.report import rankings_table, validations_table, write_report
+from drivax.studies.report import events_table, rankings_table, validations_table, write_report
 from drivax.studies.verdicts import compare_rankings
 
 LONGTAIL = load_study("longtail")
@@ -31,10 +31,14 @@ RESULTS = {
         },
         {
             "claim": CLAIM | {"change": None}, "verdict": "undecided", "needed": "41 seeds each", "difference": None,
-            "interval": None, "p": None, "adjusted": None, "change": None,
+            "interval": None, "p": None, "adjusted": None, "change": None, "slower_arm": ["baseline", 0.84],
         },
     ],
     "rates": {name: {"ordinary": RATE, "rare": RATE} for name in ("expert", "baseline")},
+    "events": {
+        "expert": {"cut_in": RATE["collision"]},
+        "baseline": dict.fromkeys(("cut_in", "below 3 m/s2"), RATE["collision"]),
+    },
     "draws": {"baseline": dict.fromkeys(("effective", "effective_scenarios", "tilt", "largest", "concentration"), 1.0)},
     "rankings": [
         {
@@ -77,6 +81,11 @@ def test_report_shows_the_results(page):
     assert "2 claims: 1 supported, 0 contradicted, 1 undecided" in text
     assert "a &lt; b &amp; c" in text and "-0.050 [-0.080, -0.020]" in text and "-30% [-50%, -10%]" in text
     assert "▲ supported" in text and "41 seeds each" in text
+    assert "(baseline at 0.84 of its speed)" in text and text.count("of its speed") == 1
+    assert "<h3>Events: collision</h3>" in text
+    rate = "0.123 [0.100, 0.150]"
+    rows = [["expert", rate, ""], ["baseline", rate, rate]]
+    assert [[cell.text for cell in row] for row in events_table(RESULTS).rows] == rows
     assert "1,126 test scenarios (563 of them rare, labelled)" in text
     assert "The conditions of the comparison are not met" not in text
     assert (

@@ -37,6 +37,7 @@ from drivax.studies.verdicts import (
     describe_sample_size,
     detectable_differences,
     rates,
+    rates_of_groups,
     rule_cost,
 )
 from drivax.tracking.run_folder import RunFolder
@@ -116,24 +117,25 @@ def test_a_claimed_size_is_tested_against_that_size(rate, verdict):
         assert "would decide" in results[SIZE].needed
 
 
-def paces(progress_by_speed, rate_by_speed, rng):
+def by_speed(progress, rates_of, rng, seeds=SEEDS, scenarios=SCENARIOS):
     """Return values of an arm by speed: progress around a mean, and collisions at a rate."""
     episodes = {}
-    for speed, progress in progress_by_speed.items():
-        hit = (rng.random((SEEDS, SCENARIOS)) < rate_by_speed[speed]).astype(float)
-        far = progress + 0.1 * rng.normal(size=(SEEDS, SCENARIOS))
-        episodes[speed] = {"collision": hit, "progress_ratio": far - far.mean() + progress}
+    for speed, mean in progress.items():
+        hit = (rng.random((seeds, scenarios)) < rates_of[speed]).astype(float)
+        episodes[speed] = {
+            "collision": hit, "progress_ratio": mean + 0.2 * rng.normal(size=(seeds, scenarios))
+        }  # fmt: skip
     return episodes
 
 
-def equal_progress(arm, reference, **options):
+def decide_at_equal_progress(arm, reference, **options):
     """Return the result of a claim at equal progress in all scenarios."""
     claim = Claim("arm collides less", "arm", "reference", "group", at_equal_progress=True, **options)
-    every = {"arm": arm, "reference": reference}
+    every, count = {"arm": arm, "reference": reference}, arm[1.0]["collision"].shape[1]
     (result,) = decide_claims(
         [claim],
         {name: episodes[1.0] for name, episodes in every.items()},
-        Strata([f"r{row}" for row in range(SCENARIOS)], np.zeros(SCENARIOS, bool)),
+        Strata([f"r{row}" for row in range(count)], np.zeros(count, bool)),
         {name: {k: v for k, v in episodes.items() if k < 1.0} for name, episodes in every.items()},
     )
     return result
@@ -142,43 +144,113 @@ def equal_progress(arm, reference, **options):
 def test_slower_driving_is_not_credited_at_equal_progress():
     """The arm collides a third less, as the reference does at its progress of 0.85, between speeds 0.9 and 0.7."""
     rng = np.random.default_rng(0)
-    rates_of_reference = {1.0: 0.45, 0.9: 0.36, 0.7: 0.24}
-    reference = paces({1.0: 1.0, 0.9: 0.9, 0.7: 0.7}, rates_of_reference, rng)
-    arm = paces({1.0: 0.85, 0.9: 0.77, 0.7: 0.6}, {1.0: 0.33, 0.9: 0.3, 0.7: 0.25}, rng)
-    result = equal_progress(arm, reference)
-    assert result.verdict == "undecided" and result.slowed == ("reference", pytest.approx(0.85))
-    hits = {speed: values["collision"].mean() for speed, values in reference.items()}
-    interpolated = 0.75 * hits[0.9] + 0.25 * hits[0.7]
+    reference = by_speed({1.0: 1.0, 0.9: 0.9, 0.7: 0.7}, {1.0: 0.45, 0.9: 0.36, 0.7: 0.24}, rng)
+    arm = by_speed({1.0: 0.85, 0.9: 0.77, 0.7: 0.6}, {1.0: 0.33, 0.9: 0.3, 0.7: 0.25}, rng)
+    result = decide_at_equal_progress(arm, reference)
+    assert result.verdict == "undecided" and result.slower_arm == ("reference", pytest.approx(0.85, abs=0.01))
+    mean = {speed: [values[name].mean() for name in ("progress_ratio", "collision")]
+        for speed, values in reference.items()}  # fmt: skip
+    target = arm[1.0]["progress_ratio"].mean()
+    interpolated = np.interp(target, *zip(mean[0.7], mean[0.9], strict=True))
     expected = arm[1.0]["collision"].mean() - interpolated
     assert result.difference.difference == pytest.approx(expected, abs=1e-9)
-    # The other way round, the arm with more progress is slowed.
-    back = equal_progress(reference, arm)
-    assert back.slowed == ("arm", pytest.approx(0.85))
+    # The other way round, the arm gets further and is slowed.
+    back = decide_at_equal_progress(reference, arm)
+    assert back.slower_arm == ("arm", pytest.approx(result.slower_arm[1]))
     assert back.difference.difference == pytest.approx(-expected, abs=1e-9)
+    # Without the control, the arm seems better.
+    plain = replace(result.claim, at_equal_progress=False)
+    strata = Strata([f"r{row}" for row in range(SCENARIOS)], np.zeros(SCENARIOS, bool))
+    (uncontrolled,) = decide_claims([plain], {"arm": arm[1.0], "reference": reference[1.0]}, strata)
+    assert uncontrolled.verdict == "supported"
 
 
-def test_intervals_at_equal_progress_include_the_progress():
-    """If collisions follow progress, noise of the progress alone moves the interpolated mean."""
-    rng = np.random.default_rng(1)
-    progress, rate = {1.0: 1.0, 0.8: 0.8}, {1.0: 0.4, 0.8: 0.2}
-    reference, arm = paces(progress, rate, rng), paces({1.0: 0.9, 0.8: 0.7}, rate, rng)
-    for values in (*reference.values(), *arm.values()):
-        values["collision"] = np.full((SEEDS, SCENARIOS), values["collision"].mean())
-    effect = equal_progress(arm, reference).difference
-    assert effect.standard_error > 0.0
-    few = {speed: {n: v[:, ::1] for n, v in values.items()} for speed, values in arm.items()}
-    for values in few.values():
-        values["progress_ratio"] = np.full((SEEDS, SCENARIOS), values["progress_ratio"].mean())
-    assert equal_progress(few, reference).difference.standard_error < effect.standard_error
+def test_intervals_at_equal_progress_cover_the_true_difference():
+    """The true difference is 0, wherever between the two speeds the arm's progress lies."""
+    rng, covered, errors, estimates = np.random.default_rng(1), 0, [], []
+    for turn in range(300):
+        target = 0.85 + 0.1 * (turn % 10) / 9
+        reference = by_speed({1.0: 1.0, 0.8: 0.8}, {1.0: 0.5, 0.8: 0.15}, rng, 5, 100)
+        rate = 0.15 + (target - 0.8) / 0.2 * 0.35
+        arm = by_speed({1.0: target, 0.8: 0.6}, {1.0: rate, 0.8: 0.1}, rng, 5, 100)
+        effect = decide_at_equal_progress(arm, reference).difference
+        low, high = effect.interval()
+        covered += low <= 0.0 <= high
+        errors.append(effect.standard_error)
+        estimates.append(effect.difference)
+    # Of 300, 285 are expected; a variance at least as large as that of seeds or scenarios alone covers more.
+    assert 278 <= covered <= 300
+    assert np.std(estimates) < np.mean(errors) < 1.25 * np.std(estimates)
 
 
 def test_a_claim_at_equal_progress_needs_a_speed_that_is_low_enough():
     rng = np.random.default_rng(2)
-    fast = paces({1.0: 1.0, 0.9: 0.9}, {1.0: 0.4, 0.9: 0.4}, rng)
-    slow = paces({1.0: 0.5, 0.9: 0.4}, {1.0: 0.2, 0.9: 0.2}, rng)
-    result = equal_progress(slow, fast)
+    fast = by_speed({1.0: 1.0, 0.9: 0.9}, {1.0: 0.4, 0.9: 0.4}, rng)
+    slow = by_speed({1.0: 0.5, 0.9: 0.4}, {1.0: 0.2, 0.9: 0.2}, rng)
+    result = decide_at_equal_progress(slow, fast)
     assert (result.verdict, result.effect) == ("undecided", None)
     assert result.needed == "reference makes more progress even at its lowest speed"
+
+
+@pytest.mark.parametrize("defined", [0, 1])
+def test_undefined_progress_leaves_a_claim_undecided(defined):
+    rng = np.random.default_rng(3)
+    arms = [by_speed({1.0: 1.0, 0.9: 0.9}, {1.0: 0.4, 0.9: 0.3}, rng) for _ in range(2)]
+    for values in (values for arm in arms for values in arm.values()):
+        values["progress_ratio"][:, defined:] = np.nan
+    result = decide_at_equal_progress(*arms)
+    assert (result.verdict, result.effect, result.needed) == (
+        "undecided", None, "fewer than two recordings define it"
+    )  # fmt: skip
+
+
+def test_a_margin_cannot_be_compared_with_nothing():
+    """Two arms without any failure: their difference has no error, but may be larger than the margin."""
+    claim = Claim("arm is not worse", "arm", "reference", "group", margin=0.01)
+    episodes = {name: {"collision": np.zeros((2, 40))} for name in ("arm", "reference")}
+    (result,) = decide_claims([claim], episodes, Strata(list(map(str, range(40))), np.zeros(40, bool)))
+    assert result.verdict == "undecided" and result.needed.startswith("nothing varies")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"speeds": (1.2,)}, "use different numbers between 0 and 1"),
+        ({"speeds": (0.5, 0.5)}, "use different numbers between 0 and 1"),
+        ({"speeds": (0.1234567, 0.1234568)}, "two evaluations would have the same name"),
+        ({"claims": (Claim("x", "bc", "baseline", "control", at_equal_progress=True),)}, "need speeds"),
+    ],
+)
+def test_speeds_that_fit_no_evaluation_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(LONGTAIL, **change)
+    with pytest.raises(ValueError, match="use a positive number"):
+        Claim("x", "bc", "baseline", "control", margin=-0.1)
+
+
+def test_screening_has_every_algorithm_with_every_sampler():
+    arms = load_study("longtail2_screening").arms
+    assert len(arms) == 41 and {arm.preset for arm in arms.values()} == {
+        f"mixed/{name}" for name in ("bc", "filtered_bc", "td3_bc", "cql", "cql_bc")
+    }  # fmt: skip
+
+
+def test_rates_by_kind_and_severity_of_events(data):
+    kinds = {
+        "cut_in": np.array([True, True, False, False]),
+        "jaywalker": np.array([False, False, True, False]),
+    }
+    values = {"collision": np.array([[0.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0]])}
+    strata = Strata(list("abcd"), np.ones(4, bool))
+    by_kind = rates_of_groups(values, strata, kinds, "collision")
+    assert list(by_kind) == ["cut_in"]  # the other kind has one recording
+    assert by_kind["cut_in"]["mean"] == 0.75 and by_kind["cut_in"]["scenarios"] == 2
+    tags = [{"event": "cut_in", "severity_mps2": "2.0"}, {"event": "jaywalker", "severity_mps2": "4.0"}, {}]
+    groups = runner.event_groups([{"tags": own} for own in tags])
+    assert {name: mask.tolist() for name, mask in groups.items()} == {
+        "cut_in": [True, False, False], "jaywalker": [False, True, False],
+        "below 3 m/s2": [True, False, False], "from 3 m/s2": [False, True, False],
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -530,8 +602,10 @@ def test_a_study_on_recorded_episodes(data, tmp_path, in_process, capsys):
     assert slow.planner.startswith("seed-0 (speed x 0.5)")
     results = json.loads((out / "results.json").read_text())
     equal, margin = results["claims"]
-    assert equal["slowed"] is not None or "even at its lowest speed" in equal["needed"]
-    assert margin["slowed"] is None and margin["claim"]["margin"] == 0.1
+    slower, scale = equal["slower_arm"]
+    assert slower in ("bc", "td3_bc") and 0.5 <= scale <= 1.0
+    assert margin["slower_arm"] is None and margin["claim"]["margin"] == 0.1
+    assert results["rates"]["bc_at_0.5"]["common"]["progress_ratio"]["mean"] < 0.9
     run = RunFolder.open(out / "runs" / "bc" / "seed-0").info
     assert run["recorded_episodes"] and run["validation"]["recordings"]
     capsys.readouterr()

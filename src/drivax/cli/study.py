@@ -41,7 +41,7 @@ class Study:
     test: tuple[Path, ...] = ()
     """Scenario sets of the test; the first has events as often as ordinary traffic."""
     episodes: tuple[Path, ...] = ()
-    """Recordings of drivax record in the training set, to learn from instead of the logs."""
+    """Folders of drivax record: episodes in the training set, to learn from instead of the logs."""
     seeds: int | None = None
     """Training runs of each arm; by default those of the configuration, or 5."""
     config: Path | None = None

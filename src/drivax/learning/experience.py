@@ -206,18 +206,18 @@ class ExperienceConfig:
                 raise DataError("no logged step has an expert action", cure="check the set")
             problem = "the expert's action exceeds the bounds at all logged steps"
             raise DataError(problem, cure="choose an action space with wider bounds")
-        uniform = chosen = sampler(np.asarray(usable, np.float64))
+        uniform = of_policy = sampler(np.asarray(usable, np.float64))
         if self.best < 1.0:
             if expert.scenario is None:
                 problem = f"best is {self.best:g}, but there are no recorded episodes to choose from"
                 raise UsageError(problem, cure="give some with --episodes, or leave out best")
             usable &= _has_high_return(expert, usable, self.best)[:, None]
-            chosen = sampler(np.asarray(usable, np.float64))
+            of_policy = sampler(np.asarray(usable, np.float64))
         if weights is not None:
-            chosen = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
-        if self.weighted == "all" or chosen is uniform:
-            return Experience(data, expert, usable, uniform, chosen)
-        return Experience(data, expert, usable, uniform, uniform, chosen)
+            of_policy = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
+        if self.weighted == "all" or of_policy is uniform:
+            return Experience(data, expert, usable, uniform, of_policy)
+        return Experience(data, expert, usable, uniform, uniform, of_policy)
 
 
 def _has_high_return(expert: ExpertSteps, usable: Bool[Array, "M T"], share: float) -> Bool[np.ndarray, " M"]:

@@ -16,7 +16,7 @@ from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.types import MOTION_SPEED, Action, SimState, Situation
-from drivax.tasks.actions import ActionSpace, Physical, action_of
+from drivax.tasks.actions import ActionSpace, Discrete, Physical, action_of
 
 #: Correlation time of the noise on actions, s.
 _CORRELATION_S = 1.0
@@ -29,7 +29,8 @@ class Planner(Protocol):
     Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
     argument of its compiled program. The compiler removes inputs that ``act`` does not read. A planner that needs
     stored scenarios has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to
-    the scenario. A planner that acts on another state than the true one has ``perceive(state)``, which returns it.
+    the scenario. A planner that acts on another state than the true one has ``perceive(state)``, which returns it;
+    evaluation calls it, wrappers other than :class:`Held` and planners in traffic do not.
     """
 
     @property
@@ -194,15 +195,16 @@ def add_noise(planner: Planner, deviation: float) -> Planner:
 
 
 @record
-class Scaled:
-    """A planner at another pace: it drives as if its speed were ``speed / scale``, and its accelerations are scaled.
+class SpeedScaled:
+    """A planner that drives at another speed: it acts as if its speed were ``speed / scale``.
 
-    Where it would keep the speed v, it keeps ``scale * v``, on the same path and with the same distances. Positions in
-    the history are scaled, too, around the present one; ``situation.facts`` are not.
+    On a free road it keeps ``scale * v`` where it would keep the speed v. It brakes as strongly as it decides, because
+    a control that drives slower should not react worse; its positive accelerations are scaled. Positions in the
+    history are scaled, too, around the present one; ``situation.facts`` and other agents are not.
 
     Attributes:
         planner: The planner.
-        scale: Factor of speeds and accelerations.
+        scale: Factor of speeds and of positive accelerations.
     """
 
     planner: Any
@@ -231,7 +233,8 @@ class Scaled:
         xy = history[-1, :2] + (history[:, :2] - history[-1, :2]) / self.scale
         speed = history[:, MOTION_SPEED] / self.scale
         history = history.at[:, :2].set(xy).at[:, MOTION_SPEED].set(speed)
-        context = replace(context, history=history, action=action.at[0].divide(self.scale))
+        last = jnp.where(action[0] > 0.0, action[0] / self.scale, action[0])
+        context = replace(context, history=history, action=action.at[0].set(last))
         return replace(state, context=context)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
@@ -242,9 +245,11 @@ class Scaled:
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
     ) -> tuple[Action, Any]:  # fmt: skip
-        """Return the planner's action in the perceived state, with a scaled acceleration."""
+        """Return the planner's action in the perceived state, with its acceleration scaled."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
-        return action.at[0].set(self.scale * jnp.clip(action[0], -1.0, 1.0)), carry
+        ahead = action[0]
+        scaled = jnp.where(ahead > 0.0, self.scale * jnp.minimum(ahead, 1.0), ahead)
+        return action.at[0].set(jnp.where(jnp.isfinite(ahead), scaled, ahead)), carry
 
 
 def scale_speed(planner: Planner, scale: float, actions: ActionSpace) -> Planner:
@@ -260,11 +265,10 @@ def scale_speed(planner: Planner, scale: float, actions: ActionSpace) -> Planner
     if planner.replays:
         problem = f"planner {planner.name} replays the log, at the speed of the log"
         raise UsageError(problem, cure="use expert_actions")
-    if not isinstance(actions, Physical):
-        raise UsageError(
-            "the action space has no acceleration to scale", cure="use physical, or leave it out"
-        )
-    return Scaled(planner, scale)
+    if not isinstance(actions, Physical) or isinstance(actions, Discrete):
+        problem = "the action space has no continuous acceleration to scale"
+        raise UsageError(problem, cure="use physical, published or route, or leave out --speed")
+    return SpeedScaled(planner, scale)
 
 
 def hold(planner: Planner, steps: int) -> Planner:

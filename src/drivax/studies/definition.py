@@ -148,6 +148,9 @@ class StudyDefinition:
     def __post_init__(self) -> None:
         if not all(0.0 < speed < 1.0 for speed in self.speeds) or len(set(self.speeds)) < len(self.speeds):
             raise ValueError(f"speeds are {self.speeds}; use different numbers between 0 and 1")
+        slower_names = {f"{arm}_at_{speed:g}" for arm in self.arms for speed in self.speeds}
+        if len(slower_names) < len(self.arms) * len(self.speeds) or slower_names & self.arms.keys():
+            raise ValueError(f"two evaluations would have the same name; change speeds {self.speeds} or arms")
         if not self.speeds and any(claim.at_equal_progress for claim in self.claims):
             raise ValueError("claims at equal progress need speeds")
         if len(set(self.baselines[:2])) < 2:
@@ -240,7 +243,7 @@ class StudySets:
         train: Training set.
         validation: Validation set, for the choice of checkpoints; None: recordings of the training set are held out.
         test: Test sets; all their scenarios are tested. The first set has events as often as ordinary traffic.
-        episodes: Recordings of ``drivax record`` in the training set, to learn from instead of the logs.
+        episodes: Folders of ``drivax record``: episodes in the training set, to learn from instead of the logs.
     """
 
     train: Path
@@ -254,7 +257,8 @@ class StudySets:
     ) -> StudySets:
         """Return the sets at these paths, or those of a benchmark's folder.
 
-        With ``episodes``, the validation set is held out of the training set, whose episodes critics are checked with.
+        With ``episodes`` and no ``validation``, recordings of the training set are held out, so that critics can be
+        checked on their episodes.
 
         Raises:
             UsageError: A set is missing.

@@ -135,9 +135,11 @@ def claims_table(results: Results, group: str) -> Table:
 def _claim_row(result: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the cells of a claim, from :meth:`ClaimResult.plain`; undefined values are empty."""
     claim, interval, change, p = (result[name] for name in ("claim", "interval", "change", "adjusted"))
-    slowed, words = result.get("slowed"), claim["words"]
-    if slowed is not None:
-        words += f" ({slowed[0]} at {slowed[1]:.2f} of its speed)"
+    slower, words = result.get("slower_arm"), claim["words"]
+    if claim.get("margin") is not None:
+        words += f" (margin {claim['margin']:g})"
+    if slower is not None:
+        words += f" ({slower[0]} at {slower[1]:.2f} of its speed)"
     return (
         words,
         _label(claim["metric"]),
@@ -169,10 +171,11 @@ def events_table(results: Results) -> Table:
     by_arm = results.get("events", {})
     groups = list(dict.fromkeys(group for rates in by_arm.values() for group in rates))
     rows = [
-        (group, *(f"{rates[group]['mean']:.3f}" if group in rates else "" for rates in by_arm.values()))
-        for group in groups
+        (name, *(_rate(rates[group]) if group in rates else "" for group in groups))
+        for name, rates in by_arm.items()
+        if rates
     ]
-    return _table("dense", ("event", *by_arm), rows)
+    return _table("dense", ("arm", *groups), rows)
 
 
 def draws_table(results: Results) -> Table:
@@ -250,8 +253,10 @@ def _verdicts(definition: StudyDefinition, results: Results) -> str:
         "random (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). A claim "
         "is supported or contradicted below 0.05, otherwise undecided; the number of seeds or recordings that would "
         "decide supposes that the difference is the estimated one, at the strictest level of its group. A claim about "
-        "a size is tested against that size. Compare the weights of a method and of its control in the table of "
-        "weights. Scores are computed once: claims are about these scores, at this strength of weighting.</small></p>"
+        "a size is tested against that size; one with a margin, against being worse by the margin. At equal progress, "
+        "the arm that gets further drives slower until it does not. Compare the weights of a method and of its control "
+        "in the table of weights. Scores are computed once: claims are about these scores, at this strength of "
+        "weighting.</small></p>"
     )
 
 

@@ -121,7 +121,9 @@ def run_study(
     # The presets of all arms must have the same observations and actions.
     usable = usable_steps(study.train_config(definition.baselines[0], 0), training)
     for name in definition.planners:
-        if not study.evaluation(name).is_dir():
+        if study.evaluation(name).is_dir():
+            _check_tested(study, study.evaluation(name))
+        else:
             log(f"evaluating {name} on the test set")
             run_evaluation(EvaluationConfig(name), make_planner(name), test, study.evaluation(name))
     shared = (usable, episodes_digest(training.episodes), is_edited_allowed())
@@ -202,6 +204,9 @@ def _open_folder(study: Study) -> None:
     if study.folder.exists() and any(study.folder.iterdir()):
         _check_folder(study, data, definition)
         return
+    if study.sets.validation is None and not hold_out(data[0].entries).recordings:
+        problem = "all scenarios are of one recording, so none can be held out"
+        raise UsageError(problem, file=study.sets.train, cure="pass --validation")
     other_arms = [name for name, arm in study.arms.items() if arm.method not in ORACLES]
     if len(other_arms) < len(study.arms) and not event_kinds(data[0]).any():
         raise UsageError(
@@ -226,7 +231,9 @@ def _check_folder(study: Study, data: Sequence[ScenarioSet], definition: str) ->
     # Claims are fixed before the evaluation. Studies of earlier versions do not name their definition.
     if folder.info.get("definition", definition) != definition:
         raise UsageError(
-            "contains a study with another definition", file=study.folder, cure="choose another --out"
+            "contains a study with another definition, or of another version of drivax",
+            file=study.folder,
+            cure="choose another --out",
         )
 
 
@@ -275,10 +282,11 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
     return Strata(recordings, rare, float(ordinary.mean()) if has_labels else None)
 
 
-def _event_groups(test: ScenarioSet) -> dict[str, Bool[np.ndarray, " scenario"]]:
+def event_groups(entries: Sequence[Mapping[str, Any]]) -> dict[str, Bool[np.ndarray, " scenario"]]:
     """Return masks of the scenarios with events of each kind, and of each half of the severities."""
-    kinds = np.array([entry["tags"].get("event", "") for entry in test.entries])
-    severity = np.array([float(entry["tags"].get("severity_mps2", "nan")) for entry in test.entries])
+    tags = [entry["tags"] for entry in entries]
+    kinds = np.array([own.get("event", "") for own in tags])
+    severity = np.array([float(own.get("severity_mps2", "nan")) for own in tags])
     groups = {kind: kinds == kind for kind in sorted({*kinds.tolist()} - {""})}
     if groups:
         middle = float(np.nanmedian(severity))
@@ -328,11 +336,12 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
     """Return whether an arm has all its evaluations.
 
     Raises:
-        UsageError: An evaluation is older than the run.
+        UsageError: An evaluation is older than the run, or of another test set.
     """
     folders = _evaluation_folders(study, arm, seed)
     existing = [folder for folder in folders if folder.is_dir()]
     for folder in existing:
+        _check_tested(study, folder)
         if _start_time(folder) < _start_time(study.run(arm, seed)):
             raise UsageError(
                 "is older than the run that it evaluates",
@@ -340,6 +349,14 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
                 cure="remove it, and run the study again",
             )
     return len(existing) == len(folders)
+
+
+def _check_tested(study: Study, folder: Path) -> None:
+    """Check that an evaluation is of the study's test set, if that exists."""
+    if study.test.is_dir():
+        tested = RunFolder.open(folder).info["data"][0]["hash"]
+        if tested != ScenarioSet.open(study.test, verify=False).hash:
+            raise UsageError("is of another test set", file=folder, cure="remove it, and run the study again")
 
 
 def _start_time(run: Path) -> datetime:
@@ -452,7 +469,10 @@ def _results(
         for arm in study.arms
         if len(set(study.evaluations(arm).values())) > 1
     }
-    baseline = definition.baselines[0]
+    baseline, groups = definition.baselines[0], event_groups(test.entries)
+    tested = episodes | {
+        study.slower(arm, speed): values for arm in slower for speed, values in slower[arm].items()
+    }
     weights = {
         name: arm.weigh(data, tables.__getitem__, study.config.weights, usable)
         for name, arm in study.arms.items()
@@ -467,10 +487,9 @@ def _results(
             "share": strata.share,
         },
         "claims": [result.plain() for result in decide_claims(study.claims, episodes, strata, slower)],
-        "rates": {name: rates(values, strata, metrics) for name, values in episodes.items()},
+        "rates": {name: rates(values, strata, metrics) for name, values in tested.items()},
         "events": {
-            name: rates_of_groups(values, strata, _event_groups(test), metrics[0])
-            for name, values in episodes.items()
+            name: rates_of_groups(values, strata, groups, metrics[0]) for name, values in tested.items()
         },
         "draws": {
             name: asdict(draw_statistics(weights[name], usable, len(usable) // len(data)))

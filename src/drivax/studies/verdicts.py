@@ -20,6 +20,7 @@ from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.stats.seeds import CrossedEffect, crossed_difference, crossed_mean, log_ratio, seeds_interval
 from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import Claim, Stratum
+from drivax.studies.equal_progress import ProgressError, match_progress
 
 #: Rankings are unrelated if their correlation's interval is within ±UNRELATED, related if it is beyond ±RELATED.
 UNRELATED, RELATED = 0.1, 0.3
@@ -133,7 +134,7 @@ class ClaimResult:
         adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
         needed: What would decide an undecided claim if the estimated effect is true, or why it cannot be tested.
-        slowed: For a claim at equal progress, the arm that drives slower, and the scale of its speed.
+        slower_arm: For a claim at equal progress, the arm that drives slower, and the scale of its speed.
     """
 
     claim: Claim
@@ -143,7 +144,7 @@ class ClaimResult:
     adjusted_p: float | None
     verdict: Verdict = "undecided"
     needed: str = ""
-    slowed: tuple[str, float] | None = None
+    slower_arm: tuple[str, float] | None = None
 
     def plain(self) -> dict[str, Any]:
         """Return plain values for ``results.json``."""
@@ -157,7 +158,7 @@ class ClaimResult:
             "p": None if self.effect is None else self.effect.p,
             "adjusted": self.adjusted_p,
             "change": None if self.change is None else list(self.change),
-            "slowed": None if self.slowed is None else list(self.slowed),
+            "slower_arm": None if self.slower_arm is None else list(self.slower_arm),
         }
 
 
@@ -186,83 +187,44 @@ def _effects(
     slower: Mapping[str, Mapping[float, Episodes]],
 ) -> ClaimResult:  # fmt: skip
     """Return the effects of a claim, without a verdict."""
-    weights, slowed, names = strata.weights(claim.rows), None, (claim.arm, claim.reference)
+    weights, names = strata.weights(claim.rows), (claim.arm, claim.reference)
     arm, reference = (episodes[name][claim.metric] for name in names)
-    if not strata.is_comparable(np.concatenate([arm, reference]), weights):
-        return ClaimResult(claim, None, None, None, None)
+    result = ClaimResult(claim, None, None, None, None)
     if claim.at_equal_progress:
-        arm_paces, reference_paces = ({1.0: episodes[name], **slower[name]} for name in names)
+        first, second = ({1.0: episodes[name], **slower[name]} for name in names)
         try:
-            arm, reference, slowed = _at_equal_progress(claim, arm_paces, reference_paces, weights)
-        except ValueError as error:
-            return ClaimResult(claim, None, None, None, None, needed=str(error))
+            matched = match_progress(first, second, claim.metric, weights)
+        except ProgressError as error:
+            return replace(
+                result, needed=f"{names[error.faster]} makes more progress even at its lowest speed"
+            )
+        arm, reference = matched.values
+        result = replace(result, slower_arm=(names[matched.slower], matched.scale))
+    if not strata.is_comparable(np.concatenate([arm, reference]), weights):
+        return result
     difference = crossed_difference(arm, reference, strata.recordings, weights)
     ratio = log_ratio(arm, reference, strata.recordings, weights)
-    effect: CrossedEffect | None = difference
+    result = replace(result, difference=difference, effect=difference)
     if claim.margin is not None:
+        if difference.standard_error == 0.0:
+            return replace(result, effect=None, needed="nothing varies: no error to compare the margin with")
         sign = -1.0 if METRICS[claim.metric].better == "low" else 1.0
-        effect = replace(difference, difference=difference.difference + sign * claim.margin)
+        shifted = replace(difference, difference=difference.difference + sign * claim.margin)
+        result = replace(result, effect=shifted)
     if ratio is None:
-        effect = effect if claim.change is None else None
-        return ClaimResult(claim, effect, difference, None, None, slowed=slowed)
+        return result if claim.change is None else replace(result, effect=None)
     if claim.change is not None:
-        effect = replace(ratio, difference=ratio.difference - math.log1p(claim.change))
+        relative = replace(ratio, difference=ratio.difference - math.log1p(claim.change))
+        result = replace(result, effect=relative)
     low, high = map(math.expm1, ratio.interval())
-    change = (math.expm1(ratio.difference), low, high)
-    return ClaimResult(claim, effect, difference, change, None, slowed=slowed)
-
-
-def _at_equal_progress(
-    claim: Claim, arm: Mapping[float, Episodes], reference: Mapping[float, Episodes], weights: Weights
-) -> tuple[Values, Values, tuple[str, float]]:
-    """Return the values of arm and reference at the lower progress of both, and who drives slower at which scale.
-
-    ``arm`` and ``reference`` have episodes by scale of the speed. The slower driver's metric is interpolated linearly
-    between the two speeds around that progress: y = metric - slope * (progress - target) of its nearer speed has the
-    interpolated mean, and subtracting the same from the other driver's values lets the variance of y include that of
-    the progress (the delta method, without the error of the slope).
-
-    Raises:
-        ValueError: It makes more progress even at the lowest speed.
-    """
-
-    def mean(values: Values) -> float:
-        return float(np.average(values[:, defined].mean(axis=0), weights=weights[defined]))
-
-    names = ("progress_ratio", claim.metric)
-    everything = [paces[speed][name] for paces in (arm, reference) for speed in paces for name in names]
-    defined = (weights > 0.0) & ~np.isnan(np.concatenate(everything)).any(axis=0)
-    progress = [
-        {speed: mean(e["progress_ratio"]) for speed, e in paces.items()} for paces in (arm, reference)
-    ]
-    is_arm = progress[0][1.0] > progress[1][1.0]
-    (fast, fast_progress), (slow, slow_progress) = (
-        ((arm, progress[0]), (reference, progress[1]))
-        if is_arm
-        else ((reference, progress[1]), (arm, progress[0]))
-    )
-    target, speeds = slow_progress[1.0], sorted(fast, reverse=True)
-    name = claim.arm if is_arm else claim.reference
-    lower = next((k for k in range(1, len(speeds)) if fast_progress[speeds[k]] <= target), None)
-    if lower is None:
-        raise ValueError(f"{name} makes more progress even at its lowest speed")
-    pair = speeds[lower - 1], speeds[lower]
-    high, low = (fast_progress[speed] for speed in pair)
-    gap = (high - low) or 1.0
-    share = (high - target) / gap
-    metric = [mean(fast[speed][claim.metric]) for speed in pair]
-    slope = (metric[0] - metric[1]) / gap
-    nearer = fast[pair[0] if share < 0.5 else pair[1]]
-    slowed, other = (e[claim.metric] - slope * (e["progress_ratio"] - target) for e in (nearer, slow[1.0]))
-    scale = pair[0] + share * (pair[1] - pair[0])
-    return (slowed, other, (name, scale)) if is_arm else (other, slowed, (name, scale))
+    return replace(result, change=(math.expm1(ratio.difference), low, high))
 
 
 def _decide(result: ClaimResult, tests: int) -> ClaimResult:
     """Return the result with its verdict; its group has ``tests`` claims that can be tested."""
     if result.effect is None or result.adjusted_p is None:
         needed = result.needed or "fewer than two recordings define it"
-        if result.difference is not None:
+        if result.difference is not None and not result.needed:
             needed = "the mean of an arm is not positive: no ratio"
         return replace(result, needed=needed)
     if result.adjusted_p >= _LEVEL:
