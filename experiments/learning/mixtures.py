@@ -94,20 +94,21 @@ def is_trained(folder: Path) -> bool:
 
 
 def compute_results(runs: Path) -> dict[str, Any]:
-    """Return means of drivers and policies, and differences of policies from both clones and the best driver."""
+    """Return means of drivers and policies, and differences of policies from both clones and the best drivers."""
     drivers = {path.name: _episodes([path]) for path in sorted((runs / "drivers").iterdir())}
-    best = max(drivers, key=lambda name: float(np.nanmean(drivers[name].values["vmax_score"])))
+    means = {name: {m: mean_interval(own, m).as_dict() for m in METRICS} for name, own in drivers.items()}
+    best = dict.fromkeys(max(means, key=lambda name: means[name][m]["mean"] or 0.0) for m in METRICS[:2])
     policies = {}
     for mixture in MIXTURES:
-        evaluated = {name: runs / "evaluated" / mixture / name for name in ALGORITHMS}
-        episodes = {
-            name: _episodes(sorted(folder.iterdir())) for name, folder in evaluated.items() if folder.exists()
+        seeds_of = {
+            name: sorted((runs / "evaluated" / mixture / name).glob("seed-*")) for name in ALGORITHMS
         }
+        episodes = {name: _episodes(seeds) for name, seeds in seeds_of.items() if len(seeds) == SEEDS}
         for name, own in episodes.items():
             seeds = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
             others = {key: episodes[key] for key in ("bc", "filtered_bc") if key in episodes and key != name}
             if mixture == "mixed":
-                others[best] = drivers[best]
+                others |= {driver: drivers[driver] for driver in best}
             policies[f"{mixture}/{name}"] = {
                 "means": {metric: mean_interval(own, metric).as_dict() for metric in METRICS},
                 "critics": [info.get("critics") for info in seeds],
@@ -116,7 +117,6 @@ def compute_results(runs: Path) -> dict[str, Any]:
                     for other, reference in others.items()
                 },
             }
-    means = {name: {m: mean_interval(own, m).as_dict() for m in METRICS} for name, own in drivers.items()}
     command = "python -m experiments.learning.mixtures judge"
     return {"command": command, "drivers": means, "policies": policies, "versions": versions()}
 
