@@ -213,6 +213,26 @@ def test_page_of_critical_moments_shows_stored_results(script, stored, repositor
     assert {moment["scenario"] for moment in result["moments"]} == set(moments.VERDICTS)
 
 
+def test_mixtures_page_shows_stored_results(script, stored):
+    module, result = script("learning.mixtures"), stored("mixtures")
+    text = module.PAGE.read_text()
+    shown = module.fill_places(text, "mixtures.py", module.page_tables(result)) == text
+    assert shown, "run python -m experiments.learning.mixtures table, and read what the page says about it"
+    for name, policy in result["policies"].items():
+        for other, difference in policy["differences"].items():
+            means = result["drivers"].get(other)
+            means = means or result["policies"][f"{name.partition('/')[0]}/{other}"]["means"]
+            expected = policy["means"]["success"]["mean"] - means["success"]["mean"]
+            assert difference["success"]["mean"] == pytest.approx(expected, abs=1e-9)
+
+
+def test_td3_bc_beats_clones_and_drivers_of_the_mixture(stored):
+    """The claim of the page: better success than both clones and than the best drivers, with healthy critics."""
+    best = stored("mixtures")["policies"]["mixed/td3_bc"]
+    assert all(difference["success"]["low"] > 0.0 for difference in best["differences"].values())
+    assert {"bc", "filtered_bc", "pdm"} <= best["differences"].keys()
+
+
 def test_curation_and_planners_share_the_test_set(stored):
     assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
 

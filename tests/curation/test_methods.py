@@ -121,7 +121,9 @@ def test_histogram_of_one_set_scores_another(data, tables, tmp_path, capsys):
         writer.add(assemble(straight_road([car(speed=4.0), car(x=30.0, speed=8.0)]), SMALL))
     call = ["curate", "action_rarity", "--actions", str(file), "--out"]
     assert main([*call, str(tmp_path / "own.npz"), "--data", str(data.path), "--temper", "1"]) == 0
+    assert capsys.readouterr().out.endswith(f"  wrote {file}\n")
     assert main([*call, str(tmp_path / "again.npz"), "--data", str(data.path)]) == 0
+    assert capsys.readouterr().out.endswith(f"  scored by {file}\n")
     own, again = (read_scores(tmp_path / f"{name}.npz", data) for name in ("own", "again"))
     np.testing.assert_array_equal(own.steps, again.steps)
     assert own.config["temper"] == again.config["temper"] == 1.0
@@ -178,6 +180,18 @@ def test_oracle_scores_are_labels(data, tables):
     assert event_kinds(data).tolist() == [0, 3, 0, 0]
     assert tables["oracle"].scenarios.tolist() == [0.0, 1.0, 0.0, 0.0]
     assert tables["oracle"].steps.sum() == 23
+
+
+def test_oracle_of_conflicts_also_labels_recordings_with_their_tag(tmp_path):
+    """The first recording has an event at steps 8 to 30, the second begins with a conflict, the third has neither."""
+    events, tags = (Event(3, 8, 30, (101,)),), {"critical": "yes"}
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        for number, changes in enumerate(({"events": events}, {"tags": tags}, {})):
+            road = straight_road([car(), car(x=30.0, speed=8.0)])
+            recording = replace(road, scenario_id=f"drive-{number}", dataset="drivax", **changes)
+            writer.add(assemble(recording, SMALL))
+    table = curate("oracle_critical", Request(ScenarioSet.open(tmp_path / "set")))
+    assert table.steps.sum(axis=1).tolist() == [23, 91, 0]
 
 
 def test_oracle_refuses_sets_without_labels(tmp_path):

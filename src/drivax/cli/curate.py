@@ -127,6 +127,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
                 "output is inside the --export folder", file=args.out, cure="choose another --out"
             )
         check_top(data, *args.export, args.overwrite, args.all_windows)
+    source = args.members or args.actions
+    has_source = source is not None and source.exists()
     if args.again is None:
         request = Request(
             data, args.like, args.seed or 0, args.tables, args.runs, config,
@@ -142,6 +144,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
         table = table.recombine(replace(table.combination, **changes))
     write_scores(table, args.out, args.overwrite)
     _print_statistics(table, args.out)
+    if source is not None and args.again is None:
+        show(f"  {'scored by' if has_source else 'wrote'} {source}")
     if args.export is not None:
         embedding = _embedding(args, data, table) if args.diverse else None
         _export(table, data, *args.export, args.overwrite, args.all_windows, embedding)
