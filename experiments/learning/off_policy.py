@@ -35,7 +35,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.tracking.run_folder import RunFolder, versions
-from experiments.learning.mixtures import ALGORITHMS, MIXTURES, SEEDS, is_trained
+from experiments.learning.mixtures import ALGORITHMS_OF, SEEDS, is_trained
 from experiments.repository import RESULTS
 
 RESULT = RESULTS / "off_policy.json"
@@ -114,8 +114,8 @@ def main() -> None:
     bank = data.data.bank
     behaviour = action_of(args.runs / "mixed" / "bc" / "seed-0", bank)
     rows = {}
-    for mixture in MIXTURES:
-        for name in ALGORITHMS:
+    for mixture, names in ALGORITHMS_OF.items():
+        for name in names:
             for seed in range(SEEDS):
                 run = args.runs / mixture / name / f"seed-{seed}"
                 if not is_trained(run):
