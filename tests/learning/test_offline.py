@@ -98,8 +98,16 @@ def to_numpy(tree):
     return {name: np.asarray(value, np.float64) for name, value in tree.items()}
 
 
-def test_cql_against_numpy(batch, policy_batch):
-    config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0, backup_actions=2)
+def combined(q, min_q_weight):
+    """The value of both critics."""
+    return min_q_weight * q.min(axis=0) + (1.0 - min_q_weight) * q.max(axis=0)
+
+
+@pytest.mark.parametrize("min_q_weight", [1.0, 0.7])
+def test_cql_against_numpy(min_q_weight, batch, policy_batch):
+    config = replace(
+        CQL, min_q_weight=min_q_weight, gap=1.5, imitation=0.7, penalty_temperature=2.0, backup_actions=2
+    )
     learner, trained, target = build_learner(config)
     (policy_keys, next_keys, uniform_keys, now_keys, then_keys), keys = step_keys(5)
     total, logs = losses(learner, trained, target, batch, policy_batch, keys)
@@ -138,8 +146,8 @@ def test_cql_against_numpy(batch, policy_batch):
         }
 
     result = to_numpy(outputs(trained))
-    value = result["target"].min(axis=0).max(axis=0)
-    assert (value > result["target"].min(axis=0)[0]).any()
+    value = combined(result["target"], min_q_weight).max(axis=0)
+    assert (value > combined(result["target"], min_q_weight)[0]).any()
     td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, value)
     error = 0.5 * ((result["q"] - td_target) ** 2).mean()
     stacked = np.concatenate([
@@ -220,8 +228,9 @@ def test_relative_advantages_do_not_depend_on_the_scale(config, batch, policy_ba
     assert float(constant[1]["weight"]) == 1.0
 
 
-def test_iql_against_numpy(batch, policy_batch):
-    learner, trained, target = build_learner(replace(IQL, largest_weight=1.05))
+@pytest.mark.parametrize("min_q_weight", [1.0, 0.7])
+def test_iql_against_numpy(min_q_weight, batch, policy_batch):
+    learner, trained, target = build_learner(replace(IQL, min_q_weight=min_q_weight, largest_weight=1.05))
     total, logs = losses(learner, trained, target, batch, policy_batch, step_keys(1)[1])
 
     @jax.jit
@@ -238,11 +247,11 @@ def test_iql_against_numpy(batch, policy_batch):
         }
 
     result = to_numpy(outputs(trained))
-    error = result["target"].min(axis=0) - result["value"]
+    error = combined(result["target"], min_q_weight) - result["value"]
     value = (np.where(error > 0, 0.7, 0.3) * error**2).mean()
     td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["then"])
     critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
-    advantage = result["there"].min(axis=0) - result["value_there"]
+    advantage = combined(result["there"], min_q_weight) - result["value_there"]
     weights = np.minimum(np.exp(3.0 * advantage), 1.05)
     policy = -(weights * result["log_prob"]).mean()
     assert 0.0 < logs["weights_cut"] == (weights == 1.05).mean() < 1.0
@@ -257,8 +266,11 @@ def test_iql_against_numpy(batch, policy_batch):
     assert logs["largest_q"] == pytest.approx(np.abs(result["q"]).max(), rel=1e-4)
 
 
-def test_awac_against_numpy(batch, policy_batch):
-    learner, trained, target = build_learner(replace(AWAC, inverse_temperature=2.0, largest_weight=1.05))
+@pytest.mark.parametrize("min_q_weight", [1.0, 0.7])
+def test_awac_against_numpy(min_q_weight, batch, policy_batch):
+    learner, trained, target = build_learner(
+        replace(AWAC, min_q_weight=min_q_weight, inverse_temperature=2.0, largest_weight=1.05)
+    )
     (next_keys, policy_keys), keys = step_keys(2)
     total, logs = losses(learner, trained, target, batch, policy_batch, keys)
 
@@ -276,9 +288,11 @@ def test_awac_against_numpy(batch, policy_batch):
         }
 
     result = to_numpy(outputs(trained))
-    td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, result["target"].min(axis=0))
+    td_target = np.asarray(batch.reward) + 0.9 * np.where(
+        batch.terminated, 0.0, combined(result["target"], min_q_weight)
+    )
     critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
-    advantage = result["logged"].min(axis=0) - result["own"].min(axis=0)
+    advantage = combined(result["logged"], min_q_weight) - combined(result["own"], min_q_weight)
     weights = np.minimum(np.exp(2.0 * advantage), 1.05)
     policy = -(weights * result["log_prob"]).mean()
     assert 0.0 < logs["weights_cut"] == (weights == 1.05).mean() < 1.0
@@ -370,7 +384,7 @@ def test_td3_bc_against_numpy(min_q_weight, batch, policy_batch):
 
     result = to_numpy(outputs(trained))
     assert (np.abs(result["noise"]) > 0.3).any() and (np.abs(result["noise"]) < 0.3).any()
-    next_q = min_q_weight * result["target"].min(axis=0) + (1.0 - min_q_weight) * result["target"].max(axis=0)
+    next_q = combined(result["target"], min_q_weight)
     td_target = np.asarray(batch.reward) + 0.9 * np.where(batch.terminated, 0.0, next_q)
     critic = 0.5 * ((result["q"] - td_target) ** 2).mean()
     policy = -2.5 * result["judged"].mean() / np.abs(result["judged"]).mean() + (result["off"] ** 2).mean()
