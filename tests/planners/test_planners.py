@@ -11,12 +11,11 @@ from flax import nnx
 
 from drivax.api import find_planner
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import advance
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.functions import NetworkPlanner
-from drivax.planners.planner import Memoryless, Planner, hold, scale_speed
+from drivax.planners.planner import Memoryless, Planner, hold, limit_speed
 from drivax.planners.simple import (
     ConstantSpeed,
     ConstantVelocity,
@@ -213,67 +212,46 @@ def test_route_space_steers_straight_on_beyond_the_route_and_without_one(simulat
     assert float(follow_route(bank, beyond, jnp.zeros(()))) == pytest.approx(-2 / (10.2**2 + 1), rel=1e-2)
 
 
-@partial(jax.jit, static_argnums=0)
-def drive_30_steps(simulator, planner, bank):
-    """Return the motions of ego over 30 steps from step 10 on."""
-    state, key = simulator.reset(bank, 0, 10, 0), jax.random.key(0)
+@record
+class Deciding(Memoryless):
+    """Return one action, whatever happens."""
 
-    def step(carry, key):
-        state, memory, _ = advance(simulator, planner, bank, *carry, key)
-        return (state, memory), state.context.history[-1]
+    decision: jax.Array
+    name: str = static(default="deciding")
 
-    start = state, planner.init(bank, state, key)
-    return jax.lax.scan(step, start, jax.random.split(key, 30))[1]
-
-
-def test_a_scaled_planner_drives_the_same_course_at_another_pace(simulator):
-    """On a free road, the speeds of IDM that starts at 10 m/s, times 0.6, are those of scaled IDM from 6 m/s on."""
-    fast, slow = (bank_of(straight_road([car(speed=speed)])) for speed in (10.0, 6.0))
-    expected = np.asarray(drive_30_steps(simulator, IdmPlanner(), fast))
-    scaled = scale_speed(IdmPlanner(), 0.6, PHYSICAL)
-    motion = np.asarray(drive_30_steps(simulator, scaled, slow))
-    np.testing.assert_allclose(motion[:, 3], 0.6 * expected[:, 3], rtol=1e-5)
-    assert expected[-1, 3] > 11.0 and scaled.name == "idm (speed x 0.6)"
-    held = np.asarray(drive_30_steps(simulator, hold(scaled, 2), slow))
-    np.testing.assert_allclose(held[-1, 3], motion[-1, 3], atol=0.1)
-
-
-def test_a_scaled_planner_perceives_scaled_speeds_positions_and_acceleration(simulator):
-    state = simulator.reset(bank_of(straight_road([car(speed=5.0)])), 0, 10, 0)
-    state = replace(state, context=replace(state.context, action=jnp.array([0.2, 0.3])))
-    seen, true = scale_speed(IdmPlanner(), 0.5, PHYSICAL).perceive(state).context, state.context.history
-    np.testing.assert_allclose(seen.history[-1], true[-1] * np.array([1, 1, 1, 2]), rtol=1e-6)
-    np.testing.assert_allclose(seen.history[-1, 0] - seen.history[-4, 0], 2 * 3 * 0.1 * 5.0, rtol=1e-4)
-    np.testing.assert_allclose(seen.action, [0.4, 0.3], rtol=1e-6)
-    braking = replace(state, context=replace(state.context, action=jnp.array([-0.2, 0.3])))
-    seen = scale_speed(IdmPlanner(), 0.5, PHYSICAL).perceive(braking).context
-    np.testing.assert_allclose(seen.action, [-0.2, 0.3], rtol=1e-6)
+    def choose(self, bank, situation, observation, key):
+        return self.decision
 
 
 @pytest.mark.parametrize(
-    ("decided", "executed"), [(0.8, 0.4), (3.0, 0.5), (-0.8, -0.8), (np.inf, np.inf), (np.nan, np.nan)]
+    ("decided", "executed"),
+    [(0.8, 0.1), (0.05, 0.05), (-0.8, -0.8), (np.inf, 0.1), (-np.inf, -np.inf), (np.nan, np.nan)],
 )
-def test_a_scaled_planner_accelerates_less_but_brakes_as_strongly(decided, executed, simulator):
-    @record
-    class Deciding(Memoryless):
-        name: str = static(default="deciding")
-
-        def choose(self, bank, situation, observation, key):
-            return jnp.array([decided, 0.25])
-
-    bank = bank_of(straight_road([car(speed=5.0)]))
-    np.testing.assert_allclose(act(scale_speed(Deciding(), 0.5, PHYSICAL), simulator, bank), [executed, 0.25])
+def test_limiter_bounds_the_acceleration_but_not_the_braking(decided, executed, simulator):
+    """At 10 m/s, half of a limit of 21.2 m/s leaves 0.6 m/s: 0.6 m/s2 of 6."""
+    road = straight_road([car(speed=10.0)], limit=21.2)
+    planner = limit_speed(Deciding(jnp.array([decided, 0.25])), 0.5, PHYSICAL)
+    assert PHYSICAL.acceleration_mps2 == 6.0
+    np.testing.assert_allclose(act(planner, simulator, bank_of(road)), [executed, 0.25], rtol=1e-4)
 
 
-def test_a_scaled_planner_needs_accelerations_and_a_positive_scale():
-    assert scale_speed(IdmPlanner(), 1.0, PHYSICAL) == IdmPlanner()
-    with pytest.raises(UsageError, match="scaled by -1"):
-        scale_speed(IdmPlanner(), -1.0, PHYSICAL)
+def test_limiter_slows_down_gently_and_assumes_an_unknown_limit(simulator):
+    """At 10 m/s, a tenth of 13.4 m/s asks for 8.7 m/s less within a second: by 2 m/s2 of 6."""
+    bank = bank_of(straight_road([car(speed=10.0)], limit=-1.0))
+    planner = limit_speed(Deciding(jnp.array([0.5, 0.0])), 0.1, PHYSICAL)
+    assert PHYSICAL.braking_mps2 == 6.0 and planner.name == "deciding (limit x 0.1)"
+    np.testing.assert_allclose(act(planner, simulator, bank), [-2.0 / 6.0, 0.0], rtol=1e-5)
+
+
+def test_limiter_needs_accelerations_and_a_positive_share():
+    assert limit_speed(IdmPlanner(), None, PHYSICAL) == IdmPlanner()
+    with pytest.raises(UsageError, match="limited to -1 of the limit"):
+        limit_speed(IdmPlanner(), -1.0, PHYSICAL)
     with pytest.raises(UsageError, match="replays the log"):
-        scale_speed(Expert(), 0.5, PHYSICAL)
+        limit_speed(Expert(), 0.5, PHYSICAL)
     for actions in (DeltaLocal(), Discrete()):
         with pytest.raises(UsageError, match="no continuous acceleration"):
-            scale_speed(RandomActions(), 0.5, actions)
+            limit_speed(RandomActions(), 0.5, actions)
 
 
 @pytest.mark.slow

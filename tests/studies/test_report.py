@@ -81,7 +81,7 @@ def test_report_shows_the_results(page):
     assert "2 claims: 1 supported, 0 contradicted, 1 undecided" in text
     assert "a &lt; b &amp; c" in text and "-0.050 [-0.080, -0.020]" in text and "-30% [-50%, -10%]" in text
     assert "▲ supported" in text and "41 seeds each" in text
-    assert "(baseline at 0.84 of its speed)" in text and text.count("of its speed") == 1
+    assert "(baseline at 0.84 of the speed limit)" in text and text.count("of the speed limit") == 1
     assert "<h3>Events: collision</h3>" in text
     rate = "0.123 [0.100, 0.150]"
     rows = [["expert", rate, ""], ["baseline", rate, rate]]

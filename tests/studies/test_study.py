@@ -215,13 +215,13 @@ def test_a_margin_cannot_be_compared_with_nothing():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"speeds": (1.2,)}, "use different numbers between 0 and 1"),
-        ({"speeds": (0.5, 0.5)}, "use different numbers between 0 and 1"),
-        ({"speeds": (0.1234567, 0.1234568)}, "two evaluations would have the same name"),
-        ({"claims": (Claim("x", "bc", "baseline", "control", at_equal_progress=True),)}, "need speeds"),
+        ({"limiters": (1.2,)}, "use different numbers between 0 and 1"),
+        ({"limiters": (0.5, 0.5)}, "use different numbers between 0 and 1"),
+        ({"limiters": (0.1234567, 0.1234568)}, "two evaluations would have the same name"),
+        ({"claims": (Claim("x", "bc", "baseline", "control", at_equal_progress=True),)}, "need limiters"),
     ],
 )
-def test_speeds_that_fit_no_evaluation_are_refused(change, message):
+def test_limiters_that_fit_no_evaluation_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         replace(LONGTAIL, **change)
     with pytest.raises(ValueError, match="use a positive number"):
@@ -563,7 +563,7 @@ baselines: [td3_bc, bc]
 planners: [idm]
 metrics: [collision, progress_ratio]
 checkpoints_by: validation/mean_q
-speeds: [0.9, 0.5]
+limiters: [0.9, 0.4]
 groups: {first: First}
 arms:
   bc: {preset: offline/bc}
@@ -596,16 +596,16 @@ def test_a_study_on_recorded_episodes(data, tmp_path, in_process, capsys):
     arguments += ["--episodes", str(tmp_path / "episodes")]
     assert main(arguments) == 0
     names = sorted(path.name for path in (out / "evaluations").iterdir())
-    arms = [f"{arm}{speed}" for arm in ("bc", "td3_bc") for speed in ("", "_at_0.5", "_at_0.9")]
+    arms = [f"{arm}{speed}" for arm in ("bc", "td3_bc") for speed in ("", "_at_0.4", "_at_0.9")]
     assert names == sorted([*arms, "idm", "td3_bc_by_mean_q"])
-    slow = EpisodeTable.read(out / "evaluations" / "bc_at_0.5" / "seed-0")
-    assert slow.planner.startswith("seed-0 (speed x 0.5)")
+    slow = EpisodeTable.read(out / "evaluations" / "bc_at_0.4" / "seed-0")
+    assert slow.planner.startswith("seed-0 (limit x 0.4)")
     results = json.loads((out / "results.json").read_text())
     equal, margin = results["claims"]
-    slower, scale = equal["slower_arm"]
-    assert slower in ("bc", "td3_bc") and 0.5 <= scale <= 1.0
+    slower, share = equal["slower_arm"]
+    assert slower in ("bc", "td3_bc") and 0.4 <= share <= 1.0
     assert margin["slower_arm"] is None and margin["claim"]["margin"] == 0.1
-    assert results["rates"]["bc_at_0.5"]["common"]["progress_ratio"]["mean"] < 0.9
+    assert results["rates"]["bc_at_0.4"]["common"]["progress_ratio"]["mean"] < 0.9
     run = RunFolder.open(out / "runs" / "bc" / "seed-0").info
     assert run["recorded_episodes"] and run["validation"]["recordings"]
     capsys.readouterr()

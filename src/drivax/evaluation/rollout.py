@@ -187,11 +187,10 @@ def advance(
     A non-finite action is replaced by ``Task.coast``, so that the state stays finite. Planners with ``replays``
     follow the log.
     """
-    context, perceive = state.context, getattr(planner, "perceive", None)
-    perceived = state if perceive is None else perceive(state)
-    situation = simulator.situation(bank, perceived)
-    observation = simulator.observe(bank, perceived.context)
-    action, carry = planner.act(carry, bank, perceived, situation, observation, key)
+    situation = simulator.situation(bank, state)
+    observation = simulator.observe(bank, state.context)
+    action, carry = planner.act(carry, bank, state, situation, observation, key)
+    context = state.context
     if planner.replays:
         action = simulator.task.actuate(bank, context, action)
         logged_pose = logged_motion(bank, context, 1)

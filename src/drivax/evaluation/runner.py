@@ -30,7 +30,7 @@ from drivax.files import check_space, explain_full_disk, replace_folder
 from drivax.metrics.catalogue import METRICS, Metric, metric_specs, select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.planners.functions import collect_errors
-from drivax.planners.planner import Planner, add_noise, hold, scale_speed
+from drivax.planners.planner import Planner, add_noise, hold, limit_speed
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, Scenario
@@ -92,8 +92,8 @@ class EvaluationConfig:
         seed: Seed of all random numbers: noisy starts and planners that sample.
         sample: Let a trained policy sample its actions instead of taking the mode.
         noise: Standard deviation of noise that is added to the actions, correlated over a second.
-        speed: Scale of the planner's speed: 0.8 lets it drive a fifth slower, as a control for policies that collide
-            less because they drive less far.
+        limiter: Slow the planner down by a speed limiter at this share of the speed limit, as a control for policies
+            that collide less because they drive less far.
         batch: Scenarios loaded at a time; as many as memory allows by default. Results do not depend on it.
         task: Action space and observation of the planner.
     """
@@ -109,7 +109,7 @@ class EvaluationConfig:
     metrics: tuple[str, ...] = ()
     sample: bool = False
     noise: float = 0.0
-    speed: float = 1.0
+    limiter: float | None = None
     batch: int | None = None
     task: Task = field(default_factory=Task)
 
@@ -123,7 +123,7 @@ def run_evaluation(
     The folder appears when all episodes are finished. ``traffic`` defaults to the built-in model ``config.traffic``,
     ``sizes`` to those of the whole set.
     """
-    planner = scale_speed(add_noise(planner, config.noise), config.speed, config.task.actions)
+    planner = limit_speed(add_noise(planner, config.noise), config.limiter, config.task.actions)
     scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
     # Only evaluated scenarios need verification; the others only contribute their sizes.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -15,11 +14,14 @@ from drivax.errors import UsageError
 from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
+from drivax.simulator.ahead import FALLBACK_LIMIT_MPS
 from drivax.simulator.types import MOTION_SPEED, Action, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Discrete, Physical, action_of
 
 #: Correlation time of the noise on actions, s.
 _CORRELATION_S = 1.0
+#: Time constant of the speed limiter, s, and its largest deceleration.
+_LIMITER_S, _LIMITER_MPS2 = 1.0, 2.0
 
 
 @runtime_checkable
@@ -29,8 +31,7 @@ class Planner(Protocol):
     Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
     argument of its compiled program. The compiler removes inputs that ``act`` does not read. A planner that needs
     stored scenarios has ``prepare(scenario_of)``, which evaluation calls with a function from a scenario's identity to
-    the scenario. A planner that acts on another state than the true one has ``perceive(state)``, which returns it;
-    evaluation calls it, wrappers other than :class:`Held` and planners in traffic do not.
+    the scenario.
     """
 
     @property
@@ -109,11 +110,6 @@ class Held:
     def replays(self) -> bool:
         """Whether the planner replays the log."""
         return self.planner.replays
-
-    @property
-    def perceive(self) -> Any:
-        """Perception of the planner, if it has one."""
-        return self.planner.perceive
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
         """Return the planner's carry, and zeros in place of the first decision."""
@@ -195,26 +191,27 @@ def add_noise(planner: Planner, deviation: float) -> Planner:
 
 
 @record
-class SpeedScaled:
-    """A planner that drives at another speed: it acts as if its speed were ``speed / scale``.
+class SpeedLimited:
+    """A planner that a speed limiter slows down: it perceives and decides as before, and brakes as strongly.
 
-    On a free road it keeps ``scale * v`` where it would keep the speed v. It brakes as strongly as it decides, because
-    a control that drives slower should not react worse; its positive accelerations are scaled. Positions in the
-    history are scaled, too, around the present one; ``situation.facts`` and other agents are not.
+    The limiter lowers the acceleration towards a share of the speed limit of the driven lane within a second, and
+    decelerates by at most 2 m/s2 where ego is faster.
 
     Attributes:
         planner: The planner.
-        scale: Factor of speeds and of positive accelerations.
+        share: Share of the speed limit, of 13.4 m/s where it is unknown.
+        space: Action space.
     """
 
     planner: Any
-    scale: float = static()
+    share: float = static()
+    space: Physical = static()
     replays: bool = static(default=False)
 
     @property
     def name(self) -> str:
-        """Name of the planner, with the scale."""
-        return f"{self.planner.name} (speed x {self.scale:g})"
+        """Name of the planner, with the share."""
+        return f"{self.planner.name} (limit x {self.share:g})"
 
     @property
     def actions(self) -> ActionSpace:
@@ -226,49 +223,40 @@ class SpeedScaled:
         """Preparation of the planner, if it needs one."""
         return self.planner.prepare
 
-    def perceive(self, state: SimState) -> SimState:
-        """Return the state with the speeds that the planner acts on."""
-        context = state.context
-        action, history = context.action, context.history
-        xy = history[-1, :2] + (history[:, :2] - history[-1, :2]) / self.scale
-        speed = history[:, MOTION_SPEED] / self.scale
-        history = history.at[:, :2].set(xy).at[:, MOTION_SPEED].set(speed)
-        last = jnp.where(action[0] > 0.0, action[0] / self.scale, action[0])
-        context = replace(context, history=history, action=action.at[0].set(last))
-        return replace(state, context=context)
-
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
         """Return the planner's carry."""
-        return self.planner.init(bank, self.perceive(state), key)
+        return self.planner.init(bank, state, key)
 
     def act(
         self, carry: Any, bank: ScenarioBank, state: SimState, situation: Situation, observation: Any,
         key: Array,
     ) -> tuple[Action, Any]:  # fmt: skip
-        """Return the planner's action in the perceived state, with its acceleration scaled."""
+        """Return the planner's action, with at most the acceleration of the limiter."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
-        ahead = action[0]
-        scaled = jnp.where(ahead > 0.0, self.scale * jnp.minimum(ahead, 1.0), ahead)
-        return action.at[0].set(jnp.where(jnp.isfinite(ahead), scaled, ahead)), carry
+        limit = situation.surroundings.lanes.limit
+        limit = self.share * jnp.where(limit > 0.0, limit, FALLBACK_LIMIT_MPS)
+        most = jnp.maximum((limit - situation.context.history[-1, MOTION_SPEED]) / _LIMITER_S, -_LIMITER_MPS2)
+        most = most / jnp.where(most < 0.0, self.space.braking_mps2, self.space.acceleration_mps2)
+        return action.at[0].set(jnp.where(action[0] > most, most, action[0])), carry
 
 
-def scale_speed(planner: Planner, scale: float, actions: ActionSpace) -> Planner:
-    """Return a planner that drives at ``scale`` times its speed; 1: the planner.
+def limit_speed(planner: Planner, share: float | None, actions: ActionSpace) -> Planner:
+    """Return a planner with a speed limiter at a share of the speed limit; None: the planner.
 
     Raises:
-        UsageError: The scale is not positive, the planner replays the log, or its actions are no accelerations.
+        UsageError: The share is not positive, the planner replays the log, or its actions are no accelerations.
     """
-    if scale == 1.0:
+    if share is None:
         return planner
-    if not 0.0 < scale < math.inf:
-        raise UsageError(f"speed is scaled by {scale:g}", cure="use a positive number")
+    if not 0.0 < share < math.inf:
+        raise UsageError(f"speed is limited to {share:g} of the limit", cure="use a positive number")
     if planner.replays:
         problem = f"planner {planner.name} replays the log, at the speed of the log"
         raise UsageError(problem, cure="use expert_actions")
     if not isinstance(actions, Physical) or isinstance(actions, Discrete):
-        problem = "the action space has no continuous acceleration to scale"
-        raise UsageError(problem, cure="use physical, published or route, or leave out --speed")
-    return SpeedScaled(planner, scale)
+        problem = "the action space has no continuous acceleration to limit"
+        raise UsageError(problem, cure="use physical, published or route, or leave out --limiter")
+    return SpeedLimited(planner, share, actions)
 
 
 def hold(planner: Planner, steps: int) -> Planner:

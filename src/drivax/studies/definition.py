@@ -132,7 +132,8 @@ class StudyDefinition:
         claims: The claims.
         checkpoints_by: Training metric whose maximum chooses checkpoints by another rule; the report has the cost of
             this rule for the first baseline.
-        speeds: Scales below 1 of the speed at which arms are also evaluated, for claims at equal progress.
+        limiters: Shares of the speed limit, below 1, at which a limiter also slows arms down, for claims at equal
+            progress.
     """
 
     title: str
@@ -143,16 +144,20 @@ class StudyDefinition:
     arms: dict[str, Arm]
     claims: tuple[Claim, ...]
     checkpoints_by: str
-    speeds: tuple[float, ...] = ()
+    limiters: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not all(0.0 < speed < 1.0 for speed in self.speeds) or len(set(self.speeds)) < len(self.speeds):
-            raise ValueError(f"speeds are {self.speeds}; use different numbers between 0 and 1")
-        slower_names = {f"{arm}_at_{speed:g}" for arm in self.arms for speed in self.speeds}
-        if len(slower_names) < len(self.arms) * len(self.speeds) or slower_names & self.arms.keys():
-            raise ValueError(f"two evaluations would have the same name; change speeds {self.speeds} or arms")
-        if not self.speeds and any(claim.at_equal_progress for claim in self.claims):
-            raise ValueError("claims at equal progress need speeds")
+        if not all(0.0 < share < 1.0 for share in self.limiters) or len(set(self.limiters)) < len(
+            self.limiters
+        ):
+            raise ValueError(f"limiters are {self.limiters}; use different numbers between 0 and 1")
+        slower_names = {f"{arm}_at_{share:g}" for arm in self.arms for share in self.limiters}
+        if len(slower_names) < len(self.arms) * len(self.limiters) or slower_names & self.arms.keys():
+            raise ValueError(
+                f"two evaluations would have the same name; change limiters {self.limiters} or arms"
+            )
+        if not self.limiters and any(claim.at_equal_progress for claim in self.claims):
+            raise ValueError("claims at equal progress need limiters")
         if len(set(self.baselines[:2])) < 2:
             raise ValueError("a study needs two different baselines")
         methods = [arm.method for arm in self.arms.values()]
@@ -327,21 +332,21 @@ class Study:
         """Return the evaluation folder of an arm with one seed, or of a planner."""
         return inside(self.folder, "evaluations", name, *([] if seed is None else [f"seed-{seed}"]))
 
-    def evaluations(self, arm: str) -> dict[str, float]:
-        """Return the scale of the speed in each of an arm's evaluations, by name.
+    def evaluations(self, arm: str) -> dict[str, float | None]:
+        """Return the speed limiter in each of an arm's evaluations, by name; None without.
 
-        The first baseline is also evaluated at other checkpoints, and arms of claims at equal progress at lower speeds.
+        The first baseline is also evaluated at other checkpoints, and arms of claims at equal progress with limiters.
         """
-        evaluations = {arm: 1.0}
+        evaluations: dict[str, float | None] = {arm: None}
         if arm == self.definition.baselines[0]:
-            evaluations[self.rule_evaluation] = 1.0
+            evaluations[self.rule_evaluation] = None
         if any(claim.at_equal_progress and arm in (claim.arm, claim.reference) for claim in self.claims):
-            evaluations |= {self.slower(arm, speed): speed for speed in self.definition.speeds}
+            evaluations |= {self.slower(arm, share): share for share in self.definition.limiters}
         return evaluations
 
-    def slower(self, arm: str, speed: float) -> str:
-        """Return the name of an arm's evaluation at a lower speed."""
-        return f"{arm}_at_{speed:g}"
+    def slower(self, arm: str, share: float) -> str:
+        """Return the name of an arm's evaluation with a speed limiter."""
+        return f"{arm}_at_{share:g}"
 
     @property
     def rule_evaluation(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 Values = Float[np.ndarray, "_ scenario"]
-#: Values of a driver by scale of its speed and metric, a row per seed.
+#: Values of a driver by speed limiter (share of the speed limit; 1: none) and metric, a row per seed.
 BySpeed = Mapping[float, Mapping[str, Values]]
 
 
@@ -28,12 +28,12 @@ class EqualProgress:
     Attributes:
         values: Values of the first and the second driver, NaN where a metric is undefined at any speed.
         slower: Which of them drives slower: 0 or 1.
-        scale: Scale of its speed, interpolated.
+        share: Its speed limiter, interpolated.
     """
 
     values: tuple[Values, Values]
     slower: int
-    scale: float
+    share: float
 
 
 def match_progress(
@@ -69,7 +69,7 @@ def match_progress(
     upper, lower = speeds[below - 1 : below + 1]
     high, low = progress[faster][upper], progress[faster][lower]
     range_of_progress = (high - low) or 1.0
-    share = (high - target) / range_of_progress
+    mix = (high - target) / range_of_progress
     of_upper, of_lower = (drivers[faster][speed] for speed in (upper, lower))
     slope = (mean(of_upper[metric]) - mean(of_lower[metric])) / range_of_progress
 
@@ -77,7 +77,7 @@ def match_progress(
         values = episodes[metric] - slope * (episodes["progress_ratio"] - target)
         return np.where(is_defined, values, np.nan)
 
-    mixed = (1.0 - share) * adjusted(of_upper) + share * adjusted(of_lower)
+    mixed = (1.0 - mix) * adjusted(of_upper) + mix * adjusted(of_lower)
     other = adjusted(drivers[1 - faster][1.0])
-    scale = upper + share * (lower - upper)
-    return EqualProgress((other, mixed) if faster else (mixed, other), faster, scale)
+    share = upper + mix * (lower - upper)
+    return EqualProgress((other, mixed) if faster else (mixed, other), faster, share)

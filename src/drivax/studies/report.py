@@ -139,7 +139,7 @@ def _claim_row(result: Mapping[str, Any]) -> tuple[str, ...]:
     if claim.get("margin") is not None:
         words += f" (margin {claim['margin']:g})"
     if slower is not None:
-        words += f" ({slower[0]} at {slower[1]:.2f} of its speed)"
+        words += f" ({slower[0]} at {slower[1]:.2f} of the speed limit)"
     return (
         words,
         _label(claim["metric"]),

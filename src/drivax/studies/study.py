@@ -380,13 +380,13 @@ def _train_and_evaluate_arm(job: Job) -> float:
     train(config, training, run, validation=_validation(study), resume=bool(steps), overwrite=not steps)
     test = ScenarioSet.open(study.test)
     bank = ScenarioBank.from_scenarios([test[0]])
-    for name, speed in study.evaluations(job.arm).items():
+    for name, limiter in study.evaluations(job.arm).items():
         folder = study.evaluation(name, job.seed)
         if not folder.is_dir():
             step = _best_step(job) if name == study.rule_evaluation else None
             planner, task = load_policy(run, bank, step=step, trust=settings.modules_of(config))
             planner_name = str(run) if step is None else f"{run}@{step}"
-            run_evaluation(EvaluationConfig(planner_name, task=task, speed=speed), planner, test, folder)
+            run_evaluation(EvaluationConfig(planner_name, task=task, limiter=limiter), planner, test, folder)
     return time.perf_counter() - start
 
 
@@ -465,13 +465,13 @@ def _results(
         episodes[name] = {metric: table.metrics[metric][None] for metric in metrics}
     episodes |= {arm: _episodes(study, arm) for arm in study.arms}
     slower = {
-        arm: {speed: _episodes(study, study.slower(arm, speed)) for speed in definition.speeds}
+        arm: {share: _episodes(study, study.slower(arm, share)) for share in definition.limiters}
         for arm in study.arms
         if len(set(study.evaluations(arm).values())) > 1
     }
     baseline, groups = definition.baselines[0], event_groups(test.entries)
     tested = episodes | {
-        study.slower(arm, speed): values for arm in slower for speed, values in slower[arm].items()
+        study.slower(arm, share): values for arm in slower for share, values in slower[arm].items()
     }
     weights = {
         name: arm.weigh(data, tables.__getitem__, study.config.weights, usable)

@@ -134,7 +134,7 @@ class ClaimResult:
         adjusted_p: P-value adjusted within the group (Holm).
         verdict: The verdict.
         needed: What would decide an undecided claim if the estimated effect is true, or why it cannot be tested.
-        slower_arm: For a claim at equal progress, the arm that drives slower, and the scale of its speed.
+        slower_arm: For a claim at equal progress, the arm that drives slower, and its speed limiter.
     """
 
     claim: Claim
@@ -168,7 +168,7 @@ def decide_claims(
 ) -> list[ClaimResult]:  # fmt: skip
     """Test every claim on the values of all arms, with p-values adjusted within its group (Holm).
 
-    ``slower`` has the values of arms at lower speeds, by scale, for claims at equal progress.
+    ``slower`` has the values of arms with a speed limiter, by its share, for claims at equal progress.
     """
     results = [_effects(claim, episodes, strata, slower or {}) for claim in claims]
     groups = [claim.group for claim in claims]
@@ -199,7 +199,7 @@ def _effects(
                 result, needed=f"{names[error.faster]} makes more progress even at its lowest speed"
             )
         arm, reference = matched.values
-        result = replace(result, slower_arm=(names[matched.slower], matched.scale))
+        result = replace(result, slower_arm=(names[matched.slower], matched.share))
     if not strata.is_comparable(np.concatenate([arm, reference]), weights):
         return result
     difference = crossed_difference(arm, reference, strata.recordings, weights)
