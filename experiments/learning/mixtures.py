@@ -102,7 +102,10 @@ def compute_results(runs: Path) -> dict[str, Any]:
     best = dict.fromkeys(max(means, key=lambda name: means[name][m]["mean"] or 0.0) for m in METRICS[:2])
     policies = {}
     for mixture in MIXTURES:
-        seeds_of = {name: sorted((runs / "evaluated" / mixture / name).glob("seed-*")) for name in ALGORITHMS}
+        seeds_of = {
+            name: sorted((runs / "evaluated" / mixture / name).glob("seed-*"))
+            for name in ALGORITHMS_OF[mixture]
+        }
         episodes = {name: _episodes(seeds) for name, seeds in seeds_of.items() if len(seeds) == SEEDS}
         for name, own in episodes.items():
             seeds = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
