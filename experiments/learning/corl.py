@@ -34,7 +34,7 @@ RESULT = RESULTS / "corl.json"
 TASK, TORQUE, STEPS = "Pendulum-v1", 2.0, 200
 #: Episodes of each controller, seeds of each program, and episodes that evaluate a policy.
 EPISODES, SEEDS, EVALUATED = 20, 3, 20
-UPDATES, BATCH, ACTIONS, RATE, GAMMA, TAU, PENALTY = 20_000, 64, 4, 3e-4, 0.99, 0.005, 10.0
+UPDATES, BATCH, ACTIONS, RATE, GAMMA, TAU, PENALTY = 10_000, 64, 4, 3e-4, 0.99, 0.005, 10.0
 Controller = Callable[[np.ndarray, np.random.Generator], float]
 
 

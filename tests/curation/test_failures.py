@@ -75,6 +75,7 @@ def test_several_evaluations_are_averaged_over_those_of_a_scenario(data, tmp_pat
         np.testing.assert_allclose(values[1], (first[1] + second[1]) / 2, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_times_to_collision_are_those_of_the_simulator(data, tmp_path):
     run = evaluated(data, IdmPlanner(), tmp_path / "run")
     motion = jnp.asarray(EpisodeTable.read(run).trajectories.ego)

@@ -122,6 +122,7 @@ TINY = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_critics_are_judged_at_the_checkpoint_that_is_loaded(data, tmp_path, monkeypatch):
     """The best is the second of three."""
     scores = iter((0.2, 0.7, 0.5))
@@ -133,6 +134,7 @@ def test_critics_are_judged_at_the_checkpoint_that_is_loaded(data, tmp_path, mon
     assert run.info["critics"] == critic_problems(rows[:2]) != critic_problems(rows)
 
 
+@pytest.mark.slow
 def test_policies_of_unhealthy_critics_are_named_so(data, tmp_path):
     """The run says it, and so do the name in tables and the report."""
     lines = []

@@ -202,6 +202,7 @@ def test_published_penalty_includes_the_logged_action(batch, policy_batch):
     assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_relative_penalty_follows_the_values(batch, policy_batch):
     learner, trained, target = build_learner(replace(CQL, penalty=0.5, relative=True))
     _, keys = step_keys(5)

@@ -82,7 +82,7 @@ def simulate(planner, bank, traffic, task=TASK):
     return jax.tree.map(lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1), steps)
 
 
-@pytest.mark.parametrize("traffic", ["log", "idm"])
+@pytest.mark.parametrize("traffic", ["log", pytest.param("idm", marks=pytest.mark.slow)])
 def test_drives_equal_those_in_the_simulator_of_the_training(data, tmp_path, traffic):
     """The evaluation measured other facts and did not end at failures; rewards and ends are those of the training."""
     run = record(ConstantVelocity(), data, tmp_path / "run", traffic)
