@@ -128,8 +128,24 @@ class Held:
         return action, (inner_carry, action)
 
 
+class _Wrapper:
+    """Base of planners that change the actions of another one."""
+
+    planner: Any
+
+    @property
+    def actions(self) -> ActionSpace:
+        """Action space of the planner, if it has one of its own."""
+        return self.planner.actions
+
+    @property
+    def prepare(self) -> Any:
+        """Preparation of the planner, if it needs one."""
+        return self.planner.prepare
+
+
 @record
-class Noisy:
+class Noisy(_Wrapper):
     """A planner with noise on its actions: Gaussian, with a correlation time of one second, independent by component.
 
     Attributes:
@@ -145,16 +161,6 @@ class Noisy:
     def name(self) -> str:
         """Name of the planner, with the deviation."""
         return f"{self.planner.name} (noise {self.deviation:g})"
-
-    @property
-    def actions(self) -> ActionSpace:
-        """Action space of the planner, if it has one of its own."""
-        return self.planner.actions
-
-    @property
-    def prepare(self) -> Any:
-        """Preparation of the planner, if it needs one."""
-        return self.planner.prepare
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[Any, Action]:
         """Return the planner's carry, and the first noise."""
@@ -191,7 +197,7 @@ def add_noise(planner: Planner, deviation: float) -> Planner:
 
 
 @record
-class SpeedLimited:
+class SpeedLimited(_Wrapper):
     """A planner that a speed limiter slows down: it perceives and decides as before, and brakes as strongly.
 
     The limiter lowers the acceleration towards a share of the speed limit of the driven lane within a second, and
@@ -212,16 +218,6 @@ class SpeedLimited:
     def name(self) -> str:
         """Name of the planner, with the share."""
         return f"{self.planner.name} (limit x {self.share:g})"
-
-    @property
-    def actions(self) -> ActionSpace:
-        """Action space of the planner, if it has one of its own."""
-        return self.planner.actions
-
-    @property
-    def prepare(self) -> Any:
-        """Preparation of the planner, if it needs one."""
-        return self.planner.prepare
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
         """Return the planner's carry."""
