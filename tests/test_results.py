@@ -233,6 +233,13 @@ def test_td3_bc_beats_clones_and_drivers_of_the_mixture(stored):
     assert {"bc", "filtered_bc", "pdm"} <= best["differences"].keys()
 
 
+def test_cql_page_quotes_the_comparison_with_corl(stored, repository):
+    page, result = (repository / "docs" / "algorithms" / "cql.md").read_text(), stored("corl")
+    for name, label in (("drivax", "our CQL"), ("corl", "CORL's code")):
+        assert f"| {label} | {', '.join(map(str, result[name]['returns']))} |" in page
+    assert ", ".join(str(result["data"][name]["mean"]) for name in ("random", "medium", "good")) in page
+
+
 def test_curation_and_planners_share_the_test_set(stored):
     assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
 
