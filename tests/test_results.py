@@ -226,10 +226,15 @@ def test_mixtures_page_shows_stored_results(script, stored):
             assert difference["success"]["mean"] == pytest.approx(expected, abs=1e-9)
 
 
-def test_td3_bc_beats_clones_and_drivers_of_the_mixture(stored):
+def test_td3_bc_beats_clones_and_drivers_of_the_mixture(script, stored):
     """The claim of the page: better success than both clones and than the best drivers, with healthy critics."""
     best = stored("mixtures")["policies"]["mixed/td3_bc"]
-    assert all(difference["success"]["low"] > 0.0 for difference in best["differences"].values())
+    page = " ".join(script("learning.mixtures").PAGE.read_text().split())
+    for difference in best["differences"].values():
+        assert "{mean:.3f} [{low:.3f}, {high:.3f}]".format(**difference["success"]) in page
+        assert "{mean:.3f}".format(**difference["vmax_score"]) in page
+    for metric in ("success", "vmax_score"):
+        assert all(difference[metric]["low"] > 0.0 for difference in best["differences"].values())
     assert {"bc", "filtered_bc", "pdm"} <= best["differences"].keys()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -357,6 +357,11 @@ class Study:
     def test(self) -> Path:
         """The scenario set of the test."""
         return inside(self.folder, "test")
+
+    @cached_property
+    def test_hash(self) -> str:
+        """Hash of the test, which must exist."""
+        return ScenarioSet.open(self.test, verify=False).hash
 
     @property
     def results(self) -> Path:

@@ -355,7 +355,7 @@ def _check_tested(study: Study, folder: Path) -> None:
     """Check that an evaluation is of the study's test set, if that exists."""
     if study.test.is_dir():
         tested = RunFolder.open(folder).info["data"][0]["hash"]
-        if tested != ScenarioSet.open(study.test, verify=False).hash:
+        if tested != study.test_hash:
             raise UsageError("is of another test set", file=folder, cure="remove it, and run the study again")
 
 
