@@ -549,6 +549,11 @@ def test_the_whole_study(data, tmp_path, in_process, capsys, monkeypatch):
     assert main([*arguments, "--anyway"]) == 2
     assert "was trained with other settings, weights or episodes" in capsys.readouterr().err
     write_sealed(run, info)
+    tested = json.loads(evaluation.read_text())
+    write_sealed(evaluation, tested | {"data": [tested["data"][0] | {"hash": "0" * 64}]})
+    assert main([*arguments, "--anyway"]) == 2
+    assert "is of another test set" in capsys.readouterr().err
+    write_sealed(evaluation, tested)
     old = json.loads(evaluation.read_text()) | {"started": "2020-01-01T00:00:00+00:00"}
     write_sealed(evaluation, old)
     assert main([*arguments, "--anyway"]) == 2
@@ -572,6 +577,17 @@ claims:
   - {words: td3_bc collides less, arm: td3_bc, reference: bc, group: first, at_equal_progress: true}
   - {words: td3_bc does not collide more, arm: td3_bc, reference: bc, group: first, margin: 0.1}
 """
+
+
+def test_a_set_of_one_recording_needs_a_validation_set(tmp_path, capsys):
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(assemble(straight_road([car(), car(x=30.0, speed=8.0)]), SMALL))
+    file, data = tmp_path / "own.yaml", str(tmp_path / "set")
+    file.write_text(RECORDED)
+    call = ["study", str(file), "--data", data, "--test", data, "--episodes", str(tmp_path / "none")]
+    assert main([*call, "--out", str(tmp_path / "study")]) == 2
+    assert "all scenarios are of one recording, so none can be held out; pass" in capsys.readouterr().err
+    assert not (tmp_path / "study").exists()
 
 
 @pytest.mark.slow
