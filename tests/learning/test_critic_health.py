@@ -82,10 +82,11 @@ def test_returns_to_go_against_plain_loops():
         assert result[row, step] == pytest.approx(expected, rel=1e-4)
 
 
-def rows(td_error=(1.0, 0.5, 0.3, 0.2), q_error=0.2, q_rank=0.8, entropy=-2.0):
+def rows(td_error=(1.0, 0.5, 0.3, 0.2), q_error=0.2, q_rank=0.8, entropy=-2.0, failures=0.3):
     """The log of a run of as many iterations as TD errors."""
     last = {"validation/q_error": q_error, "validation/q_rank": q_rank}
-    logs = [{"loss/critic": error, "loss/entropy": entropy} for error in td_error]
+    shared = {"loss/entropy": entropy, "sampler/failures": failures}
+    logs = [{"loss/critic": error} | shared for error in td_error]
     return [*logs[:-1], logs[-1] | last]
 
 
@@ -97,6 +98,7 @@ def rows(td_error=(1.0, 0.5, 0.3, 0.2), q_error=0.2, q_rank=0.8, entropy=-2.0):
         ({"q_rank": 0.3}, "Q has a rank correlation of 0.30 with the returns of held-out episodes"),
         ({"q_error": float("nan")}, "Q is off by nan standard deviations"),
         ({"q_rank": float("nan")}, "Q has a rank correlation of nan"),
+        ({"failures": 0.012}, "1.2% of the episodes fail, too few to learn what failures cost"),
         ({"entropy": -0.9}, "the entropy is -0.90, its target -2.00"),
     ],
 )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from jax.flatten_util import ravel_pytree
 from scipy import special
 
 from drivax import settings
@@ -17,7 +18,7 @@ from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.iql import IqlConfig
-from drivax.learning.algorithms.offline import read_statistics
+from drivax.learning.algorithms.offline import PolicyBatch, read_statistics
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
@@ -60,7 +61,7 @@ def batch():
 @pytest.fixture(scope="module")
 def policy_batch(batch):
     """Other steps, to improve the policy at."""
-    return {"pendulum": 0.5 - batch.observation["pendulum"]}, -batch.action
+    return PolicyBatch({"pendulum": 0.5 - batch.observation["pendulum"]}, -batch.action)
 
 
 def build_learner(config):
@@ -242,7 +243,7 @@ def test_iql_against_numpy(min_q_weight, batch, policy_batch):
             "q": learner.q_values(trained["critic"], batch.observation, batch.action),
             "value": learner._value(trained["value"], batch.observation),
             "then": learner._value(trained["value"], batch.next_observation),
-            "there": learner.q_values(target["critic"], *policy_batch),
+            "there": learner.q_values(target["critic"], *policy_batch[:2]),
             "value_there": learner._value(trained["value"], policy_batch[0]),
             "log_prob": policy.log_prob(jnp.arctanh(policy_batch[1])),
         }
@@ -283,7 +284,7 @@ def test_awac_against_numpy(min_q_weight, batch, policy_batch):
         return {
             "target": learner.q_values(target["critic"], batch.next_observation, then),
             "q": learner.q_values(trained["critic"], batch.observation, batch.action),
-            "logged": learner.q_values(trained["critic"], *policy_batch),
+            "logged": learner.q_values(trained["critic"], *policy_batch[:2]),
             "own": learner.q_values(trained["critic"], policy_batch[0], own),
             "log_prob": there.log_prob(jnp.arctanh(policy_batch[1])),
         }
@@ -309,7 +310,7 @@ def test_advantages_of_logged_returns(config, batch):
     learner, trained, target = build_learner(config)
     hindsight, *_ = build_learner(replace(config, advantage="return"))
     (next_keys, policy_keys), keys = step_keys(2)
-    own = batch.observation, batch.action
+    own = PolicyBatch(batch.observation, batch.action)
     before, logs = (losses(each, trained, target, batch, own, keys)[1] for each in (learner, hindsight))
 
     @jax.jit
@@ -348,7 +349,7 @@ def test_n_step_returns_end_with_the_episode():
     table = Table(*map(jnp.asarray, (seen, np.zeros((2, 6, 1)), reward, terminated, truncated, usable)))
     learner = replace(IQL, steps=3, batch=256).build(Logged(), table, 1)
     experience = training_data(learner.config, Logged(), table, None)
-    drawn, _ = jax.jit(learner._draw)(experience, jax.random.key(0))
+    drawn, *_ = jax.jit(learner._draw)(experience, jax.random.key(0))
     places = np.asarray(drawn.observation["pendulum"])[:, 0].astype(int)
     assert sorted(set(places)) == [0, 1, 2, 3, 4, 6, 7, 8]
     for number, place in enumerate(places):
@@ -425,6 +426,45 @@ def test_every_loss_reaches_its_own_parameters_only(config, batch, policy_batch)
         )  # fmt: skip
     for name in set(trained) - {"policy", "critic"}:
         assert largest(result["total"][name]) > 0.0, name
+
+
+@pytest.mark.parametrize(
+    "config", [replace(CQL, imitation=0.5), IQL, AWAC, TD3_BC], ids=["cql", "iql", "awac", "td3"]
+)
+def test_policy_without_guidance_does_not_depend_on_critics(config, batch, policy_batch):
+    learner, trained, target = build_learner(config)
+    others = [name for name in trained if name in ("critic", "value")]
+    changed = trained | {name: jax.tree.map(lambda leaf: leaf + 0.3, trained[name]) for name in others}
+
+    @jax.jit
+    def slope(trained, guidance):
+        def loss(policy):
+            own = policy_batch._replace(guidance=guidance)
+            return learner.loss(trained | {"policy": policy}, target, batch, own, step_keys(1)[1])[0]
+
+        return ravel_pytree(jax.grad(loss)(trained["policy"]))[0]
+
+    imitation = slope(trained, jnp.zeros(COUNT))
+    assert jnp.abs(imitation).max() > 1e-3
+    np.testing.assert_allclose(slope(changed, jnp.zeros(COUNT)), imitation, atol=1e-6)
+    assert jnp.abs(slope(changed, jnp.ones(COUNT)) - slope(trained, jnp.ones(COUNT))).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("config", "cloning"),
+    [(TD3_BC, {"q_weight": 0.0}), (AWAC, {"inverse_temperature": 0.0})],
+    ids=["td3", "awac"],
+)
+def test_policy_only_imitates_without_failures(bandit, config, cloning):
+    """One episode in 25 fails, or one in 10."""
+    config = replace(config, updates=5, needs_failures=True)
+    for failures, same in ((20, replace(config, **cloning)), (50, replace(config, needs_failures=False))):
+        fails = jnp.arange(len(bandit.terminated))[:, None] < failures
+        data = replace(bandit, terminated=bandit.terminated & fails, truncated=bandit.terminated & ~fails)
+        _, state, logs = train_learner(config, data, iterations=2)
+        assert logs["sampler/failures"] == pytest.approx(failures / 500)
+        _, expected, _ = train_learner(same, data, iterations=2)
+        jax.tree.map(np.testing.assert_array_equal, state.parameters, expected.parameters)
 
 
 def train_learner(config, data, iterations=20, weights=None):
@@ -531,6 +571,7 @@ def test_impossible_settings_are_refused():
         (partial(CqlConfig, actions=0), "actions is 0; use 1 or more"),
         (partial(CqlConfig, backup_actions=0), "backup_actions is 0"),
         (partial(CqlConfig, relative=True, gap=1.0), "a gap replaces the weight of the penalty"),
+        (partial(CqlConfig, needs_failures=True), "needs a policy that imitates; use imitation above 0"),
         (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0, .*; use more than 0, or no gap"),
         (partial(Td3BcConfig, delay=0), "delay is 0; use 1 or more"),
         (partial(CqlConfig, steps=0), "steps is 0; use 1 or more"),

@@ -29,6 +29,8 @@ MOST_Q_ERROR = 0.5
 LEAST_Q_RANK = 0.5
 #: Largest mean TD error of the last quarter of a run relative to the quarter before it.
 MOST_TD_RISE = 1.05
+#: Least share of episodes that end in a failure: with fewer, nothing tells critics what failures cost.
+LEAST_FAILURES = 0.05
 #: Largest distance of the entropy from its target over the last quarter of a run, nats.
 MOST_ENTROPY_ERROR = 0.5
 
@@ -96,6 +98,9 @@ def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None =
     problems, errors, ranks = [], _column(rows, "validation/q_error"), _column(rows, "validation/q_rank")
     if not len(errors) or not len(ranks):
         return None
+    failures = _column(rows, "sampler/failures")
+    if len(failures) and not failures[-1] >= LEAST_FAILURES:
+        problems.append(f"{failures[-1]:.1%} of the episodes fail, too few to learn what failures cost")
     td_error = _column(rows, "loss/critic")
     before, last = (td_error[len(td_error) * k // 4 : len(td_error) * (k + 1) // 4] for k in (2, 3))
     if len(before) and not last.mean() <= MOST_TD_RISE * before.mean():

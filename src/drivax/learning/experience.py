@@ -155,6 +155,7 @@ class Experience:
         uniform: Sampler that draws usable steps, of all episodes, with equal probability.
         critic: Sampler of steps for policy evaluation.
         policy: Sampler of steps for policy improvement; None: that of the critic.
+        failures: Share of the critic's episodes that end in a failure.
     """
 
     data: Any
@@ -162,12 +163,14 @@ class Experience:
     usable: Bool[Array, "M T"]
     uniform: Sampler
     critic: Sampler
+    failures: Float[Array, ""]
     policy: Sampler | None = None
 
     def sizes(self) -> dict[str, Float[Array, ""]]:
-        """Return effective sample sizes to log."""
+        """Return effective sample sizes and the share of failures, to log."""
         samplers = {"critic": self.critic, "policy": self.policy or self.critic}
-        return {f"sampler/{name}_effective": sampler.effective for name, sampler in samplers.items()}
+        effective = {f"sampler/{name}_effective": sampler.effective for name, sampler in samplers.items()}
+        return effective | {"sampler/failures": self.failures}
 
 
 @dataclass(frozen=True)
@@ -216,8 +219,16 @@ class ExperienceConfig:
         if weights is not None:
             of_policy = sampler(np.asarray(usable) * _weights_of_logs(weights, expert))
         if self.weighted == "all" or of_policy is uniform:
-            return Experience(data, expert, usable, uniform, of_policy)
-        return Experience(data, expert, usable, uniform, uniform, of_policy)
+            return Experience(data, expert, usable, uniform, of_policy, _share_of_failures(expert, usable))
+        return Experience(
+            data, expert, usable, uniform, uniform, _share_of_failures(expert, expert.usable), of_policy
+        )
+
+
+def _share_of_failures(expert: ExpertSteps, usable: Bool[Array, "M T"]) -> Float[Array, ""]:
+    """Return the share of episodes that end in a failure, out of those with a usable step."""
+    failed = (expert.terminated & expert.usable).any(axis=1)
+    return jnp.mean(failed, where=usable.any(axis=1))
 
 
 def _has_high_return(expert: ExpertSteps, usable: Bool[Array, "M T"], share: float) -> Bool[np.ndarray, " M"]:

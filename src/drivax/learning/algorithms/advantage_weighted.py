@@ -61,11 +61,11 @@ class AdvantageWeighted(Offline[Config]):
         self, trained: Trained, policy_batch: PolicyBatch, advantage: Float[Array, " B"]
     ) -> tuple[Array, dict[str, Array]]:
         """Return the imitation loss, and values to log, given the advantages of the logged actions."""
-        config, (observation, expert) = self.config, policy_batch
+        config, (observation, expert, guidance) = self.config, policy_batch
         if config.relative:
             centred = advantage - mean_over_devices(advantage)
             advantage = advantage / jnp.maximum(jnp.sqrt(mean_over_devices(centred**2)), _LEAST_DEVIATION)
-        weights = advantage_weights(advantage, config.inverse_temperature, config.largest_weight)
+        weights = advantage_weights(guidance * advantage, config.inverse_temperature, config.largest_weight)
         policy = self.distribution(trained["policy"], observation)
         error = policy.mode() - expert
         is_mse = config.loss == "mse"

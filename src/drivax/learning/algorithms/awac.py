@@ -44,7 +44,7 @@ class Awac(AdvantageWeighted[AwacConfig]):
         next_value = self.q_value(target["critic"], batch.next_observation, next_action)
         critic_loss, q = self.critic_loss(trained, batch, next_value)
 
-        observation, expert = policy_batch
+        observation, expert, _ = policy_batch
         policy = self.distribution(parameters, observation)
         actions = jnp.stack([expert, policy.action(sample_each(policy, policy_keys))])
         if self.config.advantage == "return":

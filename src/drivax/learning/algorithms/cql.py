@@ -79,6 +79,9 @@ class CqlConfig(OfflineConfig):
         check_at_most(self, MOST_ACTIONS, "actions", "backup_actions")
         check_above_zero(self, "temperature", "penalty_temperature")
         check_at_least(self, 0, "penalty", "imitation", "penalty_rate", "temperature_rate")
+        if self.needs_failures and self.imitation == 0.0:
+            problem = "needs_failures needs a policy that imitates"
+            raise UsageError(problem, cure="use imitation above 0, or leave out needs_failures")
         if self.gap is not None and self.penalty == 0.0:
             problem = "penalty is 0, from which the multiplier of a gap cannot start"
             raise UsageError(problem, cure="use more than 0, or no gap")
@@ -185,13 +188,13 @@ class Cql(Offline[CqlConfig]):
     def _policy_loss(
         self, trained: Trained, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
-        observation, expert = policy_batch
+        observation, expert, guidance = policy_batch
         actor = self.soft_actor(trained, observation, self.target_entropy, keys)
         error = actor.policy.mode() - expert
         total = jnp.mean(actor.loss)
         if self.config.imitation:
             mean_q = mean_over_devices(jnp.abs(jnp.min(actor.q_values, axis=0)))
-            scaled = jnp.mean(scaled_policy_loss(actor.loss, mean_q))
+            scaled = jnp.mean(guidance * scaled_policy_loss(actor.loss, mean_q))
             total = scaled + self.config.imitation * jnp.mean(error**2)
         return total + actor.temperature_loss, actor.logs | {
             "policy": total,

@@ -59,7 +59,7 @@ class Iql(AdvantageWeighted[IqlConfig]):
         self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, keys: Array
     ) -> tuple[Array, dict[str, Array]]:
         """Return the sum of expectile regression, the critics' loss, and advantage-weighted imitation."""
-        (observation, expert), parameters = policy_batch, target["critic"]
+        (observation, expert, _), parameters = policy_batch, target["critic"]
         target_q = self.q_value(parameters, batch.observation, batch.action)
         value = self._value(trained["value"], batch.observation)
         value_loss = jnp.mean(expectile_loss(target_q - value, self.config.expectile))

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ from drivax.learning.algorithms.off_policy import (
 )
 from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam, mean_gradients
-from drivax.learning.critic_health import critic_problems, policy_returns, returns_to_go
+from drivax.learning.critic_health import LEAST_FAILURES, critic_problems, policy_returns, returns_to_go
 from drivax.learning.driving import Driving
 from drivax.learning.environment import Environment
 from drivax.learning.experience import (
@@ -89,6 +89,8 @@ class OfflineConfig:
             (true), or as in a file that ``drivax inspect --observations --json`` wrote (its path; to resume, it must
             still be there).
         fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
+        needs_failures: Let critics guide the policy only if enough of their episodes end in a failure
+            (:data:`~drivax.learning.critic_health.LEAST_FAILURES`); otherwise the policy only imitates.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -106,6 +108,7 @@ class OfflineConfig:
     gradient_norm: float = 10.0
     normalise: bool | str = False
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
+    needs_failures: bool = False
 
     #: Former key.
     renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
@@ -157,8 +160,20 @@ class OfflineState:
 
 
 Config = TypeVar("Config", bound=OfflineConfig)
-#: Observations of the steps for policy improvement, and the expert's actions.
-PolicyBatch = tuple[dict[str, Array], Float[Array, "B D"]]
+
+
+class PolicyBatch(NamedTuple):
+    """Steps for policy improvement.
+
+    Attributes:
+        observation: Their observations.
+        action: The expert's actions.
+        guidance: Factor of what the policy learns from critics, 0 if it only imitates.
+    """
+
+    observation: dict[str, Array]
+    action: Float[Array, "B D"]
+    guidance: Float[Array, " B"] | float = 1.0
 
 
 class Offline(OffPolicy[Config]):
@@ -236,26 +251,30 @@ class Offline(OffPolicy[Config]):
         """Return values to log, and the gradient of :meth:`loss`; ``batch`` is a result of :meth:`_draw`, and keys."""
 
         def loss(trained: Trained, samples: Any) -> tuple[Array, dict[str, Array]]:
-            transitions, policy_batch, keys = samples
-            if policy_batch is None:
-                policy_batch = transitions.observation, transitions.action
+            transitions, policy_steps, guidance, keys = samples
+            observation, action = policy_steps or (transitions.observation, transitions.action)
+            policy_batch = PolicyBatch(observation, action, 1.0 if guidance is None else guidance)
             return self.loss(trained, target, transitions, policy_batch, keys)
 
         # In a single chunk, because losses may be scaled by a mean over the batch.
         return mean_gradients(loss, trained, jax.tree.map(lambda leaf: leaf[None], batch))
 
-    def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch | None]:
-        """Draw the steps for policy evaluation, and those for policy improvement (None: the same)."""
+    def _draw(
+        self, data: Experience, key: Array
+    ) -> tuple[Transitions, tuple[dict[str, Array], Array] | None, Array | None]:
+        """Draw the steps for policy evaluation, and those for policy improvement (None: the same); and the guidance."""
         environment, count = require_log(self.environment), (self.config.batch,)
+        is_guided = (data.failures >= LEAST_FAILURES).astype(jnp.float32)
+        guidance = jnp.broadcast_to(is_guided, count) if self.config.needs_failures else None
         critic_key, policy_key = jax.random.split(key)
         index = sample_steps(data.critic, critic_key, count)
         observe = partial(transitions, environment, gamma=self.config.gamma, steps=self.config.steps)
         batch = map_over_devices(observe, data, index)
         if data.policy is None:
-            return batch, None
+            return batch, None, guidance
         index = sample_steps(data.policy, policy_key, count)
         observation, action, _ = map_over_devices(partial(expert_actions, environment), data, index)
-        return batch, (observation, action)
+        return batch, (observation, action), guidance
 
     def _statistics(self, data: Experience) -> Statistics:
         """Return the feature statistics of the configured file, or over drawn steps, the same for every seed."""

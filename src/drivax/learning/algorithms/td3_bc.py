@@ -75,13 +75,13 @@ class Td3Bc(Offline[Td3BcConfig]):
         next_q = self.q_values(target["critic"], batch.next_observation, next_action)
         critic_loss, q = self.critic_loss(trained, batch, self.combine(next_q))
 
-        observation, expert = policy_batch
+        observation, expert, guidance = policy_batch
         action = self.distribution(trained["policy"], observation).mode()
         policy_q = self.q_values(jax.lax.stop_gradient(trained["critic"]), observation, action)[0]
         error = action - expert
         imitation = jnp.mean(error**2)
         scaled = scaled_policy_loss(-policy_q, mean_over_devices(jnp.abs(policy_q)))
-        policy = config.q_weight * jnp.mean(scaled) + imitation
+        policy = config.q_weight * jnp.mean(guidance * scaled) + imitation
         return critic_loss + policy, {
             "critic": critic_loss,
             "policy": policy,
