@@ -9,7 +9,14 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.curation.scores import ScoreTable
 from drivax.studies.definition import load_study
-from drivax.studies.report import events_table, rankings_table, validations_table, write_report
+from drivax.studies.report import (
+    critics_table,
+    events_table,
+    rankings_table,
+    rates_table,
+    validations_table,
+    write_report,
+)
 from drivax.studies.verdicts import compare_rankings
 
 LONGTAIL = load_study("longtail")
@@ -34,7 +41,8 @@ RESULTS = {
             "interval": None, "p": None, "adjusted": None, "change": None, "slower_arm": ["baseline", 0.84],
         },
     ],
-    "rates": {name: {"ordinary": RATE, "rare": RATE} for name in ("expert", "baseline")},
+    "rates": {name: {"ordinary": RATE, "rare": RATE} for name in ("expert", "baseline", "cql")},
+    "critics": {"bc": [None, None], "baseline": [[], []], "cql": [["Q is off", "Q < 0"], [], ["Q is off"]]},
     "events": {
         "expert": {"cut_in": RATE["collision"]},
         "baseline": dict.fromkeys(("cut_in", "below 3 m/s2"), RATE["collision"]),
@@ -83,6 +91,11 @@ def test_report_shows_the_results(page):
     assert "▲ supported" in text and "41 seeds each" in text
     assert "(baseline at 0.84 of the speed limit)" in text and text.count("of the speed limit") == 1
     assert "<h3>Events: collision</h3>" in text
+    rows = [["baseline", "2 of 2", ""], ["cql", "1 of 3", "Q is off; Q < 0"]]
+    assert [[cell.text for cell in row] for row in critics_table(RESULTS).rows] == rows
+    labels = [row[0].text for row in rates_table(RESULTS, "ordinary").rows]
+    assert labels == ["expert", "baseline", "cql (unhealthy critics)"]
+    assert "Health of the critics" in text and "Q &lt; 0" in text
     rate = "0.123 [0.100, 0.150]"
     rows = [["expert", rate, ""], ["baseline", rate, rate]]
     assert [[cell.text for cell in row] for row in events_table(RESULTS).rows] == rows

@@ -622,6 +622,7 @@ def test_a_study_on_recorded_episodes(data, tmp_path, in_process, capsys):
     assert slower in ("bc", "td3_bc") and 0.4 <= share <= 1.0
     assert margin["slower_arm"] is None and margin["claim"]["margin"] == 0.1
     assert results["rates"]["bc_at_0.4"]["common"]["progress_ratio"]["mean"] < 0.9
+    assert results["critics"]["bc"] == [None, None] and all(results["critics"]["td3_bc"])
     run = RunFolder.open(out / "runs" / "bc" / "seed-0").info
     assert run["recorded_episodes"] and run["validation"]["recordings"]
     capsys.readouterr()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,8 @@ def write_report(
         "Before the comparison": _conditions(definition, results),
         "Verdicts": _verdicts(definition, results),
         "Evaluation of the arms": "".join(_rates(definition, results, stratum) for stratum in _STRATA)
-        + _events(definition, results),
+        + _events(definition, results)
+        + _critics(results),
         "Distribution of the sampling weights": draws_table(results).html(),
         "Are the methods different?": _rankings(results),
         f"Choosing checkpoints by the highest {rule}": _rule_cost(results, rule),
@@ -155,8 +157,12 @@ def rates_table(results: Results, stratum: Stratum) -> Table:
     """Return the means of every arm in a stratum of scenarios."""
     arms = {name: rates[stratum] for name, rates in results["rates"].items() if stratum in rates}
     metrics = list(dict.fromkeys(metric for rates in arms.values() for metric in rates))
+    unhealthy = {arm for arm, seeds in results.get("critics", {}).items() if any(seeds)}
     rows = [
-        (name, *(_rate(rates[metric]) if metric in rates else "" for metric in metrics))
+        (
+            f"{name} (unhealthy critics)" if name in unhealthy else name,
+            *(_rate(rates[metric]) if metric in rates else "" for metric in metrics),
+        )
         for name, rates in arms.items()
     ]
     return _table("dense", ("arm", *map(_label, metrics)), rows)
@@ -176,6 +182,24 @@ def events_table(results: Results) -> Table:
         if rates
     ]
     return _table("dense", ("arm", *groups), rows)
+
+
+def critics_table(results: Results) -> Table:
+    """Return the number of seeds with healthy critics of each arm that has any, and what is wrong with the others."""
+    checked = {
+        arm: [problems for problems in seeds if problems is not None]
+        for arm, seeds in results.get("critics", {}).items()
+    }
+    rows = [
+        (
+            arm,
+            f"{sum(not problems for problems in seeds)} of {len(seeds)}",
+            "; ".join(dict.fromkeys(chain(*seeds))),
+        )
+        for arm, seeds in checked.items()
+        if seeds
+    ]
+    return _table("claims", ("arm", "healthy critics", "problems of the others"), rows)
 
 
 def draws_table(results: Results) -> Table:
@@ -276,6 +300,13 @@ def _events(definition: StudyDefinition, results: Results) -> str:
     """Return the section of kinds and severities of events, empty without labels."""
     table = events_table(results)
     return f"<h3>Events: {escape(_label(definition.metrics[0]))}</h3>{table.html()}" if table.rows else ""
+
+
+def _critics(results: Results) -> str:
+    """Return the section of the critics' checks, empty without any."""
+    table = critics_table(results)
+    note = "<p><small>An arm is called unhealthy if the critics of one of its seeds fail a check.</small></p>"
+    return f"<h3>Health of the critics</h3>{table.html()}{note}" if table.rows else ""
 
 
 def _rankings(results: Results) -> str:

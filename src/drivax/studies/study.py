@@ -491,6 +491,12 @@ def _results(
         "events": {
             name: rates_of_groups(values, strata, groups, metrics[0]) for name, values in tested.items()
         },
+        "critics": {
+            arm: [
+                RunFolder.open(study.run(arm, seed)).info.get("critics") for seed in range(study.config.seeds)
+            ]
+            for arm in study.arms
+        },
         "draws": {
             name: asdict(draw_statistics(weights[name], usable, len(usable) // len(data)))
             for name in study.arms
