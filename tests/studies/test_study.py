@@ -622,7 +622,8 @@ def test_a_study_on_recorded_episodes(data, tmp_path, in_process, capsys):
     assert slower in ("bc", "td3_bc") and 0.4 <= share <= 1.0
     assert margin["slower_arm"] is None and margin["claim"]["margin"] == 0.1
     assert results["rates"]["bc_at_0.4"]["common"]["progress_ratio"]["mean"] < 0.9
-    assert results["critics"]["bc"] == [None, None] and all(results["critics"]["td3_bc"])
+    # One held-out scenario has no spread of returns to compare Q with.
+    assert results["critics"] == {"bc": [None, None], "td3_bc": [None, None]}
     run = RunFolder.open(out / "runs" / "bc" / "seed-0").info
     assert run["recorded_episodes"] and run["validation"]["recordings"]
     capsys.readouterr()
