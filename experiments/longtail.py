@@ -1,10 +1,10 @@
-"""Store and resume the long-tail study on the built-in world's benchmark.
+"""Store and resume the long-tail studies on the built-in world's benchmark.
 
-drivax study longtail --data BENCHMARK --out STUDY
-python -m experiments.longtail keep --out STUDY      (store finished parts in experiments/state/longtail)
-python -m experiments.longtail restore --out STUDY   (restore them to a new folder, where the study continues)
-python -m experiments.longtail finish --out STUDY    (write the results to experiments/results/longtail.json)
-python -m experiments.longtail table                 (write the stored results to the page)
+drivax study NAME --data BENCHMARK --out STUDY           (longtail, longtail2_screening or longtail2)
+python -m experiments.longtail keep NAME --out STUDY      (store finished parts in experiments/state/NAME)
+python -m experiments.longtail restore NAME --out STUDY   (restore them to a new folder, where the study continues)
+python -m experiments.longtail finish NAME --out STUDY    (write the results to experiments/results/NAME.json)
+python -m experiments.longtail table NAME                 (write the stored results to the page)
 
 `keep` stores each arm's run without checkpoints, its episodes, and the scores: another processor rounds differently,
 and runs trained with other weights belong to another study.
@@ -28,35 +28,41 @@ from drivax.studies import report
 from drivax.studies.definition import Stratum, Study, StudyConfig, StudySets, load_study
 from drivax.studies.study import is_evaluated
 from experiments.learning.tables import table
-from experiments.repository import DOCS, RESULTS, STATE, fetch
+from experiments.repository import DOCS, RESULTS, STATE, fetch, fill_places
 
-KEPT, RESULT = STATE / "longtail", RESULTS / "longtail.json"
-PAGE = DOCS / "results" / "longtail.md"
-BEGIN, END = "<!-- longtail.py: {} -->", "<!-- longtail.py: end -->"
-DEFINITION = load_study("longtail")
+#: Pages of the studies.
+PAGES = {
+    name: DOCS / "results" / f"{page}.md"
+    for name, page in (("longtail", "longtail"), ("longtail2_screening", "longtail2"))
+}
 #: Stored files of a run or evaluation.
 FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv", "summary.json")
 
 
-def keep(folder: Path) -> None:
+def result_file(name: str) -> Path:
+    """Return the file of a study's results."""
+    return RESULTS / f"{name}.json"
+
+
+def keep(name: str, folder: Path) -> None:
     """Store new evaluated arms, the study's own files, and scores."""
-    study = stored_study(folder)
-    KEPT.mkdir(parents=True, exist_ok=True)
-    _pack([folder], folder, KEPT / "study.tar.xz")
-    for name in DEFINITION.planners:
-        if study.evaluation(name).is_dir():
-            _pack([study.evaluation(name)], folder, KEPT / f"{name}.tar.xz")
+    study, kept = stored_study(name, folder), STATE / name
+    kept.mkdir(parents=True, exist_ok=True)
+    _pack([folder], folder, kept / "study.tar.xz")
+    for planner in study.definition.planners:
+        if study.evaluation(planner).is_dir():
+            _pack([study.evaluation(planner)], folder, kept / f"{planner}.tar.xz")
     for run in sorted((folder / "runs").glob("*/seed-*")):
         arm, seed = run.parent.name, int(run.name.removeprefix("seed-"))
-        file = KEPT / f"{arm}-{seed}.tar.xz"
+        file = kept / f"{arm}-{seed}.tar.xz"
         if not file.exists() and is_evaluated(study, arm, seed):
-            _pack([run, *(study.evaluation(name, seed) for name in study.evaluations(arm))], folder, file)
-    shutil.copytree(folder / "scores", KEPT / "scores", dirs_exist_ok=True)
+            _pack([run, *(study.evaluation(own, seed) for own in study.evaluations(arm))], folder, file)
+    shutil.copytree(folder / "scores", kept / "scores", dirs_exist_ok=True)
 
 
-def restore(folder: Path) -> None:
-    """Restore the stored study, or the study in the repository's history, to a new folder."""
-    state = fetch("benchmarks/results/longtail", KEPT)
+def restore(name: str, folder: Path) -> None:
+    """Restore the stored study to a new folder; the first study, if it is not stored, from the repository's history."""
+    state = fetch("benchmarks/results/longtail", STATE / name) if name == "longtail" else STATE / name
     folder.mkdir(parents=True)
     for file in sorted(state.glob("*.tar.xz")):
         with tarfile.open(file) as archive:
@@ -67,41 +73,45 @@ def restore(folder: Path) -> None:
         seal(file.parent, *FILES, "trajectories.npz", "crashes.json")
 
 
-def finish(folder: Path) -> None:
+def finish(name: str, folder: Path) -> None:
     """Store the results, and the number of test episodes with a collision by planner or arm and seed."""
-    study, results = stored_study(folder), json.loads((folder / "results.json").read_text())
+    study, results = stored_study(name, folder), json.loads((folder / "results.json").read_text())
     collisions = {}
-    for name in results["rates"]:
-        seeds = [None] if name in DEFINITION.planners else range(results["about"]["seeds"])
-        tables = [EpisodeTable.read(study.evaluation(name, seed)) for seed in seeds]
-        collisions[name] = [int(table.metrics["collision"].sum()) for table in tables]
-    RESULT.write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
+    for own in results["rates"]:
+        seeds = [None] if own in study.definition.planners else range(results["about"]["seeds"])
+        tables = [EpisodeTable.read(study.evaluation(own, seed)) for seed in seeds]
+        collisions[own] = [int(table.metrics["collision"].sum()) for table in tables]
+    result_file(name).write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
 
 
-def stored_study(folder: Path) -> Study:
+def stored_study(name: str, folder: Path) -> Study:
     """Return the study in a folder, without its scenario sets."""
-    return Study(DEFINITION, StudyConfig(), StudySets(folder, folder, ()), folder)
+    return Study(load_study(name), StudyConfig(), StudySets(folder, folder, ()), folder)
 
 
-def fill_page(page: str, results: dict[str, Any]) -> str:
-    """Return the page with the tables of the results."""
-    rule = DEFINITION.checkpoints_by.rpartition("/")[2]
+def fill_page(page: str, name: str, results: dict[str, Any]) -> str:
+    """Return the page with those tables of the results of a study that it has a place for."""
+    definition = load_study(name)
+    rule = definition.checkpoints_by.rpartition("/")[2]
     tables = {
         "conditions": report.conditions_table(results),
+        "critics": report.critics_table(results),
         "detectable": report.detectable_table(results),
+        "events": report.events_table(results),
         "draws": report.draws_table(results),
         "rankings": report.rankings_table(results),
         "rule cost": report.rule_cost_table(results, rule),
         "validations": report.validations_table(results, rule),
-        **{f"claims {group}": report.claims_table(results, group) for group in DEFINITION.groups},
+        **{f"claims {group}": report.claims_table(results, group) for group in definition.groups},
         **{f"rates {stratum}": report.rates_table(results, stratum) for stratum in get_args(Stratum)},
     }
-    for name, results_table in tables.items():
-        headings = [column.heading for column in results_table.columns]
-        lines = table(headings, [[cell.text for cell in row] for row in results_table.rows])
-        before, rest = page.split(BEGIN.format(name))
-        page = "\n".join([before + BEGIN.format(name), "", *lines, "", END + rest.split(END, 1)[1]])
-    return page
+    lines = {
+        f"{name} {part}": table(
+            [column.heading for column in own.columns], [[cell.text for cell in row] for row in own.rows]
+        )
+        for part, own in tables.items()
+    }
+    return fill_places(page, "longtail.py", lines)
 
 
 def _pack(folders: list[Path], study: Path, out: Path) -> None:
@@ -134,14 +144,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("keep", "restore", "finish", "table"))
+    parser.add_argument("name", choices=tuple(PAGES))
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     if args.what == "table":
-        PAGE.write_text(fill_page(PAGE.read_text(), json.loads(RESULT.read_text())))
+        page, results = PAGES[args.name], json.loads(result_file(args.name).read_text())
+        page.write_text(fill_page(page.read_text(), args.name, results))
     elif args.out is None:
         parser.error("the following arguments are required: --out")
     else:
-        {"keep": keep, "restore": restore, "finish": finish}[args.what](args.out)
+        {"keep": keep, "restore": restore, "finish": finish}[args.what](args.name, args.out)
 
 
 if __name__ == "__main__":

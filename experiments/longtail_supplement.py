@@ -1,6 +1,6 @@
 """Compute what the runs of the long-tail study show beyond its claims: critics, comparisons with BC, collisions.
 
-python -m experiments.longtail restore --out STUDY
+python -m experiments.longtail restore longtail --out STUDY
 drivax generate BENCHMARK --benchmark
 python -m experiments.longtail_supplement compute --out STUDY --data BENCHMARK
 python -m experiments.longtail_supplement page       (write the tables and the picture of the page)
@@ -32,14 +32,14 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.clusters import recordings
 from drivax.stats.seeds import crossed_difference
-from drivax.studies.definition import Stratum, Study, StudySets
+from drivax.studies.definition import Stratum, Study, StudySets, load_study
 from drivax.studies.verdicts import Strata
 from drivax.tracking.run_folder import RunFolder
 from experiments.learning.tables import interval, table
-from experiments.longtail import DEFINITION, PAGE, stored_study
-from experiments.longtail import RESULT as STUDY_RESULT
+from experiments.longtail import PAGES, result_file, stored_study
 from experiments.repository import RESULTS, save_picture
 
+DEFINITION, PAGE = load_study("longtail"), PAGES["longtail"]
 RESULT = RESULTS / "longtail_supplement.json"
 PICTURE = PAGE.parent / "longtail-critics.png"
 BEGIN, END = "<!-- longtail_supplement.py: {} -->", "<!-- longtail_supplement.py: end -->"
@@ -92,7 +92,7 @@ def _rounded(values: np.ndarray) -> list[Any]:
 
 def evaluations(study: Study) -> tuple[dict[str, Values], Strata, tuple[str, ...]]:
     """Return values ``[seed, scenario]`` by arm and metric, the strata, and the ids of the test scenarios."""
-    about = json.loads(STUDY_RESULT.read_text())["about"]
+    about = json.loads(result_file("longtail").read_text())["about"]
     metrics = ("collision", "progress_ratio")
     tables = {
         arm: [EpisodeTable.read(study.evaluation(arm, seed)) for seed in range(about["seeds"])]
@@ -301,7 +301,7 @@ def fill_page(page: str, results: Mapping[str, Any]) -> str:
 
 def compute(folder: Path, data: Path) -> dict[str, Any]:
     """Return the results of a study's folder and of the benchmark's scenarios."""
-    study, sets = stored_study(folder), StudySets.of(data, None, ())
+    study, sets = stored_study("longtail", folder), StudySets.of(data, None, ())
     episodes, strata, ids = evaluations(study)
     return {
         "critics": critic_curves(study),

@@ -266,14 +266,15 @@ def test_members_disagree_where_they_err(stored):
 @pytest.fixture
 def found(script):
     """What the long-tail study found."""
-    return json.loads(script("longtail").RESULT.read_text())
+    return json.loads(script("longtail").result_file("longtail").read_text())
 
 
 def test_longtail_page_shows_stored_results(script, found):
     longtail = script("longtail")
-    text = longtail.PAGE.read_text()
-    assert longtail.fill_page(text, found) == text, (
-        "run python -m experiments.longtail table, and read what the page says about it"
+    text = longtail.PAGES["longtail"].read_text()
+    assert "<!-- longtail.py: longtail rates rare -->" in text
+    assert longtail.fill_page(text, "longtail", found) == text, (
+        "run python -m experiments.longtail table longtail, and read what the page says about it"
     )
 
 
