@@ -5,6 +5,8 @@ python -m experiments.longtail keep NAME --out STUDY      (store finished parts 
 python -m experiments.longtail restore NAME --out STUDY   (restore them to a new folder, where the study continues)
 python -m experiments.longtail finish NAME --out STUDY    (write the results to experiments/results/NAME.json)
 python -m experiments.longtail table NAME                 (write the stored results to the page)
+python -m experiments.longtail power --out STUDY          (what a study with more seeds and events than the screening,
+                                                           STUDY, detects; stored in experiments/results)
 
 `keep` stores each arm's run without checkpoints, its episodes, and the scores: another processor rounds differently,
 and runs trained with other weights belong to another study.
@@ -19,14 +21,24 @@ import json
 import re
 import shutil
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
+from drivax.curation.methods import event_kinds
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.files import write_json
+from drivax.scenario.store import ScenarioSet
 from drivax.seal import seal
+from drivax.stats.clusters import recordings_of
+from drivax.stats.seeds import crossed_difference
 from drivax.studies import report
 from drivax.studies.definition import Stratum, Study, StudyConfig, StudySets, load_study
 from drivax.studies.study import is_evaluated
+from drivax.studies.verdicts import confidence_level
+from drivax.tracking.run_folder import versions
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, STATE, fetch, fill_places
 
@@ -35,6 +47,8 @@ PAGES = {
     name: DOCS / "results" / f"{page}.md"
     for name, page in (("longtail", "longtail"), ("longtail2_screening", "longtail2"))
 }
+#: Metric of the power, seeds of the screening, and numbers of claims that are adjusted together.
+PRIMARY, SCREENING_SEEDS, CLAIMS = "at_fault_collision", 2, (1, 6)
 #: Stored files of a run or evaluation.
 FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv", "summary.json")
 
@@ -82,6 +96,57 @@ def finish(name: str, folder: Path) -> None:
         tables = [EpisodeTable.read(study.evaluation(own, seed)) for seed in seeds]
         collisions[own] = [int(table.metrics["collision"].sum()) for table in tables]
     result_file(name).write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
+
+
+def power(folder: Path) -> None:
+    """Store the smallest differences at events that studies of several sizes detect with a power of 80 %.
+
+    Variances are means over the weighted arms of the screening, each against the uniform arm of its algorithm. Progress
+    is not matched: its errors come on top.
+    """
+    study, test = stored_study("longtail2_screening", folder), ScenarioSet.open(folder / "test")
+    rare, labels = event_kinds(test) > 0, recordings_of(test.entries)
+    uniform = {arm.preset: name for name, arm in study.arms.items() if arm.method == "uniform"}
+    values = {
+        name: np.stack(
+            [
+                EpisodeTable.read(study.evaluation(name, seed)).metrics[PRIMARY]
+                for seed in range(SCREENING_SEEDS)
+            ]
+        )
+        for name in study.arms
+    }
+    effects = [
+        crossed_difference(values[name], values[uniform[arm.preset]], labels, rare.astype(np.float64))
+        for name, arm in study.arms.items()
+        if arm.method != "uniform"
+    ]
+    mean = replace(
+        effects[0],
+        seeds=tuple(np.mean([effect.seeds for effect in effects], axis=0).tolist()),
+        scenarios=float(np.mean([effect.scenarios for effect in effects])),
+        interaction=tuple(np.mean([effect.interaction for effect in effects], axis=0).tolist()),
+    )
+    events = int(rare.sum())
+    rows = [
+        {
+            "seeds": seeds,
+            "events": events * more,
+            "detectable": [
+                mean.with_clusters(mean.clusters * more)
+                .with_seeds(seeds)
+                .detectable(confidence=confidence_level(claims))
+                for claims in CLAIMS
+            ],
+        }
+        for seeds in (2, 5, 8, 16)
+        for more in (1, 8)
+    ]
+    content = {
+        "command": "python -m experiments.longtail power --out STUDY", "metric": PRIMARY, "claims": CLAIMS,
+        "arms": len(effects), "rows": rows, "versions": versions(),
+    }  # fmt: skip
+    write_json(result_file("longtail2_power"), content)
 
 
 def stored_study(name: str, folder: Path) -> Study:
@@ -143,15 +208,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("keep", "restore", "finish", "table"))
-    parser.add_argument("name", choices=tuple(PAGES))
-    parser.add_argument("--out", type=Path)
+    commands = parser.add_subparsers(dest="what", required=True)
+    for what in ("keep", "restore", "finish", "table", "power"):
+        command = commands.add_parser(what)
+        if what != "power":
+            command.add_argument("name", choices=tuple(PAGES))
+        if what != "table":
+            command.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    if args.what == "table":
+    if args.what == "power":
+        power(args.out)
+    elif args.what == "table":
         page, results = PAGES[args.name], json.loads(result_file(args.name).read_text())
         page.write_text(fill_page(page.read_text(), args.name, results))
-    elif args.out is None:
-        parser.error("the following arguments are required: --out")
     else:
         {"keep": keep, "restore": restore, "finish": finish}[args.what](args.name, args.out)
 

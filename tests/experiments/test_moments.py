@@ -13,7 +13,7 @@ from scenes import SMALL, STEPS, car, straight_road
 
 
 def test_moments_of_one_recording_are_apart():
-    """Scenarios from the most to the least critical one: recording, window and vehicle, place, step of the highest score."""
+    """Scenarios in order of their score: recording, window and vehicle, place, step of the highest score."""
     moments = (
         ("a", "a@0/1", 0.0, 40),  # at 4.0 s
         ("a", "a@0/2", 29.0, 60),  # 2 s and 29 m from the first

@@ -162,8 +162,8 @@ def test_needed_numbers_at_their_ends():
     assert result.p < 0.05
     assert result.seeds_needed() > 5
     assert result.seeds_needed(confidence=1 - 0.05 / 30) > result.seeds_needed()
-    more = result._with_seeds(result.seeds_needed())
-    assert more.detectable() <= 0.02 < result._with_seeds(result.seeds_needed() - 1).detectable()
+    more = result.with_seeds(result.seeds_needed())
+    assert more.detectable() <= 0.02 < result.with_seeds(result.seeds_needed() - 1).detectable()
 
 
 def test_log_ratio_of_a_constant_ratio_is_exact():

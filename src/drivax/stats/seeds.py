@@ -105,11 +105,11 @@ class CrossedEffect:
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
         """Return the smallest number of seeds per policy above the present one that detects the difference, or None."""
-        return self._smallest_number(self._with_seeds, max(self.seed_counts), power, confidence)
+        return self._smallest_number(self.with_seeds, max(self.seed_counts), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
         """Return the smallest number of clusters above the present one that detects the difference, or None."""
-        return self._smallest_number(self._with_clusters, self.clusters, power, confidence)
+        return self._smallest_number(self.with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
         from scipy import special  # takes 0.1 s to import
@@ -126,7 +126,7 @@ class CrossedEffect:
         normal_quantile(confidence)  # refuses a confidence outside (0, 1)
         return self._quantile((1.0 + confidence) / 2.0)
 
-    def _with_seeds(self, number: int) -> CrossedEffect:
+    def with_seeds(self, number: int) -> CrossedEffect:
         """Extrapolate to ``number`` seeds of each policy with the same variance."""
         (a, b), (e_a, e_b) = self.seeds, self.interaction
         share_a, share_b = (count / number for count in self.seed_counts)
@@ -135,7 +135,7 @@ class CrossedEffect:
         seeds, counts = (a * share_a, b * share_b), (number, number)
         return replace(self, seeds=seeds, scenarios=scenarios, seed_counts=counts, interaction=interaction)
 
-    def _with_clusters(self, number: int) -> CrossedEffect:
+    def with_clusters(self, number: int) -> CrossedEffect:
         """Extrapolate to ``number`` clusters with the same variance."""
         (a, b), (e_a, e_b), share = self.seeds, self.interaction, self.clusters / number
         seeds = max(a - e_a, 0.0) + e_a * share, max(b - e_b, 0.0) + e_b * share
