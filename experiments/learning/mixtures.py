@@ -43,6 +43,8 @@ DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
 ALGORITHMS = ("bc", "filtered_bc", "td3_bc", "awac", "iql", "cql_bc")
 #: On the log, every scenario has one episode, so a filter changes nothing.
 ALGORITHMS_OF = {"mixed": ALGORITHMS, "expert": tuple(name for name in ALGORITHMS if name != "filtered_bc")}
+#: Further settings. Without guidance by critics TD3+BC only imitates, and updates its policy as often as cloning does.
+SETTINGS = {("expert", "td3_bc"): ("--algorithm.delay", "1")}
 METRICS = ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio")
 
 
@@ -62,7 +64,8 @@ def steps(data: Path, runs: Path) -> Iterator[tuple[Path, list[str]]]:
             # One after the other, because all cores train one seed faster than several.
             for seed in range(SEEDS):
                 folder = runs / mixture / name / f"seed-{seed}"
-                train = ["train", f"mixed/{name}", "--data", str(scenarios), "--episodes", str(episodes)]
+                train = ["train", f"mixed/{name}", *SETTINGS.get((mixture, name), ())]
+                train += ["--data", str(scenarios), "--episodes", str(episodes)]
                 yield folder, [*train, "--seed", str(seed), "--out", str(folder)]
                 out = runs / "evaluated" / mixture / name / f"seed-{seed}"
                 yield (

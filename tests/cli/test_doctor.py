@@ -136,14 +136,14 @@ WRONG = {
     "log.db": (lambda: b"SQLite format 3\0" + bytes(4096), "without nuPlan's tables", "logs of nuPlan"),
     "part-0.parquet": (lambda: b"PAR1" + bytes(99) + b"PAR1", "not named as a scenario of Argoverse 2", "motion"),
     "table.feather": (lambda: b"ARROW1\0\0" + bytes(99), "not named as annotations", "folder of the log"),
-    "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "no ScenarioNet scenario", "sd_*.pkl"),
+    "sd_x.pkl": (lambda: pickle.dumps({"id": 1}), "but not a ScenarioNet scenario", "sd_*.pkl"),
     "tfrecord-1_1.json": (
         lambda: json.dumps({"name": "x", "objects": [], "roads": []}).encode(),
         "without GPUDrive's positions", "GPUDrive's present converter"
     ),
     "log_map_archive_x.json": (lambda: b'{"lane_segments": {}}', "without its recording", "scenario_*.parquet"),
     "sample.json": (lambda: b'[{"token": "a", "scene_token": "b"}]', "a table of nuScenes", "metadata archive"),
-    "notes.json": (lambda: b'{"mine": 1}', "JSON of no data set", "as downloaded"),
+    "notes.json": (lambda: b'{"mine": 1}', "JSON of an unknown data set", "as downloaded"),
     "data.zip": (lambda: b"PK\x03\x04" + bytes(99), "zip archive", "unzip"),
     "data.tar": (lambda: bytes(257) + b"ustar" + bytes(512), "tar archive", "tar xf"),
     "array.npy": (lambda: b"\x93NUMPY\x01\0" + bytes(99), "numpy array", "name its folder"),

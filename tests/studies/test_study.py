@@ -245,8 +245,8 @@ def test_rates_by_kind_and_severity_of_events(data):
     by_kind = rates_of_groups(values, strata, kinds, "collision")
     assert list(by_kind) == ["cut_in"]  # the other kind has one recording
     assert by_kind["cut_in"]["mean"] == 0.75 and by_kind["cut_in"]["scenarios"] == 2
-    tags = [{"event": "cut_in", "severity_mps2": "2.0"}, {"event": "jaywalker", "severity_mps2": "4.0"}, {}]
-    groups = runner.event_groups([{"tags": own} for own in tags])
+    events = [{"event": "cut_in", "severity_mps2": "2.0"}, {"event": "jaywalker", "severity_mps2": "4.0"}, {}]
+    groups = runner.event_groups([{"tags": tags} for tags in events])
     assert {name: mask.tolist() for name, mask in groups.items()} == {
         "cut_in": [True, False, False], "jaywalker": [False, True, False],
         "below 3 m/s2": [True, False, False], "from 3 m/s2": [False, True, False],

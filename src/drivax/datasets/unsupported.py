@@ -44,7 +44,7 @@ _MAGIC = {
 }
 _HEAD = 1 << 16
 _MOTION = "download the motion data set (scenario/*.tfrecord-*)"
-#: Kinds of JSON files by words at their beginning, and cures.
+#: Kinds of JSON files by a pattern at their beginning, and cures.
 _JSON = {
     rb'"(objects|roads)"': (
         "JSON with objects or roads, but without GPUDrive's positions or geometries at its beginning",
@@ -58,7 +58,7 @@ _JSON = {
         "a table of nuScenes, but not scene.json with sample.json next to it",
         "unpack the whole metadata archive (v1.0-*.tgz) and name its folder",
     ),
-    rb"": ("JSON of no data set that drivax knows", "give the files of the data set as downloaded"),
+    rb"": ("JSON of an unknown data set", "give the files of the data set as downloaded"),
 }
 _INDICES = ("dataset_summary.pkl", "dataset_mapping.pkl")
 
@@ -76,14 +76,14 @@ def explain(path: Path) -> DataError:
     for magic, (problem, cure) in _MAGIC.items():
         if head[_TAR_BYTE if magic == _TAR else 0 :].startswith(magic):
             return DataError(problem, file=path, cure=cure)
-    if head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
-        problem, cure = "a pickle that is no ScenarioNet scenario", "give the sd_*.pkl files"
+    if re.match(rb"\x80[\x02-\x05]", head):
+        problem, cure = "a pickle, but not a ScenarioNet scenario", "give the sd_*.pkl files"
         if path.name in _INDICES:
             problem = "the index of a ScenarioNet database, without scenarios"
             cure = "give the folder that holds its sd_*.pkl files"
         return DataError(problem, file=path, cure=cure)
     if head.lstrip()[:1] in (b"{", b"["):
-        problem, cure = next(entry for words, entry in _JSON.items() if re.search(words, head))
+        problem, cure = next(entry for pattern, entry in _JSON.items() if re.search(pattern, head))
         return DataError(problem, file=path, cure=cure)
     return _tfrecord(path)
 

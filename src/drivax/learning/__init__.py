@@ -3,7 +3,7 @@
 - ``loop`` runs the iterations: it logs, validates, writes checkpoints, resumes. ``program`` compiles them.
 - ``algorithms`` has a module per algorithm; the terms of their losses are functions of :mod:`drivax.rl`.
 - ``environment`` collects rollouts; ``driving``, ``self_play`` and ``mixture`` are the environments.
-- ``replay`` stores the transitions of SAC, ``experience`` samples logged steps; PPO shuffles its own rollouts.
+- ``replay`` stores the transitions of SAC, ``experience`` samples minibatches of logged steps; PPO shuffles rollouts.
 - ``training_log.rank`` decides which checkpoint is the best, and ``drivax.tracking.Checkpoints`` keeps it.
 - ``policies`` loads trained policies as planners and as traffic, and exports them.
 """

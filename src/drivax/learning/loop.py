@@ -29,7 +29,7 @@ from drivax.learning.policies import find_traffic
 from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
 from drivax.learning.recorded_episodes import RecordedDriving
-from drivax.learning.stored_episodes import StoredDriving, StoredEpisodes, fit_observations
+from drivax.learning.stored_episodes import StoredDriving, StoredEpisodes, match_observations
 from drivax.learning.training_log import (
     Preempted,
     StopSignal,
@@ -306,7 +306,7 @@ def _environment(
     if isinstance(episodes, StoredEpisodes):
         if training.weights is not None:
             raise UsageError("weights of scenarios do not fit stored episodes", cure="leave out one of both")
-        stored = fit_observations(episodes, environment.shapes(bank), environment.action_size)
+        stored = match_observations(episodes, environment.shapes(bank), environment.action_size)
         return StoredDriving(environment.simulator), stored
     environment = recorded_environment(environment, episodes)
     recorded = prepare_episodes(environment, bank, data, episodes)

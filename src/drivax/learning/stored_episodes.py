@@ -112,10 +112,10 @@ def minari_folder(path: str | Path) -> Path | None:
     return next((folder for folder in folders if (folder / "metadata.json").is_file()), None)
 
 
-def fit_observations(
-    episodes: StoredEpisodes, shapes: Mapping[str, tuple[int, ...]], actions: int
+def match_observations(
+    episodes: StoredEpisodes, shapes: Mapping[str, tuple[int, ...]], action_size: int
 ) -> StoredEpisodes:
-    """Return episodes with the groups of a task's observation; empty ones, which are not stored, are added.
+    """Return the episodes with exactly the groups of a task's observation: groups of size 0, not stored, are added.
 
     Raises:
         UsageError: Groups, their shapes or the size of actions differ.
@@ -125,12 +125,12 @@ def fit_observations(
     if stored != expected:
         problem = f"observations of the episodes are {_text(stored)}, those of the task {_text(expected)}"
         raise UsageError(problem, cure="train with their observation (task.observation)")
-    if (size := episodes.steps.action.shape[-1]) != actions:
-        problem = f"actions of the episodes have {size} numbers, those of the task {actions}"
+    if (size := episodes.steps.action.shape[-1]) != action_size:
+        problem = f"actions of the episodes have {size} numbers, those of the task {action_size}"
         raise UsageError(problem, cure="train with their action space (task.actions)")
-    lead = episodes.steps.usable.shape
+    batch_shape = episodes.steps.usable.shape
     observation = {
-        name: episodes.observation[name] if name in stored else jnp.zeros(lead + shape)
+        name: episodes.observation[name] if name in stored else jnp.zeros(batch_shape + shape)
         for name, shape in shapes.items()
     }
     return StoredEpisodes(observation, episodes.steps)

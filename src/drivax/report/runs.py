@@ -39,7 +39,7 @@ class Training:
 def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
     """Read evaluation and training runs, with every seed of a run.
 
-    An evaluation has the name of its planner, a training that of its folder (of a seed ``RUN/seed-N``). A repeated name
+    An evaluation is named after its planner, a training run after its folder (a seed ``RUN/seed-N``). A repeated name
     gets as suffix the shortest end of its path that distinguishes it from the runs before it.
 
     Raises:

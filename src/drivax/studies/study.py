@@ -283,14 +283,19 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
 
 
 def event_groups(entries: Sequence[Mapping[str, Any]]) -> dict[str, Bool[np.ndarray, " scenario"]]:
-    """Return masks of the scenarios with events of each kind, and of each half of the severities."""
+    """Return masks of the scenarios with each kind of event, and with a severity below, or from, the median on."""
     tags = [entry["tags"] for entry in entries]
-    kinds = np.array([own.get("event", "") for own in tags])
-    severity = np.array([float(own.get("severity_mps2", "nan")) for own in tags])
+    kinds = np.array([tags_of_scenario.get("event", "") for tags_of_scenario in tags])
+    severity_mps2 = np.array(
+        [float(tags_of_scenario.get("severity_mps2", "nan")) for tags_of_scenario in tags]
+    )
     groups = {kind: kinds == kind for kind in sorted({*kinds.tolist()} - {""})}
     if groups:
-        middle = float(np.nanmedian(severity))
-        groups |= {f"below {middle:g} m/s2": severity < middle, f"from {middle:g} m/s2": severity >= middle}
+        median_mps2 = float(np.nanmedian(severity_mps2))
+        groups |= {
+            f"below {median_mps2:g} m/s2": severity_mps2 < median_mps2,
+            f"from {median_mps2:g} m/s2": severity_mps2 >= median_mps2,
+        }
     return groups
 
 

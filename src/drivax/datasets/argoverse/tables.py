@@ -101,7 +101,7 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
             unpacked_size.check_footer(source)
             file = pq.ParquetFile(source)
             schema, parquet_schema = file.schema_arrow, file.schema
-            names = _check(schema, columns, optional)
+            names = _select_columns(schema, columns, optional)
             indices = [i for i in range(len(parquet_schema)) if parquet_schema.column(i).path in names]
             unpacked_size.check_pages(source, indices)
             # Text stays dictionary-encoded: every row may repeat one text of a megabyte.
@@ -112,7 +112,7 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
             # Read the stream inside the file and not its footer, which may point elsewhere.
             unpacked_size.check_messages(source)
             schema = pa.ipc.open_stream(source).schema
-            names = _check(schema, columns, optional)
+            names = _select_columns(schema, columns, optional)
             unpacked_size.check_messages(source)
             indices = [schema.names.index(name) for name in names]
             options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=indices)
@@ -121,18 +121,21 @@ def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> t
     return table, frozenset(schema.names) - {*names}
 
 
-def _check(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str]) -> list[str]:
-    """Return the names of the columns to read; refuse a missing one, a repeated one, and one of another type.
+def _select_columns(schema: Any, columns: Mapping[str, Kind], optional: Sequence[str]) -> list[str]:
+    """Return the names of the columns to read.
 
-    A column of another type could repeat one value without limit; pyarrow would read ``a.b`` together with ``a``.
+    Raises:
+        DataError: A required column is missing, a column is repeated or has another type, or a name contains a dot.
     """
     names = [name for name in columns if name in schema.names or name not in optional]
     for name in names:
         if schema.names.count(name) != 1:
             problem = f"has {'several columns' if name in schema.names else 'no column'} {name}"
             raise DataError(problem, cure="name a table of Argoverse 2, or download it again")
+        # Other types, such as run-end encoded ones, may repeat one value without limit.
         if not _is_plain(arrow_type := schema.field(name).type, columns[name]):
             raise DataError(f"column {name} contains {str(arrow_type)[:80]}", cure=_AGAIN)
+    # pyarrow would read ``a.b`` together with ``a``.
     if any("." in name for name in schema.names):
         raise DataError("has a column with a dot in its name", cure=_AGAIN)
     return names

@@ -313,15 +313,16 @@ def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float
 
 
 def walk(
-    graph: LaneGraph, lane: Int[Array, " start"], s: Float[Array, " start"], step_m: float, count: int
-) -> tuple[Float[Array, "start count 2"], Float[Array, "start count"]]:
-    """Points and headings along lanes and their straightest successors; straight on where lanes end.
+    graph: LaneGraph, lane: Int[Array, " start"], s: Float[Array, " start"], step_m: float, points: int
+) -> tuple[Float[Array, "start points 2"], Float[Array, "start points"]]:
+    """Return points (m) and headings (rad) every ``step_m`` along lanes and their straightest successors.
 
-    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane.
+    The first point lies ``step_m`` ahead of arc length ``s`` on each start lane; beyond the last lane, points continue
+    straight on.
     """
-    distance = step_m * np.arange(1, count + 1)
+    distance = step_m * np.arange(1, points + 1)
     chain, begin = [lane], [-s]
-    for _ in range(4 * count):  # ends rings of very short lanes
+    for _ in range(4 * points):  # ends rings of very short lanes
         next_lane = graph.successor[chain[-1], 0]
         next_begin = np.where(next_lane >= 0, begin[-1] + graph.lines.length[chain[-1]], np.inf)
         if not (next_begin <= distance[-1]).any():
@@ -330,12 +331,12 @@ def walk(
         begin.append(next_begin)
     hop = (distance[None, :, None] > np.stack(begin, axis=-1)[:, None, :]).sum(axis=-1) - 1
     hop = np.maximum(hop, 0)
-    row = np.take_along_axis(np.stack(chain, axis=-1), hop, axis=1)
+    lane_of_point = np.take_along_axis(np.stack(chain, axis=-1), hop, axis=1)
     arc = distance - np.take_along_axis(np.stack(begin, axis=-1), hop, axis=1)
-    lane_arc = np.minimum(arc, graph.lines.length[row])
-    heading = graph.lines.heading(row, lane_arc, END_SPAN_M)
+    lane_arc = np.minimum(arc, graph.lines.length[lane_of_point])
+    heading = graph.lines.heading(lane_of_point, lane_arc, END_SPAN_M)
     overrun = (arc - lane_arc)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
-    return graph.lines.at(row, lane_arc)[..., :2] + overrun, heading
+    return graph.lines.at(lane_of_point, lane_arc)[..., :2] + overrun, heading
 
 
 def precede(

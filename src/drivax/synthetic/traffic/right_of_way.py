@@ -31,6 +31,8 @@ _WAITING_MPS2, _TURNING_MPS = 3.4, 7.0
 _HARDEST_MPS2, _RED_MPS2, _LATE_YELLOW_MPS2 = 6.5, 8.0, 5.0
 #: A vehicle has stopped at a sign below this speed, m/s, and within this distance of the line, m.
 _STOPPED_MPS, _STOPPED_M = 0.2, 4.5
+#: Gap to keep beyond a connector, m, and speed below which a leader beyond it blocks the exit, m/s.
+_EXIT_GAP_M, _QUEUE_MPS = 1.5, 1.5
 #: Least duration of a stop at a stop sign, s.
 _PAUSE_S = 0.45
 #: Vehicles that stop within this time of each other arrive simultaneously, s.
@@ -307,7 +309,11 @@ class RightOfWay:
     def _may_enter(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders, waiting: list[int]
     ) -> bool:
-        """Whether its stop, its leader, conflicts, room beyond the connector and priority permit a vehicle to enter."""
+        """Return whether a vehicle may enter its connector.
+
+        It has stopped where it must, its leader was not denied entry, no vehicle is in conflict with it, it has room to
+        leave, and it need not yield.
+        """
         i, connector, line_m = request.row, request.connector, request.line_m
         control = rules.control[connector]
         if control >= _STOP and state.step * DT_S - self._stopped_at_s[i] < _PAUSE_S:
@@ -318,9 +324,10 @@ class RightOfWay:
         if not rules.rivals[connector].isdisjoint(waiting) or self._blockers(state, rules, request, holders):
             return False
         exit_m = state.tables.connector_end[i, request.slot]
-        is_full = leader_rear_m < exit_m + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
-        # Behind a leader that is not yet in the junction, or without a rule, vehicles follow as on other lanes.
-        if is_full and leader_rear_m >= line_m - 1.0 and control != _NONE:
+        room_m = exit_m + self._length[i] + _EXIT_GAP_M
+        is_exit_blocked = leader_rear_m < room_m and state.leader_speed[i] < _QUEUE_MPS
+        # Behind a leader that is not yet in the junction, and at uncontrolled connectors, vehicles follow as elsewhere.
+        if is_exit_blocked and leader_rear_m >= line_m - 1.0 and control != _NONE:
             return False
         return not len(rules.yields_to[connector]) or self._accepts_gap(state, rules, request)
 
