@@ -238,6 +238,21 @@ def test_td3_bc_beats_clones_and_drivers_of_the_mixture(script, stored):
     assert {"bc", "filtered_bc", "pdm"} <= best["differences"].keys()
 
 
+def test_no_algorithm_is_worse_than_cloning_of_the_log(stored):
+    """The claim of the page, at events."""
+    policies = {
+        name: own for name, own in stored("mixtures")["policies"].items() if name.startswith("expert/")
+    }
+    assert len(policies) == 5
+    for name in policies.keys() - {"expert/bc"}:
+        for metric in ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio"):
+            difference = policies[name]["differences"]["bc"][metric]
+            assert difference["low"] < 0.0 < difference["high"] and round(abs(difference["mean"]), 3) <= 0.018
+        assert all(
+            "0.0% of the episodes fail" in " ".join(problems) for problems in policies[name]["critics"]
+        )
+
+
 def test_cql_page_quotes_the_comparison_with_corl(stored, repository):
     page, result = (repository / "docs" / "algorithms" / "cql.md").read_text(), stored("corl")
     for name, label in (("drivax", "our CQL"), ("corl", "CORL's code")):
