@@ -24,8 +24,8 @@ COLUMNS = {
 def blocks(result: dict[str, Any]) -> dict[str, list[str]]:
     """Return the tables by the names of their places."""
     rows = [
-        [f"`{one['planner']}`", *(interval(one["metrics"][metric]) for metric in COLUMNS)]
-        for one in result["summaries"]
+        [f"`{summary['planner']}`", *(interval(summary["metrics"][metric]) for metric in COLUMNS)]
+        for summary in result["summaries"]
     ]
     differences = [
         [f"`{planner}`", f"`{metric}`", interval(values, signed=True), str(values["n"])]

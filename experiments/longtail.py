@@ -70,7 +70,8 @@ def keep(name: str, folder: Path) -> None:
         arm, seed = run.parent.name, int(run.name.removeprefix("seed-"))
         file = kept / f"{arm}-{seed}.tar.xz"
         if not file.exists() and is_evaluated(study, arm, seed):
-            _pack([run, *(study.evaluation(own, seed) for own in study.evaluations(arm))], folder, file)
+            evaluations = (study.evaluation(policy, seed) for policy in study.evaluations(arm))
+            _pack([run, *evaluations], folder, file)
     shutil.copytree(folder / "scores", kept / "scores", dirs_exist_ok=True)
 
 
@@ -91,10 +92,10 @@ def finish(name: str, folder: Path) -> None:
     """Store the results, and the number of test episodes with a collision by planner or arm and seed."""
     study, results = stored_study(name, folder), json.loads((folder / "results.json").read_text())
     collisions = {}
-    for own in results["rates"]:
-        seeds = [None] if own in study.definition.planners else range(results["about"]["seeds"])
-        tables = [EpisodeTable.read(study.evaluation(own, seed)) for seed in seeds]
-        collisions[own] = [int(table.metrics["collision"].sum()) for table in tables]
+    for planner in results["rates"]:
+        seeds = [None] if planner in study.definition.planners else range(results["about"]["seeds"])
+        tables = [EpisodeTable.read(study.evaluation(planner, seed)) for seed in seeds]
+        collisions[planner] = [int(table.metrics["collision"].sum()) for table in tables]
     result_file(name).write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
 
 
@@ -155,7 +156,7 @@ def stored_study(name: str, folder: Path) -> Study:
 
 
 def fill_page(page: str, name: str, results: dict[str, Any]) -> str:
-    """Return the page with those tables of the results of a study that it has a place for."""
+    """Return the page, filled with those of a study's tables that it has places for."""
     definition = load_study(name)
     rule = definition.checkpoints_by.rpartition("/")[2]
     tables = {
@@ -172,9 +173,10 @@ def fill_page(page: str, name: str, results: dict[str, Any]) -> str:
     }
     lines = {
         f"{name} {part}": table(
-            [column.heading for column in own.columns], [[cell.text for cell in row] for row in own.rows]
+            [column.heading for column in content.columns],
+            [[cell.text for cell in row] for row in content.rows],
         )
-        for part, own in tables.items()
+        for part, content in tables.items()
     }
     return fill_places(page, "longtail.py", lines)
 

@@ -72,9 +72,9 @@ def critic_curves(study: Study) -> dict[str, Any]:
     baseline = DEFINITION.baselines[0]
     return {
         "steps": [row["step"] for row in critics[baseline][0]],
-        "seeds": {name: _rounded(values) for name, values in curves[baseline].items()},
+        "seeds": {name: _round_nested(values) for name, values in curves[baseline].items()},
         "arms": {
-            arm: {name: _rounded(values[name].mean(axis=0)) for name in PANELS}
+            arm: {name: _round_nested(values[name].mean(axis=0)) for name in PANELS}
             for arm, values in curves.items()
         },
     }
@@ -85,9 +85,9 @@ def _rows(study: Study, arm: str, seed: int) -> list[dict[str, float]]:
     return list(RunFolder(study.run(arm, seed), {}).metric_rows())[STRIDE - 1 :: STRIDE]
 
 
-def _rounded(values: np.ndarray) -> list[Any]:
+def _round_nested(values: np.ndarray) -> list[Any]:
     """Return nested lists of numbers with four significant digits."""
-    return [_rounded(value) if value.ndim else float(f"{value:.4g}") for value in np.asarray(values)]
+    return [_round_nested(value) if value.ndim else float(f"{value:.4g}") for value in np.asarray(values)]
 
 
 def evaluations(study: Study) -> tuple[dict[str, Values], Strata, tuple[str, ...]]:
@@ -98,8 +98,8 @@ def evaluations(study: Study) -> tuple[dict[str, Values], Strata, tuple[str, ...
         arm: [EpisodeTable.read(study.evaluation(arm, seed)) for seed in range(about["seeds"])]
         for arm in study.arms
     }
-    episodes = {
-        arm: {name: np.stack([one.metrics[name] for one in seeds]) for name in metrics}
+    values = {
+        arm: {name: np.stack([episodes.metrics[name] for episodes in seeds]) for name in metrics}
         for arm, seeds in tables.items()
     }
     keys = tables[DEFINITION.baselines[0]][0].keys
@@ -108,7 +108,7 @@ def evaluations(study: Study) -> tuple[dict[str, Values], Strata, tuple[str, ...
     rare = np.array([segment.split("-")[-1].startswith("r") for segment in keys["segment"]])
     if int(rare.sum()) != about["rare"]:
         raise SystemExit(f"{rare.sum()} test scenarios have an event; the study has {about['rare']}")
-    return episodes, Strata(labels, rare, about["share"]), keys["scenario_id"]
+    return values, Strata(labels, rare, about["share"]), keys["scenario_id"]
 
 
 def differences_from_bc(episodes: Mapping[str, Values], strata: Strata) -> dict[str, Any]:
@@ -213,11 +213,11 @@ def page_tables(results: Mapping[str, Any]) -> dict[str, list[str]]:
 
 def _critics_table(critics: Mapping[str, Any]) -> list[str]:
     """Return the baseline's curves at the validations: mean over seeds, and the range at the end."""
-    every = slice(VALIDATION - 1, None, VALIDATION)
-    steps = [compact(step) for step in critics["steps"][every]]
+    validations = slice(VALIDATION - 1, None, VALIDATION)
+    steps = [compact(step) for step in critics["steps"][validations]]
     rows = []
     for name, label in CURVES.items():
-        values = np.array(critics["seeds"][name])[:, every]
+        values = np.array(critics["seeds"][name])[:, validations]
         cells = [f"{value:.2f}" for value in values.mean(axis=0)]
         rows.append([label, *cells, f"{values[:, -1].min():.2f} to {values[:, -1].max():.2f}"])
     return table(["logged steps drawn", *steps, "seeds at the end"], rows)

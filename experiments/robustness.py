@@ -74,7 +74,7 @@ _DISK, _REST, _PAGE = 512 << 20, 1 << 18, 4096
 #: A stopped command, and a whole one, end within these times (s).
 _STOP_S, _RUN_S = 120.0, 900.0
 _POLL_S = 0.01
-#: Shares of its time in which the moment is drawn; a command that ends before its moment takes the next share.
+#: Shares of a command's time within which its moment is drawn; a command that ends earlier takes the next share.
 _SHARES = (1.0, 0.6, 0.4, 0.2)
 
 _TRAIN = """
@@ -202,7 +202,7 @@ COMMANDS = commands(12, 4)
 
 @dataclass
 class Bench:
-    """A disk with the work folder, the reference, and the course of the undisturbed runs."""
+    """A disk with the work folder, and the reference output and times of the undisturbed runs."""
 
     disk: Path
     commands: dict[str, Command]
@@ -248,7 +248,7 @@ class Bench:
             previous, self.reference = self.reference, digests(self.work)
             if repeat and (lines := differences(previous, self.reference)):
                 raise SystemExit("undisturbed runs differ:\n" + "\n".join(lines))
-        self.problems += self._litter()
+        self.problems += self._leftovers()
         if self.problems:
             raise SystemExit("undisturbed runs fail:\n" + "\n".join(self.problems))
 
@@ -301,25 +301,26 @@ class Bench:
     def check(self, name: str) -> None:
         """Compare all output with the reference, and look for files that should not exist."""
         lines = differences(self.reference, digests(self.work))
-        self.problems += [f"{name}: {line}" for line in (*lines, *self._litter())]
+        self.problems += [f"{name}: {line}" for line in (*lines, *self._leftovers())]
 
     def _exists(self, command: Command) -> bool:
         return any((self.work / output).exists() for output in command.outputs)
 
     def _differences(self, name: str, without: Sequence[str] = ()) -> list[str]:
         """Return how the outputs of a command differ from the reference, except those in the folders ``without``."""
-        own = (self._own(name, paths) for paths in (self.reference, digests(self.work)))
+        outputs = (self._select_outputs(name, paths) for paths in (self.reference, digests(self.work)))
         expected, actual = (
-            {path: digest for path, digest in paths.items() if not _is_below(path, without)} for paths in own
+            {path: digest for path, digest in paths.items() if not _is_below(path, without)}
+            for paths in outputs
         )
         return differences(expected, actual)
 
-    def _own(self, name: str, paths: dict[str, str]) -> dict[str, str]:
+    def _select_outputs(self, name: str, paths: dict[str, str]) -> dict[str, str]:
         """Select what a command writes, without hidden files, and without what others write into its folders."""
         folders = self.commands[name].outputs
         nested = [output for other in self._writers_into(name) for output in self.commands[other].outputs]
-        own = (path for path in paths if _is_below(path, folders) and path not in nested)
-        return {path: paths[path] for path in own if not _is_hidden(path)}
+        outputs = (path for path in paths if _is_below(path, folders) and path not in nested)
+        return {path: paths[path] for path in outputs if not _is_hidden(path)}
 
     def _writers_into(self, name: str) -> list[str]:
         folders = self.commands[name].outputs
@@ -368,7 +369,7 @@ class Bench:
                 process.send_signal(getattr(signal, f"SIG{fault.upper()}"))
 
     def _fill(self) -> None:
-        """Leave nothing of the disk free half of the time, otherwise a random rest."""
+        """Fill the disk: completely half of the time, otherwise up to a random rest."""
         rest, filled, piece = self.rng.choice((0, self.rng.randrange(_REST))), 0, _DISK
         with self.ballast.open("wb") as file:
             while piece >= _PAGE and (free := shutil.disk_usage(self.disk).free) >= rest + _PAGE:
@@ -395,7 +396,7 @@ class Bench:
             if status >= 0 and "Traceback" in error:
                 self.problems.append(f"{place}: traceback: {error[-1200:]}")
             if status > 0 and not error.strip().rpartition("\n")[2].startswith("drivax: "):
-                self.problems.append(f"{place}: the last line is no message: {error[-600:]}")
+                self.problems.append(f"{place}: the last line is not a message: {error[-600:]}")
         if not _wait(lambda: not _group_exists(process.pid), 20.0):
             os.killpg(process.pid, signal.SIGKILL)
             self.problems.append(f"{place}: processes remain")
@@ -406,7 +407,7 @@ class Bench:
         )  # A killed process cannot remove its temporary files.
         self.temporary.mkdir()
 
-    def _litter(self) -> list[str]:
+    def _leftovers(self) -> list[str]:
         """Return hidden files, and temporary files."""
         hidden = [f"leaves {path}" for path in sorted(filter(_is_hidden, _paths(self.work)))]
         return hidden + [f"leaves tmp/{path}" for path in sorted(_paths(self.temporary))]

@@ -409,7 +409,9 @@ def test_links_inside_a_folder_are_refused(tmp_path: Path):
     for names in (("link",), ("link", "file"), ("dangling",)):
         if names == ("dangling",):
             (tmp_path / "dangling").symlink_to(tmp_path / "missing")
-        with pytest.raises(DataError, match=f"{names[0]}: is a symbolic link; replace the link by what it"):
+        with pytest.raises(
+            DataError, match=f"{names[0]}: is a symbolic link; replace the link with its target"
+        ):
             inside(tmp_path, *names)
 
 

@@ -11,7 +11,7 @@
 generate sets/fresh --scenarios 1024 --seed 20261129 --rare_rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. Measures are weighted to
 the natural share of events, so precision is that of an ordinary set. The density of actions comes from ``test`` alone;
-ensembles are trained on ``train``. ``--method`` scores only these methods and keeps the other results.
+ensembles are trained on ``train``. ``--method`` scores only the named methods and keeps the results of others.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def measure_events(bench: Path, only: list[str], results: dict[str, Any]) -> dic
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
     if only and results.get("sets") != hashes:
-        raise SystemExit("the stored results have other sets: score all methods, without --method")
+        raise SystemExit("the stored results are from other sets: score all methods, without --method")
     truth = Truth.of(sets)
     methods = dict(results["methods"]) if only else {}
     for name, test_table, table in score_methods(sets, bench / "train", only or list(METHODS)):

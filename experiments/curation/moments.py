@@ -94,14 +94,14 @@ def most_critical(scores: ScoreTable, data: ScenarioSet) -> Iterator[tuple[int, 
     earlier: list[tuple[str, float, np.ndarray[Any, Any]]] = []
     for row in map(int, scores.order):
         scenario, step = data[row], int(scores.steps[row].argmax())
-        place = scenario.record["origin"][:2] + scenario.agent_xy[step, 0]
+        xy = scenario.record["origin"][:2] + scenario.agent_xy[step, 0]
         _, _, start = scenario.id.partition("/")[0].rpartition("@")
-        drive, time_s = scenario.text("segment"), ((int(start) if start.isdigit() else 0) + step) * DT_S
+        segment, time_s = scenario.text("segment"), ((int(start) if start.isdigit() else 0) + step) * DT_S
         if all(
-            drive != other or abs(time_s - at_s) > APART_S or np.hypot(*(place - at)) > APART_M
-            for other, at_s, at in earlier
+            segment != other or abs(time_s - other_s) > APART_S or np.hypot(*(xy - other_xy)) > APART_M
+            for other, other_s, other_xy in earlier
         ):
-            earlier.append((drive, time_s, place))
+            earlier.append((segment, time_s, xy))
             yield row, step
 
 

@@ -40,10 +40,10 @@ def draw_picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: D
     step = int(table.steps[row].argmax())
     page = Figure(figsize=SIZE, dpi=DPI, facecolor="white", layout="constrained")
     grid = page.add_gridspec(plots, 2, width_ratios=(1, 1.45))
-    scene, scenario = page.add_subplot(grid[:, 0]), data[row]
+    map_axes, scenario = page.add_subplot(grid[:, 0]), data[row]
     x, y = (float(number) for number in scenario.agent_xy[step, 0])
-    draw_on(scene, scenario, step, (x, y), REACH_M)
-    scene.set_title(f"{step * DT_S:.1f} s, score {table.steps[row, step]:.2f}", fontsize=10)
+    draw_on(map_axes, scenario, step, (x, y), REACH_M)
+    map_axes.set_title(f"{step * DT_S:.1f} s, score {table.steps[row, step]:.2f}", fontsize=10)
     draw_plots([page.add_subplot(grid[number, 1]) for number in range(plots)], row, step)
     save_picture(page, out)
     print(f"{out.name}: {table.scenario_ids[row]}, step {step}")

@@ -29,7 +29,7 @@ from drivax.datasets.formats import detect, survey
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, replay
 from drivax.geometry.boxes import corners
-from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.queries import LEVEL_M, OFFROAD_TOLERANCE_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording, windows, with_ego
@@ -96,44 +96,45 @@ def rows_of(batch: list[Case], planner: str) -> list[dict[str, Any]]:
     bank = ScenarioBank.from_scenarios(filled, trim=False)
     facts = {name: np.asarray(v) for name, v in replay(bank, jnp.arange(BATCH), planner != "expert").items()}
     return [
-        _row(case, planner, {name: values[place] for name, values in facts.items()})
-        for place, case in enumerate(batch)
+        _row(case, planner, {name: values[index] for name, values in facts.items()})
+        for index, case in enumerate(batch)
     ]
 
 
 def _row(case: Case, planner: str, facts: Mapping[str, np.ndarray]) -> dict[str, Any]:
     counted = facts["logged"].copy()
     counted[0] = False
-    faults = {name: facts[name] & counted for name in ("collision", "offroad", "left_map", "red_light")}
+    names = ("collision", "offroad", "left_map", "red_light")
+    violations = {name: facts[name] & counted for name in names}
     divergence = facts["log_divergence_m"][counted]
-    off = CURRENT_STEP + np.flatnonzero(faults["offroad"])
-    contradicted = sum(nearest_edges_say_on_road(case.scenario, int(step)) for step in off)
-    lights = Flag.LIGHTS in case.scenario.has
+    offroad_steps = CURRENT_STEP + np.flatnonzero(violations["offroad"])
+    contradicted = sum(nearest_edges_say_on_road(case.scenario, int(step)) for step in offroad_steps)
+    has_lights = Flag.LIGHTS in case.scenario.has
     return {
         "group": case.group,
         "scenario": case.scenario.id,
         "planner": planner,
         "steps": int(counted.sum()),
         "distance_m": round(float(facts["moved_m"][counted].sum()), 2),
-        "collision_step": _first(faults["collision"]),
-        "offroad_steps": int(faults["offroad"].sum()),
+        "collision_step": _first(violations["collision"]),
+        "offroad_steps": int(violations["offroad"].sum()),
         "contradicted_steps": contradicted if planner == "expert" else None,
-        "first_offroad_step": _first(faults["offroad"]),
-        "left_map_steps": int(faults["left_map"].sum()),
-        "red_light_step": _first(faults["red_light"]) if lights else None,
+        "first_offroad_step": _first(violations["offroad"]),
+        "left_map_steps": int(violations["left_map"].sum()),
+        "red_light_step": _first(violations["red_light"]) if has_lights else None,
         "mean_divergence_m": round(float(divergence.mean()), 3) if len(divergence) else None,
         "final_divergence_m": round(float(divergence[-1]), 3) if len(divergence) else None,
     }
 
 
 def nearest_edges_say_on_road(scenario: Scenario, step: int) -> bool:
-    """Whether the nearest stored edge of every corner of the logged ego, however far, has it on the drivable side.
+    """Whether every corner of the logged ego is on the drivable side of its nearest stored edge, however far.
 
     A second check of an off-road step, by brute force over all edges of the ego's level and without grid, cut-off and
     lanes. A corner right of its nearest edge by up to 0.3 m still counts as on the road.
     """
-    last = int(scenario.segment_blocks[1])
-    a, b = (scenario.record[name][:last].astype(np.float64) for name in ("segment_a", "segment_b"))
+    count = int(scenario.segment_blocks[1])
+    a, b = (scenario.record[name][:count].astype(np.float64) for name in ("segment_a", "segment_b"))
     ground = scenario.agent_z[step, 0] - scenario.agent_size[0, 2] / 2
     level = np.abs((a[:, 2] + b[:, 2]) / 2 - ground) <= LEVEL_M
     a, b = a[level, :2], b[level, :2]
@@ -143,7 +144,8 @@ def nearest_edges_say_on_road(scenario: Scenario, step: int) -> bool:
     box = np.array(
         [*scenario.agent_xy[step, 0], np.cos(heading), np.sin(heading), *scenario.agent_size[0, :2]]
     )
-    return all(_left_of_nearest(corner, a, b) >= -0.3 for corner in np.asarray(corners(jnp.asarray(box))))
+    points = np.asarray(corners(jnp.asarray(box)))
+    return all(_left_of_nearest(point, a, b) >= -OFFROAD_TOLERANCE_M for point in points)
 
 
 def _left_of_nearest(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
@@ -177,20 +179,20 @@ def table(rows: list[dict[str, Any]]) -> str:
                 group,
                 planner,
                 len(group_rows),
-                _middle(group_rows, "distance_m", 1),
+                _median_and_max(group_rows, "distance_m", 1),
                 sum(row["collision_step"] is not None for row in group_rows),
                 f"{sum(row['offroad_steps'] for row in group_rows)} of {sum(row['steps'] for row in group_rows)}",
                 sum(row["contradicted_steps"] for row in group_rows) if planner == "expert" else "",
                 sum(row["left_map_steps"] for row in group_rows),
                 sum(row["red_light_step"] is not None for row in group_rows),
-                _middle(group_rows, "mean_divergence_m", 2),
-                _middle(group_rows, "final_divergence_m", 2),
+                _median_and_max(group_rows, "mean_divergence_m", 2),
+                _median_and_max(group_rows, "final_divergence_m", 2),
             )
             lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
-def _middle(rows: list[dict[str, Any]], name: str, digits: int) -> str:
+def _median_and_max(rows: list[dict[str, Any]], name: str, digits: int) -> str:
     values = [row[name] for row in rows if row[name] is not None]
     return f"{np.median(values):.{digits}f}, {max(values):.{digits}f}" if values else "–"
 

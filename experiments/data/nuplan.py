@@ -35,7 +35,8 @@ METRICS = {
     "fault_score": "at_fault_collision", "drivable": "offroad", "ttc_ok": "ttc_ok", "direction": "direction",
     "speed": "speed_compliance", "comfortable": "comfortable",
 }  # fmt: skip
-_AGREES = 0.005
+#: Largest difference of values that count as equal.
+_TOLERANCE = 0.005
 
 
 def scenario(scene: Mapping[str, Any], name: str) -> Scenario:
@@ -91,7 +92,7 @@ def measure(data: Path) -> dict[str, Any]:
             values = metrics[metric]
             ours = 1.0 - values if name in ("fault_score", "drivable") else values
             theirs = np.array([_verdict(scene["devkit"], name) for scene in scenes])
-            counts[group][name] = int((np.abs(ours - theirs) <= _AGREES).sum())
+            counts[group][name] = int((np.abs(ours - theirs) <= _TOLERANCE).sum())
             counts[group][f"{name}_undefined"] = int(np.isnan(ours).sum())
     return counts
 

@@ -3,7 +3,7 @@
 python -m experiments.data.real_files --data ../shared/data [--write]     (--write stores the result and the page)
 python -m experiments.data.real_files --table                             (write the stored result to the page)
 
-A file longer than a scenario gives several; the ego is the source's.
+A file longer than a scenario yields several scenarios; the ego is that of the source.
 """
 
 from __future__ import annotations
@@ -107,9 +107,9 @@ def tables(result: dict[str, Any]) -> str:
             f"| source | scenario | {' | '.join(map(label, planners))} |",
         ]
         lines.append("|---|---|" + "---|" * len(planners))
-        for row, about in enumerate(scenarios):
+        for row, scenario in enumerate(scenarios):
             cells = [_cell(episodes[row]) for episodes in planners.values()]
-            lines.append(f"| {about['source']} | {about['scenario_id']} | {' | '.join(cells)} |")
+            lines.append(f"| {scenario['source']} | {scenario['scenario_id']} | {' | '.join(cells)} |")
         counts = [sum(e["outcome"] == "success" for e in episodes) for episodes in planners.values()]
         lines += [f"| | **successes** of {len(scenarios)} | {' | '.join(map(str, counts))} |", ""]
     return "\n".join(lines[:-1])

@@ -138,7 +138,7 @@ def measure(source: str, scenario: Scenario, ego: bool) -> Row:
         ego=ego,
         lane_graph=scenario.tags["lane_graph"],
         routed=Flag.ROUTE in scenario.has,
-        goal=float(coverage(scenario)[0]),
+        goal=float(coverage(scenario)[GOAL_ROW]),
         candidate=candidate_coverage(scenario),
         lanes=lane_coverage(scenario),
     )
@@ -155,8 +155,8 @@ def draw(scenario: Scenario, row: Row, folder: Path) -> None:
         ends = np.stack((scenario.segment_a[part, :2], scenario.segment_b[part, :2]), axis=1)
         axes.plot(*np.moveaxis(ends, 0, 2).transpose(1, 0, 2), color=colour, linewidth=0.7)
     for number, points in enumerate(scenario.route_points):
-        if points and number != 1:
-            colour, width = ("red", 2.0) if number == 0 else (None, 0.8)
+        if points and number != LOG_ROW:
+            colour, width = ("red", 2.0) if number == GOAL_ROW else (None, 0.8)
             axes.plot(*scenario.route_xy[number, :points].T, color=colour, linewidth=width)
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0]
     axes.plot(*log.T, ".", color="green", markersize=4)
@@ -177,10 +177,10 @@ def table(rows: list[Row]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for source in dict.fromkeys(row.source for row in rows):
-        mine = [row for row in rows if row.source == source]
-        own = [f"{row.candidate:.0%}" for row in mine if row.ego and source != "built-in world"]
-        counts = [sum(x) for x in zip(*((r.routed, r.covered, r.lanes >= SHARE) for r in mine), strict=True)]
-        cells = [source, mine[0].lane_graph, len(mine), *counts, ", ".join(own) or "-"]
+        logs = [row for row in rows if row.source == source]
+        ego_shares = [f"{row.candidate:.0%}" for row in logs if row.ego and source != "built-in world"]
+        counts = [sum(x) for x in zip(*((r.routed, r.covered, r.lanes >= SHARE) for r in logs), strict=True)]
+        cells = [source, logs[0].lane_graph, len(logs), *counts, ", ".join(ego_shares) or "-"]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 

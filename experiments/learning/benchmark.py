@@ -49,8 +49,8 @@ TRAFFIC = ("log", "idm")
 #: Random actions in the box of the published action space, shown in a separate table.
 BOX = "random in the published box"
 PLANNERS = ("expert", "pdm", "idm", "constant_speed", "constant_velocity", "random", BOX)
-#: Trainings that differ in one setting, by table of the docs; the first is the reference. Those that are no presets
-#: are in these tables only.
+#: Trainings that differ in one setting, by table of the docs; the first is the reference. Trainings that are not
+#: presets are in these tables only.
 COMPARISONS = {
     "encoders": ("encoder_mlp", "encoder_lq", "encoder_entity"),
     "constraints": ("weights", "constraints"),
@@ -274,9 +274,9 @@ def compute_results() -> dict[str, Any]:
     }
     tests = {episodes.about["test"] for episodes in all_episodes.values()}
     if len(tests) != 1:
-        raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
+        raise SystemExit(f"{len(tests)} test sets: evaluate all planners on one")
     if ("expert", "log") not in all_episodes:
-        raise SystemExit("drive the expert in log traffic, too: distances are relative to its")
+        raise SystemExit("evaluate the expert in log traffic, too: distances are relative to the expert's")
     for episodes in all_episodes.values():
         episodes.values["distance_ratio"] = distance_ratio(episodes, all_episodes["expert", "log"])
     planners: dict[str, Any] = {}
@@ -337,7 +337,7 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
     for tag, values in tags.items():
         for value in np.unique(values):
             rows = values == value
-            means = {
+            intervals = {
                 name: mean_interval(
                     replace(
                         episodes,
@@ -345,10 +345,9 @@ def stratify(all_episodes: Mapping[tuple[str, str], Episodes]) -> list[dict[str,
                         segments=episodes.segments[rows],
                     ),
                     "accuracy",
-                )
+                ).as_dict()
                 for name, episodes in planners.items()
             }
-            intervals = {name: episodes.as_dict() for name, episodes in means.items()}
             strata.append(
                 {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
             )
@@ -504,7 +503,7 @@ def main() -> None:
         return
     if args.command == "judge":
         result = compute_results()
-        # Earlier policies observe what no longer exists, so their rows cannot be computed again.
+        # Earlier policies need observations that no longer exist, so their rows cannot be computed again.
         result["changes"] = json.loads(RESULT.read_text())["changes"] | result["changes"]
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
     PAGE.write_text(fill_page(PAGE.read_text(), page_tables(json.loads(RESULT.read_text()))))

@@ -33,7 +33,7 @@ def _braking(moment: Moment) -> tuple[Array, bool]:
     return -moment.facts.acceleration_mps2, True
 
 
-_ALONG = frozenset({"acceleration_mps2"})
+_ACCELERATION_FACTS = frozenset({"acceleration_mps2"})
 
 speed_ratio = Metric(
     "-",
@@ -60,13 +60,13 @@ max_acceleration = Metric(
     "m/s2",
     "-",
     "largest acceleration over 0.5 s",
-    step_value=StepValue("acceleration", "m/s2", _acceleration, _ALONG),
+    step_value=StepValue("acceleration", "m/s2", _acceleration, _ACCELERATION_FACTS),
     operator="max",
 )
 max_braking = Metric(
     "m/s2",
     "-",
     "largest deceleration over 0.5 s",
-    step_value=StepValue("braking", "m/s2", _braking, _ALONG),
+    step_value=StepValue("braking", "m/s2", _braking, _ACCELERATION_FACTS),
     operator="max",
 )

@@ -1,12 +1,12 @@
-"""Compare CQL with that of CORL on the same data: episodes of mixed quality of Gymnasium's pendulum.
+"""Compare our CQL with CORL's on the same data: episodes of mixed quality of Gymnasium's pendulum.
 
 python -m experiments.learning.corl collect --out DATA          (a Minari data set of three controllers)
 python -m experiments.learning.corl drivax --data DATA          (learns with three seeds)
 python -m experiments.learning.corl corl --data DATA --code CQL (the same by CORL's code)
 
 CQL is CORL's file algorithms/offline/cql.py (github.com/corl-team/CORL, 5790218), which needs PyTorch; its other
-imports are not used. Both have the settings of ``configs/published/cql_corl.yaml`` with its weight for large values
-(10 of the squared error), but a smaller batch, fewer actions and equal rates, so that a run takes minutes.
+imports are not used. Both have the settings of ``configs/published/cql_corl.yaml`` with a conservative penalty of
+weight 10 (the squared error has 1), but a smaller batch, fewer actions and equal rates, so that a run takes minutes.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ DRIVERS = ("pdm", "idm", "constant_speed", "zoo:bc", "zoo:aggressive")
 ALGORITHMS = ("bc", "filtered_bc", "td3_bc", "awac", "iql", "cql_bc")
 #: On the log, every scenario has one episode, so a filter changes nothing.
 ALGORITHMS_OF = {"mixed": ALGORITHMS, "expert": tuple(name for name in ALGORITHMS if name != "filtered_bc")}
-#: Further settings. Without guidance by critics TD3+BC only imitates, and updates its policy as often as cloning does.
+#: Further settings: on `expert` data, where critics have no influence, TD3+BC updates its policy as often as cloning.
 SETTINGS = {("expert", "td3_bc"): ("--algorithm.delay", "1")}
 METRICS = ("success", "vmax_score", "at_fault_collision", "offroad", "progress_ratio")
 
@@ -101,25 +101,32 @@ def is_trained(folder: Path) -> bool:
 def compute_results(runs: Path) -> dict[str, Any]:
     """Return means of drivers and policies, and differences of policies from both clones and the best drivers."""
     drivers = {path.name: _episodes([path]) for path in sorted((runs / "drivers").iterdir())}
-    means = {name: {m: mean_interval(own, m).as_dict() for m in METRICS} for name, own in drivers.items()}
+    means = {
+        name: {metric: mean_interval(episodes, metric).as_dict() for metric in METRICS}
+        for name, episodes in drivers.items()
+    }
     best = dict.fromkeys(max(means, key=lambda name: means[name][m]["mean"] or 0.0) for m in METRICS[:2])
     policies = {}
     for mixture in MIXTURES:
-        seeds_of = {
+        folders = {
             name: sorted((runs / "evaluated" / mixture / name).glob("seed-*"))
             for name in ALGORITHMS_OF[mixture]
         }
-        episodes = {name: _episodes(seeds) for name, seeds in seeds_of.items() if len(seeds) == SEEDS}
-        for name, own in episodes.items():
-            seeds = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
-            others = {key: episodes[key] for key in ("bc", "filtered_bc") if key in episodes and key != name}
+        evaluated = {name: _episodes(seeds) for name, seeds in folders.items() if len(seeds) == SEEDS}
+        for name, episodes in evaluated.items():
+            infos = [RunFolder.open(runs / mixture / name / f"seed-{seed}").info for seed in range(SEEDS)]
+            others = {
+                key: evaluated[key] for key in ("bc", "filtered_bc") if key in evaluated and key != name
+            }
             if mixture == "mixed":
                 others |= {driver: drivers[driver] for driver in best}
             policies[f"{mixture}/{name}"] = {
-                "means": {metric: mean_interval(own, metric).as_dict() for metric in METRICS},
-                "critics": [info.get("critics") for info in seeds],
+                "means": {metric: mean_interval(episodes, metric).as_dict() for metric in METRICS},
+                "critics": [info.get("critics") for info in infos],
                 "differences": {
-                    other: {metric: mean_interval(own, metric, reference).as_dict() for metric in METRICS}
+                    other: {
+                        metric: mean_interval(episodes, metric, reference).as_dict() for metric in METRICS
+                    }
                     for other, reference in others.items()
                 },
             }

@@ -3,8 +3,8 @@
 python -m experiments.learning.off_policy --data BENCHMARK --runs RUNS
 
 RUNS is the folder of `experiments.learning.mixtures`, with its trained policies. Episodes of the mixture `mixed` in 256
-scenarios of the split `validation` are the data of the estimates. Each policy acts by its mode with Gaussian noise, and
-so does the behaviour policy, a clone of these episodes: kernels, without which deterministic policies have no ratios.
+scenarios of the split `validation` are the data of the estimates. Each policy acts by its mode with Gaussian noise (a
+kernel), and so does the behaviour policy, a clone of these episodes: deterministic policies have no importance ratios.
 """
 
 from __future__ import annotations

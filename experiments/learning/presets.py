@@ -129,7 +129,7 @@ def compare_trainings(names: Sequence[str]) -> dict[str, Any]:
     """Return costs and results of trainings, and their paired differences from the first."""
     evaluated = {name: episodes for name in names if (episodes := read_episodes(name, "log")) is not None}
     if len({episodes.about["test"] for episodes in evaluated.values()}) > 1:
-        raise SystemExit(f"{', '.join(evaluated)}: several test sets: drive all on one")
+        raise SystemExit(f"{', '.join(evaluated)}: several test sets: evaluate all on one")
     trainings = {}
     for name, episodes in evaluated.items():
         training, reference = read_training(name), evaluated[names[0]]

@@ -123,8 +123,8 @@ class Others:
 
     Attributes:
         box: Predicted boxes at each time.
-        maybe: Predicted boxes if agents enter ego's path and stay there.
-        enters: Mask of agents that may do so.
+        entering_box: Predicted boxes if agents enter ego's path and stay there.
+        may_enter: Mask of agents that may do so.
         speed: Predicted speeds, m/s.
         valid: Mask of agents.
         behind: Mask of agents that follow ego.
@@ -134,8 +134,8 @@ class Others:
     """
 
     box: Float[Array, "H K 6"]
-    maybe: Float[Array, "H K 6"]
-    enters: Bool[Array, " K"]
+    entering_box: Float[Array, "H K 6"]
+    may_enter: Bool[Array, " K"]
     speed: Float[Array, "H K"]
     valid: Bool[Array, " K"]
     behind: Bool[Array, " K"]
@@ -353,8 +353,8 @@ class SearchPlanner:
 
     A manoeuvre has a target offset and a maximum acceleration, below which the car follows its leader by IDM; the last
     acceleration comes with a higher speed, to clear conflicts. Each manoeuvre is simulated for 5 s with the car's own
-    dynamics and steering law. It costs to collide (the sooner, the more), to cut off agents that may arrive earlier or
-    later, to leave the road or its lanes, to pass closely, to lose progress and to brake.
+    dynamics and steering law. Its cost counts collisions (the sooner, the more), cutting off agents that may arrive
+    earlier or later, leaving the road or its lanes, passing closely, lost progress and braking.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -390,7 +390,7 @@ class SearchPlanner:
         is_blocked = _is_blocked(path, exists, offsets, others, ego_box, stop_m)
 
         def line_costs(shift: Array) -> tuple[Array, Array]:
-            line = _shifted_line(path, offsets, (lateral, shift), ego_box, speed)
+            line = _shifted_line(path, offsets, lateral, shift, ego_box, speed)
             poses, distance, first_controls = self._drive_line(
                 line, exists, offsets, others, (ego_box, speed, desired_mps, stop_m)
             )
@@ -466,16 +466,16 @@ def advance(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Floa
 def _shifted_line(
     path: Float[Array, "P 7"],
     offsets: Float[Array, " P"],
-    offsets_m: tuple[Array, Array],
+    lateral: Array,
+    shift: Array,
     ego_box: Array,
     speed: Array,
 ) -> Float[Array, "P 7"]:
-    """Shift the route laterally from the car's current offset and heading to a target offset.
+    """Shift the route from the car's current ``lateral`` offset (m) and heading to the target offset ``shift`` (m).
 
     The shift by d is a cubic over a time T of 1 to 2.5 s, if possible with at most 3.5 m/s2 of lateral acceleration,
     which is 6 d / T^2.
     """
-    lateral, shift = offsets_m
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     forward, left = (
         ego_box[COS] * cos[0] + ego_box[SIN] * sin[0],
@@ -540,11 +540,12 @@ def _collision_cost(pose: Float[Array, "H 4"], ego_box: Array, others: Others) -
 
     hit_earliness = earliness(overlaps(others.box, _TIGHT_M))
     price = jnp.where(hit_earliness > 0.0, _COLLISION + _EARLY_COLLISION * hit_earliness, 0.0)
-    price = jnp.maximum(price, _POSSIBLE * earliness(overlaps(others.maybe, _POSSIBLE_M) & others.enters))
+    possible_hits = overlaps(others.entering_box, _POSSIBLE_M) & others.may_enter
+    price = jnp.maximum(price, _POSSIBLE * earliness(possible_hits))
     worst = jnp.max(price * jnp.where(others.behind, _REAR_FACTOR, 1.0))
     # Agents that cross or enter ego's path may arrive earlier or later.
     cos = jnp.einsum("hi,hki->hk", pose[:, 2:4], others.box[..., COS : SIN + 1])
-    crosses = ((cos < SAME_DIRECTION) | others.enters) & (others.speed > SLOW_MPS) & others.vehicle
+    crosses = ((cos < SAME_DIRECTION) | others.may_enter) & (others.speed > SLOW_MPS) & others.vehicle
     times = prediction_times()[:, None]
     early_m = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
     inflated = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early_m, 0.0))

@@ -40,7 +40,7 @@ def main() -> None:
     values = {"DATA": str(args.data.resolve()), "TREE": str(args.against.resolve())}
     for name in args.only:
         words, has_table = SCRIPTS[name]
-        # The encoders' script writes always.
+        # The encoders' script always writes.
         write = () if name == "encoders" else ("--write",)
         calls = [(*(values.get(word, word) for word in words), *write)] + [("--table",)] * has_table
         for call in calls:

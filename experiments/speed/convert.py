@@ -40,8 +40,8 @@ AIMS = {"convert_audited_per_s": 8, "read_checked_per_s": 5_000, "read_unchecked
 BATCH = 64
 
 
-def repeated(source: Path, target: Path, copies: int) -> Path:
-    """Return the first record of a TFRecord file of protos, repeated under new ids."""
+def write_copies(source: Path, target: Path, copies: int) -> Path:
+    """Write copies of the first record of a TFRecord file of protos under new ids, and return their file."""
     _, payload = next(read_records(source))
     message = message_class("Scenario").FromString(payload)
     with target.open("wb") as file:
@@ -51,28 +51,28 @@ def repeated(source: Path, target: Path, copies: int) -> Path:
     return target
 
 
-def timed(work: Callable[[], object]) -> tuple[float, float]:
+def time_call(work: Callable[[], object]) -> tuple[float, float]:
     """Return CPU seconds and wall seconds of a call."""
-    processor, passed = time.process_time(), time.perf_counter()
+    cpu_start, wall_start = time.process_time(), time.perf_counter()
     work()
-    return time.process_time() - processor, time.perf_counter() - passed
+    return time.process_time() - cpu_start, time.perf_counter() - wall_start
 
 
 def conversion(source: Path, folder: Path, scenarios: int) -> dict[str, float]:
-    """Scenarios per second to a stored and audited set, and the time of each part."""
-    data = repeated(source, folder / "data.tfrecord", scenarios)
-    few = repeated(source, folder / "few.tfrecord", 2)
+    """Scenarios per second that are converted to a stored and audited set, and the time of each part."""
+    data = write_copies(source, folder / "data.tfrecord", scenarios)
+    few = write_copies(source, folder / "few.tfrecord", 2)
     convert(few, folder / "compiled", audit=audit)  # the audit is compiled once and kept for later runs
-    audited, passed = timed(lambda: convert(data, folder / "audited", audit=audit))
-    decoding, _ = timed(lambda: sum(1 for _ in WomdScenario().read(data)))
-    assembling, _ = timed(lambda: sum(1 for _ in convert_file(data, Conversion())))
+    cpu_s, wall_s = time_call(lambda: convert(data, folder / "audited", audit=audit))
+    decoding, _ = time_call(lambda: sum(1 for _ in WomdScenario().read(data)))
+    assembling, _ = time_call(lambda: sum(1 for _ in convert_file(data, Conversion())))
     batch = ScenarioSet.open(folder / "audited")[:BATCH]
-    auditing, _ = timed(lambda: audit(batch))
-    writing, _ = timed(lambda: large_set(folder / "audited", folder / "written", scenarios))
+    auditing, _ = time_call(lambda: audit(batch))
+    writing, _ = time_call(lambda: large_set(folder / "audited", folder / "written", scenarios))
     return {
         "scenarios": scenarios,
-        "convert_audited_per_s": scenarios / audited,
-        "convert_audited_per_s_passed": scenarios / passed,
+        "convert_audited_per_s": scenarios / cpu_s,
+        "convert_audited_per_s_passed": scenarios / wall_s,
         "decode_ms": 1e3 * decoding / scenarios,
         "assemble_ms": 1e3 * (assembling - decoding) / scenarios,
         "audit_ms": 1e3 * auditing / len(batch),
@@ -107,11 +107,11 @@ def reading(path: Path, repeats: int) -> dict[str, float]:
     batches = [order[at : at + BATCH] for at in range(0, count - BATCH + 1, BATCH)]
     memory = np.zeros(BATCH, record_dtype(ScenarioSet.open(path).capacity))
 
-    def copied(opened: ScenarioSet) -> None:
+    def copy_records(opened: ScenarioSet) -> None:
         for batch in batches:
             opened.records(batch, out=memory)
 
-    def viewed(opened: ScenarioSet) -> None:
+    def view_records(opened: ScenarioSet) -> None:
         for batch in batches:
             for row in batch.tolist():
                 opened[row]
@@ -122,16 +122,16 @@ def reading(path: Path, repeats: int) -> dict[str, float]:
             opened = ScenarioSet.open(path, verify=verify)
             if again:
                 read(opened)
-            seconds.append(timed(partial(read, opened))[0])
+            seconds.append(time_call(partial(read, opened))[0])
         return len(batches) * BATCH / min(seconds)
 
     return {
         "set": count,
-        "read_checked_per_s": best(copied, verify=True),
-        "read_unchecked_first_per_s": best(copied, verify=False),
-        "read_unchecked_per_s": best(copied, verify=False, again=True),
-        "view_checked_per_s": best(viewed, verify=True),
-        "view_unchecked_per_s": best(viewed, verify=False),
+        "read_checked_per_s": best(copy_records, verify=True),
+        "read_unchecked_first_per_s": best(copy_records, verify=False),
+        "read_unchecked_per_s": best(copy_records, verify=False, again=True),
+        "view_checked_per_s": best(view_records, verify=True),
+        "view_unchecked_per_s": best(view_records, verify=False),
     }
 
 

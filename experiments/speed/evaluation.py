@@ -36,7 +36,7 @@ AIMS = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pd
 TRAFFIC = ("log", "idm")
 
 
-def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, str]]) -> float:
+def evaluation_seconds(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, str]]) -> float:
     """Seconds for 1,000 scenarios of 80 steps."""
     driver, task = find_planner(planner, bank, False)
     ends: list[float] = []
@@ -46,13 +46,13 @@ def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, 
         names,
         task=task,
         traffic=find_traffic(traffic),
-        progress=lambda done, whole: ends.append(time.perf_counter()),
+        progress=lambda done, total: ends.append(time.perf_counter()),
     )
-    batch = (ends[-1] - ends[0]) / (len(ends) - 1)
-    return 1000 / program_width() * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
+    batch_s = (ends[-1] - ends[0]) / (len(ends) - 1)
+    return 1000 / program_width() * batch_s * 80 / (bank.steps - 1 - CURRENT_STEP)
 
 
-def measured(data: Path, planners: list[str]) -> dict[str, Any]:
+def measure(data: Path, planners: list[str]) -> dict[str, Any]:
     """Seconds by planner and traffic."""
     stored = ScenarioSet.open(data)
     scenarios = [stored[row] for row in range(SCENARIOS)]
@@ -60,7 +60,9 @@ def measured(data: Path, planners: list[str]) -> dict[str, Any]:
     rows: dict[str, dict[str, Any]] = {}
     for planner in planners:
         with conditions() as record:
-            rows[planner] = {kind: round(timed(planner, kind, bank, names), 2) for kind in TRAFFIC}
+            rows[planner] = {
+                kind: round(evaluation_seconds(planner, kind, bank, names), 2) for kind in TRAFFIC
+            }
         rows[planner] |= record
         print(planner, rows[planner], flush=True)
     return {
@@ -95,12 +97,12 @@ def main() -> None:
     args = parser.parse_args()
     if args.table:
         before, rest = PAGE.read_text().split(BEGIN)
-        found = table(json.loads(RESULT.read_text()))
-        PAGE.write_text(f"{before}{BEGIN}\n\n{found}\n\n{END}{rest.split(END)[1]}")
+        text = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.split(END)[1]}")
         return
     if args.data is None:
         parser.error("the following arguments are required: --data")
-    result = measured(args.data, args.planner)
+    result = measure(args.data, args.planner)
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -48,19 +48,19 @@ def seconds(call: Callable[[], Any], repeats: int) -> float:
 
 def elapsed(call: Callable[[], Any]) -> float:
     """Seconds of a call."""
-    began = time.perf_counter()
+    start = time.perf_counter()
     jax.block_until_ready(call())
-    return time.perf_counter() - began
+    return time.perf_counter() - start
 
 
 def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
     """Return a training's iteration function and its number of trained parameters."""
     environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    began = time.perf_counter()
+    start = time.perf_counter()
     weights = np.ones((len(bank), bank.steps))
     experience = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
-    preparation_s = time.perf_counter() - began
+    preparation_s = time.perf_counter() - start
     program = Program(Seeds(learner, (0,)), experience, 1)
     state = [program.initial_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
@@ -104,15 +104,15 @@ def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
     config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
-    began, ensemble_s, single_s = [0.0], list[float](), list[float]()
+    start, ensemble_s, single_s = [0.0], list[float](), list[float]()
 
     def turn(done: int, total: int) -> None:
         end = time.perf_counter()
         jax.block_until_ready(iterate())
         if done > 1:
-            ensemble_s.append(end - began[0])
+            ensemble_s.append(end - start[0])
             single_s.append(time.perf_counter() - end)
-        began[0] = time.perf_counter()
+        start[0] = time.perf_counter()
 
     train_ensemble(config, data, turn)
     single, ensemble = statistics.median(single_s), statistics.median(ensemble_s)

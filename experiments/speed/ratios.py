@@ -1,16 +1,16 @@
-"""Time this tree against another, by turns, in one run; the ratios go into the page on speed.
+"""Time this tree against another, alternately, in one run; the ratios go into the page on speed.
 
     git worktree add ../before COMMIT
     python -m experiments.speed.ratios --data SET --against ../before [--only NAME ...] [--write]
     python -m experiments.speed.ratios --data SET --kernels [--only NAME ...] [--write]
     python -m experiments.speed.ratios --data SET --cores [--only NAME ...] [--write]
 
-With ``--against``, both trees run without native kernels; with ``--kernels``, this tree is timed without them against
-itself with them; with ``--cores``, with them on one core against itself on all cores. Both sides train the presets of
-the first.
+``--against`` times two trees without native kernels, ``--kernels`` this tree without native kernels and with them, and
+``--cores`` this tree with native kernels on one core and on all cores. Both sides train with the presets of the first
+side.
 
 SET has at least 1,024 scenarios, and both trees can open it. Each tree runs in processes of its own. A repeated
-measurement keeps one process per tree alive, runs both by turns, and quotes the median of the ratios of neighbouring
+measurement keeps one process per side alive, runs both alternately, and reports the median of the ratios of adjacent
 runs; the first runs of each, which compile, do not count. A command starts in a new process, with an empty compilation
 cache (``first``) or with that of an earlier run (``again``). Nothing else may run on the machine. Each row has the time
 of a fixed program and the load before and after it.
@@ -42,7 +42,7 @@ PAGE = DOCS / "results" / "speed.md"
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the two sides are: key of the rows in the result, markers around the table, and headings of its sides."""
+    """Kind of comparison: key of its rows in the result, markers around its table, and headings of the two sides."""
 
     key: str
     begin: str
@@ -221,7 +221,7 @@ def call():
     "train to its first iteration, first": Command(_TRAIN, "metrics.jsonl"),
     "train to its first iteration, again": Command(_TRAIN, "metrics.jsonl", {TREES: "15 s (8 s)"}),
 }
-#: Runs what it was given for each line of input; prints the work done and the seconds.
+#: Program that calls ``call`` for each line of input, and prints the work done and the seconds.
 _LOOP = """
 import sys, time
 for line in sys.stdin:
@@ -294,7 +294,7 @@ class Worker:
 
 
 def repeated(measurement: Repeated, sides: Sequence[Side], data: Path, repeats: int) -> dict[str, Any]:
-    """Return work per second of both sides, by turns; medians."""
+    """Return medians of work per second of both sides, measured alternately."""
     with tempfile.TemporaryDirectory() as cache:
         presets = sides[0].tree / "configs"
         workers = [
@@ -350,19 +350,19 @@ def command_seconds(command: Command, side: Side, data: Path, folder: Path, cach
 def timed_command(
     name: str, command: Command, sides: Sequence[Side], data: Path, repeats: int
 ) -> dict[str, Any]:
-    """Return seconds of a command of both sides, by turns; medians."""
+    """Return medians of the seconds of a command on both sides, measured alternately."""
     pairs = []
     with tempfile.TemporaryDirectory() as top:
         folder = Path(top)
         for turn in range(repeats + 1):
-            kept = not name.endswith("first")
-            caches = [folder / f"cache-{k}{'' if kept else f'-{turn}'}" for k in (0, 1)]
+            keeps_cache = not name.endswith("first")
+            caches = [folder / f"cache-{k}{'' if keeps_cache else f'-{turn}'}" for k in (0, 1)]
             seconds = [
                 command_seconds(command, side, data, folder, cache)
                 for side, cache in zip(sides, caches, strict=True)
             ]
             # The first turn fills the caches, and the page cache.
-            if turn or not kept:
+            if turn or not keeps_cache:
                 pairs.append((seconds[0], seconds[1]))
     before, after = (statistics.median(side) for side in zip(*pairs, strict=True))
     return {

@@ -99,39 +99,39 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
     bank = replicate(
         prepare_bank(IdmTraffic(), ScenarioBank.from_scenarios([stored[i] for i in range(SCENARIOS)]))
     )
-    best = {name: one["batch"] for name, one in json.loads(RESULT.read_text())["speed"].items()}
+    best = {name: speed["batch"] for name, speed in json.loads(RESULT.read_text())["speed"].items()}
     programs = []
     for name, batch in best.items():
         task, traffic = name.split(", ")
         config = BenchConfig(batch=batch, repeats=repeats, task=TASKS[task], traffic=traffic)
         programs.append(compile_program(bank, config))
     with conditions() as record:
-        speeds = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
-    return {**record, "steps_per_second": speeds, "versions": versions()}
+        rates = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
+    return {**record, "steps_per_second": rates, "versions": versions()}
 
 
 def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
     """Seconds to compile a program that steps or resets, and observes a batch, on one device.
 
-    The program that is timed does more: it drives by IDM, judges episodes, loops, and spans all devices.
+    The program that is timed does more: it drives by IDM, evaluates episodes, loops, and spans all devices.
     """
     simulator, batch = Simulator(task, make_traffic(traffic)), 64
 
-    def one(bank: ScenarioBank, state: Any, action: Any, over: Any, fresh: Any) -> Any:
+    def step_one(bank: ScenarioBank, state: Any, action: Any, over: Any, fresh: Any) -> Any:
         after, transition = simulator.step_or_reset(bank, state, action, over, fresh)
         return transition, simulator.observe(bank, after.context)
 
     def step(bank: ScenarioBank, states: Any, actions: Any, over: Any, index: Any) -> Any:
         fresh = map_where(over, partial(simulator.new_episode, bank), index)
-        return jax.vmap(one, in_axes=(None, 0, 0, 0, 0))(bank, states, actions, over, fresh)
+        return jax.vmap(step_one, in_axes=(None, 0, 0, 0, 0))(bank, states, actions, over, fresh)
 
     states = jax.eval_shape(jax.vmap(simulator.reset, in_axes=(None, 0)), bank, jnp.zeros(batch, jnp.int32))
     over, index = (jax.ShapeDtypeStruct((batch,), kind) for kind in (bool, jnp.int32))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), bank)
     jax.clear_caches()
-    began = time.perf_counter()
+    start = time.perf_counter()
     jax.jit(step).lower(shapes, states, states.context.action, over, index).compile()
-    return time.perf_counter() - began
+    return time.perf_counter() - start
 
 
 def more_segments(bank: ScenarioBank) -> ScenarioBank:
@@ -145,8 +145,8 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """Return the bank with a number of slots: the first ones, padded with empty ones."""
-    few = replace(
+    """Return the bank with a number of agent slots: the first ones, padded with empty ones."""
+    first = replace(
         bank,
         agents=bank.agents[:, :, :count],
         extension=bank.extension[:, :count],
@@ -154,31 +154,31 @@ def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
         parked=bank.parked[:, :count],
         parked_when=bank.parked_when[:, :, :count],
     )
-    return pad_agents(few, count - few.agents.shape[2])
+    return pad_agents(first, count - first.agents.shape[2])
 
 
 def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> float:
     """Ratio of the time per step of a large and a small bank, measured alternately."""
     programs = [compile_program(bank, config) for bank in (small, large)]
-    one, other = steps_per_second(programs, config.repeats)
-    return round(one / other, 3)
+    small_rate, large_rate = steps_per_second(programs, config.repeats)
+    return round(small_rate / large_rate, 3)
 
 
 def state_bytes(bank: ScenarioBank) -> dict[str, int]:
     """Bytes of an environment's state in each kind of traffic, full task."""
-    some = jax.tree.map(lambda leaf: leaf[:1], bank)
+    single = jax.tree.map(lambda leaf: leaf[:1], bank)
     slots = jnp.arange(1, 5)[None]
     motion = jnp.zeros((1, bank.steps, 4, 4))
     banks = {
-        "log": (some, None),
-        "idm": (some, IdmTraffic()),
-        "override": (with_override(some, slots, motion), OverrideTraffic()),
-        "override+idm": (with_override(some, slots, motion), OverrideTraffic(IdmTraffic())),
+        "log": (single, None),
+        "idm": (single, IdmTraffic()),
+        "override": (with_override(single, slots, motion), OverrideTraffic()),
+        "override+idm": (with_override(single, slots, motion), OverrideTraffic(IdmTraffic())),
     }
     sizes = {}
-    for name, (one, traffic) in banks.items():
+    for name, (traffic_bank, traffic) in banks.items():
         simulator = Simulator(TASKS["full"]) if traffic is None else Simulator(TASKS["full"], traffic)
-        ready = prepare_bank(simulator.traffic, one)
+        ready = prepare_bank(simulator.traffic, traffic_bank)
         state = jax.eval_shape(simulator.reset, ready, jnp.zeros((), jnp.int32))
         sizes[name] = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
     return sizes
@@ -217,9 +217,9 @@ def runs_table(runs: list[dict[str, Any]]) -> list[str]:
         "|---" * (len(names) + 3) + "|",
     ]
     for run in runs:
-        one = run["steps_per_second"]
-        ratio = one["lean, idm"] / one["lean, log"]
-        cells = [f"{one[name]:,}" for name in names]
+        rates = run["steps_per_second"]
+        ratio = rates["lean, idm"] / rates["lean, log"]
+        cells = [f"{rates[name]:,}" for name in names]
         machine = " to ".join(f"{value:.0f}" for value in sorted(run["machine_ms"]))
         rows.append(
             f"| {run['when'][:16].replace('T', ' ')} | {machine} | {' | '.join(cells)} | {ratio:.2f} |"
@@ -231,11 +231,11 @@ def table(result: dict[str, Any], runs: list[dict[str, Any]]) -> str:
     """Return the page's tables."""
     rows = ["| task | traffic | steps/s | batch | state (B) | a step, compiled (s) | all, compiled (s) |"]
     rows += ["|---|---|---|---|---|---|---|"]
-    for name, one in result["speed"].items():
+    for name, speed in result["speed"].items():
         task, traffic = name.split(", ")
         rows.append(
-            f"| {task} | `{traffic}` | {one['steps_per_second']:,} | {one['batch']} | {one['state_bytes']:,} "
-            f"| {one['compile_seconds']:.1f} | {one['program_compile_seconds']:.1f} |"
+            f"| {task} | `{traffic}` | {speed['steps_per_second']:,} | {speed['batch']} | {speed['state_bytes']:,} "
+            f"| {speed['compile_seconds']:.1f} | {speed['program_compile_seconds']:.1f} |"
         )
     rows += ["", *runs_table(runs)]
     rows += ["", "| metrics | batch | steps/s | relative |", "|---|---|---|---|"]
@@ -289,7 +289,7 @@ def main() -> None:
         RUNS.write_text(json.dumps(runs, indent=1) + "\n")
         print("\n".join(runs_table(runs)))
         return
-    # The set by its name: where it lies on this machine does not matter.
+    # Only the set's name: its folder on this machine does not matter.
     command = (
         f"python -m experiments.speed.simulator --data {args.data.name} --repeats {args.repeats} --write"
     )

@@ -51,7 +51,7 @@ KINDS = {
 
 
 def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], Any]]:
-    """Return the programs to time: an iteration or its part, always from the same state."""
+    """Return the programs to time: a whole iteration, and parts of it that always start at the same state."""
     learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     assert isinstance(learner, Ppo)
     program = Program(Seeds(learner, (0,)), bank, config.devices)
@@ -108,10 +108,10 @@ def measure(data: Path, repeats: int, environments: int | None) -> dict[str, Any
     times: dict[tuple[str, str], list[float]] = {kind: [] for kind in calls}
     for turn in range(repeats + 1):
         for kind, call in calls.items():
-            began = time.perf_counter()
+            start = time.perf_counter()
             jax.block_until_ready(call())
             if turn:
-                times[kind].append(time.perf_counter() - began)
+                times[kind].append(time.perf_counter() - start)
     result = {}
     for name in KINDS:
         whole, acting, simulating = (

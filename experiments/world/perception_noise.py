@@ -1,7 +1,7 @@
 """Estimate jitter in tracks of real logs, for the built-in world's perception noise.
 
 Tracks of other moving vehicles are smoothed with a Savitzky-Golay filter of 1.1 s and order 3; the residual is the
-tracker's noise (and the motion that a cubic cannot follow). The filter takes part of correlated noise for motion, so
+tracker's noise (and the motion that a cubic cannot follow). The filter mistakes part of correlated noise for motion, so
 an AR(1) process is fitted whose residual under the same filter has the measured standard deviation and lag-1
 autocorrelation (both in closed form from the filter's matrix).
 
@@ -94,7 +94,7 @@ def residuals(recording: Recording) -> dict[str, list[Array]]:
 
 
 def summary(pieces: list[Array]) -> dict[str, float]:
-    """Return medians of the residual's deviation and autocorrelation, its 90th percentile, and the fitted noise."""
+    """Return median and 90th percentile of residual deviations, their median autocorrelation, and the fitted noise."""
     # Medians over runs are robust to a few tracks with swapped identities.
     deviation = float(np.median([np.std(piece) for piece in pieces]))
     lag = float(np.median([np.mean(p[1:] * p[:-1]) / max(np.mean(p * p), 1e-12) for p in pieces]))

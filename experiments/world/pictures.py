@@ -27,7 +27,7 @@ from drivax.report.pictures.drawing import road_lines
 from drivax.report.pictures.palette import LIGHT
 from drivax.report.pictures.still import draw_on
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.schema import CURRENT_STEP, Scenario
+from drivax.scenario.schema import CURRENT_STEP, DT_S, Scenario
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.world import WorldConfig, generate_one
@@ -165,7 +165,7 @@ def draw_event(axes: Axes, scenario: Scenario) -> None:
     axes.text(
         0.97,
         0.03,
-        f"{(step - first) * 0.1:+.1f} s",
+        f"{(step - first) * DT_S:+.1f} s",
         transform=axes.transAxes,
         ha="right",
         fontsize=10,

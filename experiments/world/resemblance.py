@@ -1,8 +1,8 @@
 """Compare the built-in world with real recordings: one figure, medians, Kolmogorov-Smirnov distances.
 
-Compares ego and every other vehicle that is always valid, within 50 m of ego on average and drives at least 5 m, in the
-world and the recordings. The recordings come from a few places and do not represent any data set, so differences in
-the number of agents may reflect these places.
+Compares ego and every other vehicle that is always valid, stays within 50 m of ego on average and drives at least 5 m,
+in the world and the recordings. The recordings come from a few places and do not represent any data set, so differences
+in the number of agents may reflect these places.
 
 Run: python -m experiments.world.resemblance --data ../shared/data --scenarios 256 [--write]
 """
@@ -52,6 +52,8 @@ FIRST_IN_ROW = tuple(QUANTITIES)[::3]
 MIN_DISTANCE_M = 5.0
 #: Maximum mean distance of a compared vehicle from ego, whose sensors record its surroundings, m.
 NEAR_EGO_M = 50.0
+#: Maximum distance of counted agents from a compared vehicle, m.
+COUNTED_WITHIN_M = 50.0
 #: Maximum gap to a leader, and its maximum lateral distance from the subject's axis, m. Headings differ by at most 45
 #: degrees.
 LEADER_M, LEADER_LATERAL_M = 60.0, 1.6
@@ -84,15 +86,16 @@ def _subject(row: int, box: Array, velocity: Array, valid: Array, kind: Array) -
     offset = others[..., :2] - box_of_subject[:, None, :2]
     distance = np.where(present, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
     gap = _leader_gap(box_of_subject, others, offset, present & (kind == AgentKind.VEHICLE))
-    has_leader, is_moving, near = gap < LEADER_M, speed > MIN_SPEED_MPS, distance.min(axis=1, initial=np.inf)
+    has_leader, is_moving = gap < LEADER_M, speed > MIN_SPEED_MPS
+    nearest_m = distance.min(axis=1, initial=np.inf)
     return {
         "speed": speed,
         "acceleration": acceleration,
         "yaw_rate": yaw_rate[is_moving],
         "leader_m": gap[has_leader],
         "leader_s": gap[has_leader & is_moving] / speed[has_leader & is_moving],
-        "agents": (distance < 50.0).sum(axis=1).astype(np.float64),
-        "nearest_m": near[np.isfinite(near)],
+        "agents": (distance < COUNTED_WITHIN_M).sum(axis=1).astype(np.float64),
+        "nearest_m": nearest_m[np.isfinite(nearest_m)],
     }
 
 

@@ -163,8 +163,8 @@ def _generation(result: Result) -> list[tuple[str, str]]:
     for name, generation in result["generation"].items():
         for family, count in generation["families"].items():
             causes = ", ".join(f"{k} {v}" for k, v in sorted(count["causes"].items()))
-            text = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
-            pairs.append((f"{name}: {family} rejected", text))
+            rejections = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
+            pairs.append((f"{name}: {family} rejected", rejections))
     return pairs
 
 

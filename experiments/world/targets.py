@@ -165,25 +165,25 @@ def compare_coverage(
     roads that suit their event. Kinds of events are counted over all rare scenarios.
     """
     maps = {row["segment"]: row["family"] for row in rows if row["event"] is None}
-    events_rows = [row for row in (*rows, *rare) if row["event"] is not None]
-    families, events = Counter(maps.values()), Counter(row["event"] for row in events_rows)
-    table: dict[str, Counter[str]] = {}
-    for row in events_rows:
-        table.setdefault(row["event"], Counter())[row["family"]] += 1
+    event_rows = [row for row in (*rows, *rare) if row["event"] is not None]
+    families, events = Counter(maps.values()), Counter(row["event"] for row in event_rows)
+    family_by_event: dict[str, Counter[str]] = {}
+    for row in event_rows:
+        family_by_event.setdefault(row["event"], Counter())[row["family"]] += 1
     probabilities = {family.name: p for family, p in DOMAINS[world.domain].families}
     kinds = [kind.name.lower() for kind in EventKind if kind]
-    count = len(probabilities) + len(kinds) + 1
+    comparisons = len(probabilities) + len(kinds) + 1
     event_count = sum(row["event"] is not None for row in rows)
     return {
         "families": {
-            name: compare_share(p, families[name], len(maps), count)
+            name: compare_share(p, families[name], len(maps), comparisons)
             for name, p in sorted(probabilities.items())
         },
-        "rare_rate": compare_share(world.rare_rate, event_count, len(rows), count),
+        "rare_rate": compare_share(world.rare_rate, event_count, len(rows), comparisons),
         "events": {
-            name: compare_share(1 / len(kinds), events[name], len(events_rows), count) for name in kinds
+            name: compare_share(1 / len(kinds), events[name], len(event_rows), comparisons) for name in kinds
         },
-        "family_by_event": {event: dict(counts) for event, counts in sorted(table.items())},
+        "family_by_event": {event: dict(counts) for event, counts in sorted(family_by_event.items())},
     }
 
 

@@ -41,7 +41,7 @@ class Loaded:
         scenarios: The stored scenarios.
         bank: The scenarios stacked on the device, an argument of all simulation functions.
         names: ``dataset``, ``scenario_id`` and ``segment`` of each scenario.
-        sizes: Bank sizes of the whole set, which make results of a subset bit-identical.
+        sizes: Bank sizes of the whole set, so that its scenarios give the same results in any subset, bit for bit.
     """
 
     scenarios: Sequence[Scenario]
@@ -67,7 +67,7 @@ def load(
 
     Raises:
         DataError: The set is damaged, an id is not in it, or no scenario is left.
-        UsageError: A filter or the limit is impossible.
+        UsageError: A filter or the limit is invalid.
     """
     if limit is not None and limit < 1:
         raise UsageError(f"a limit of {limit} leaves no scenario", cure="use 1 or more")
@@ -99,7 +99,7 @@ def make_simulator(
 
 
 def as_traffic(traffic: str | Traffic, trust: Sequence[str] = ()) -> Traffic:
-    """Return the traffic of a name (:func:`make_simulator`); a traffic object stays as it is."""
+    """Return the traffic model of a name, as in :func:`make_simulator`; a traffic object is returned unchanged."""
     if not isinstance(traffic, str):
         return traffic
     return make_traffic(traffic) if traffic in TRAFFIC else learning.find_traffic(traffic, trust)
@@ -162,7 +162,8 @@ def find_planner(
     """
     if name in PLANNERS or is_dotted(name):
         if sample:
-            raise UsageError(f"{name!r} is no trained policy to sample", cure="leave out --sample (sample=)")
+            problem = f"{name!r} is not a trained policy, so it cannot sample"
+            raise UsageError(problem, cure="leave out --sample (sample=)")
         planner = make_planner(name, task and task.actions)
         return planner, task or default_task(planner)
     folder, step = run_and_step(name)
@@ -186,7 +187,7 @@ def generate(
         options: World, workers, capacity, length, egos, and whether to overwrite ``out``.
 
     Raises:
-        UsageError: ``out`` exists without ``options.overwrite``, or an option is impossible.
+        UsageError: ``out`` exists without ``options.overwrite``, or an option is invalid.
     """
     from drivax.synthetic.generate import generate as generate_set
 
@@ -203,7 +204,7 @@ def convert(src: str | Path, out: str | Path, **options: Any) -> datasets.Conver
 
     Raises:
         DataError: ``src`` has no file of a known format.
-        UsageError: ``out`` exists, an option is impossible, or a package is missing.
+        UsageError: ``out`` exists, an option is invalid, or a package is missing.
     """
     return datasets.convert(src, out, datasets.Conversion(**options), audit=audit)
 
@@ -224,7 +225,7 @@ def compare(
 
     Raises:
         DataError: A run folder is missing or damaged.
-        UsageError: The evaluations cannot be compared, or a setting is impossible.
+        UsageError: The evaluations cannot be compared, or a setting is invalid.
     """
     plan = replace(plan or ComparisonPlan(), a=Path(a), b=Path(b), **settings)
     first, second = (EpisodeTable.read_seeds(Path(run)) for run in (a, b))
@@ -244,7 +245,7 @@ def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> curat
 
     Raises:
         DataError: The method cannot score this set.
-        UsageError: Unknown method or impossible settings.
+        UsageError: Unknown method or invalid settings.
     """
     scenarios = data if isinstance(data, ScenarioSet) else ScenarioSet.open(data)
     return curation.curate(method, curation.Request(scenarios, **options))

@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 MOST_SAMPLES = 1 << 20
 #: Largest number of steps of n-step returns.
 MOST_RETURN_STEPS = 1000
-#: Largest number of steps that an iteration collects in all environments; the published ones have 8,192.
+#: Largest number of steps that an iteration collects in all environments; those of the presets collect up to 8,192.
 MOST_STEPS_PER_ITERATION = 1 << 24
 
 

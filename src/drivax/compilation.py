@@ -22,8 +22,8 @@ from pathlib import Path
 _PATIENCE_S = 2.0
 #: Programs that compile faster are not stored (s): reading them takes as long.
 _LEAST_COMPILE_S = 0.1
-#: Size to which the cache is cut (bytes), and time since its last use after which a file may be deleted (s): another
-#: process may still be writing a newer one.
+#: Size to which the cache is cut (bytes), and time since the last use of a file after which it may be deleted (s):
+#: another process may still be writing a newer file.
 _MAX_BYTES, _SETTLED_S = 2 << 30, 600.0
 
 

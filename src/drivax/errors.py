@@ -20,7 +20,7 @@ _EXTRAS = {
     "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
     "minari": "minari", "h5py": "minari",
 }  # fmt: skip
-#: Maximum length of a problem, record or cure, in characters; of longer ones, which quote a value, both ends are kept.
+#: Maximum length of a problem, record or cure, in characters; longer texts, which quote a value, keep both ends.
 _LONGEST = 1000
 #: Cure of a full disk.
 MAKE_ROOM = "make room, or choose another disk"

@@ -1,4 +1,4 @@
-"""Escape text from files: CSV cells that a spreadsheet would compute, and control characters of terminals."""
+"""Escape text from files: CSV cells that a spreadsheet would run as formulas, and control characters of terminals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-#: Characters that begin a formula in spreadsheets, full-width ones included, and blanks before them, which some strip.
+#: Characters that begin a formula, full-width ones included, and blanks before them, which some spreadsheets strip.
 _BEGIN, _BLANKS = r"[=+\-@\uff1d\uff0b\uff0d\uff20]", r"[ \xa0]*"
 #: Matches before a formula, or before a tab or line break that may hide one, but not before a number.
 _FORMULA = rf"(?=[\t\r\n]|{_BLANKS}{_BEGIN})(?![+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\Z)"
@@ -32,7 +32,7 @@ def show(text: object = "", file: Any = None) -> None:
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV; an apostrophe precedes each text that a spreadsheet would compute (:func:`csv_rows`).
+    """Return rows as CSV; an apostrophe precedes text that a spreadsheet would run as a formula (:func:`csv_rows`).
 
     This includes text after a separator in a cell, such as ``;=1``: some spreadsheets begin a cell there.
     """

@@ -6,7 +6,7 @@ While a process writes the folder ``sets/a``, ``sets/.a.partial`` has::
     identity.json  description of the content; only the same content is resumed
     progress/      one note per finished part
     content/       becomes ``sets/a``
-    old/           the replaced ``sets/a``, on disks that cannot exchange two folders
+    old/           the replaced ``sets/a``, on file systems that cannot exchange two folders
     spool*/        temporary files of the writer
 
 The next writer of ``sets/a`` takes over what a killed process left. If a note is damaged, too large or not a regular
@@ -34,7 +34,7 @@ from drivax.errors import MAKE_ROOM, DataError, UsageError
 
 #: Flags of renameat2 (Linux): relative to the current folder, exchange both names.
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-#: Errors of disks without locks or without exchange.
+#: Errors of file systems that cannot lock files or exchange two names.
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EXDEV)
 #: Files of a partial folder; its other entries are folders.
 _FILES = ("identity.json", "lock")
@@ -88,7 +88,7 @@ def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
 
 
 def path_end(path: Path, others: Iterable[Path]) -> str:
-    """Return the shortest trailing part of a path in which no path of ``others`` ends, or the whole path."""
+    """Return the shortest trailing part of a path that no path of ``others`` ends with, or the whole path."""
     parts, other_parts = path.parts, [other.parts for other in others]
     lengths = (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in other_parts))
     return str(Path(*parts[-next(lengths, len(parts)) :]))
@@ -155,7 +155,7 @@ def explain_full_disk(path: Path, size: int = 0) -> Iterator[None]:
 
 
 def _is_full_disk(error: Exception) -> bool:
-    """Return whether the disk is full, by a system error or one of a library (TensorStore) that quotes it."""
+    """Return whether an error means a full disk: a system error, or a library's (TensorStore) that quotes one."""
     codes = (errno.ENOSPC, errno.EDQUOT)
     has_code = isinstance(error, FullDiskError) or getattr(error, "errno", None) in codes
     return has_code or any(os.strerror(code) in str(error) for code in codes)
@@ -210,7 +210,7 @@ def inside(folder: Path, *names: str) -> Path:
         path /= name
         if path.is_symlink():
             raise DataError(
-                "is a symbolic link", file=path, cure="replace the link by what it leads to, or remove it"
+                "is a symbolic link", file=path, cure="replace the link with its target, or remove it"
             )
     return path
 
@@ -384,7 +384,7 @@ def allow_open_files(path: Path, number: int) -> None:
         return
     if hard != infinity and total > hard:
         problem = f"needs {total} open files, the limit is {hard}"
-        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {total}, or a larger shard size")
+        raise UsageError(problem, file=path, cure=f"raise it: ulimit -Hn {total}, or use a larger shard size")
     resource.setrlimit(resource.RLIMIT_NOFILE, (total, hard))
 
 
@@ -394,7 +394,7 @@ def _follow(path: Path) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Remove whatever has a name: a folder with its content, or a file; of a symbolic link, the link."""
+    """Remove a folder with its content, a file, or a symbolic link but not its target."""
     if _has_kind(path, folder=True):
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -451,7 +451,7 @@ def _open_locked(path: Path, wait: bool = False) -> IO[bytes]:
 
 
 def _exchange(first: Path, second: Path) -> bool:
-    """Exchange the names of two folders in one step; return False if system or disk cannot."""
+    """Exchange the names of two folders atomically; return False if the system or file system cannot."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)  # Linux only
     if rename is None:
         return False

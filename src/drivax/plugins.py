@@ -179,7 +179,7 @@ def _signature(function: Any) -> inspect.Signature | None:
 
 
 def result_class(function: Any) -> type | None:
-    """Return the class of what a class or function returns, from its annotation; None if unknown."""
+    """Return the class of the object that a class or function makes, from its annotation; None if unknown."""
     if isinstance(function, type):
         return function
     if isinstance(function, BuiltinFunctionType):

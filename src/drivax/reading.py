@@ -121,7 +121,7 @@ def read_json(file: Path, cure: str, most: int = MOST_TEXT) -> Any:
 
 
 def read_lines(file: Path, cure: str, most: int = MOST_TEXT) -> Iterator[str]:
-    """Yield the lines of a UTF-8 file with their line ends, reading one at a time.
+    """Yield the lines of a UTF-8 file with their line endings, reading one at a time.
 
     Raises:
         DataError: The file is missing, larger than ``most`` bytes, or not text, or has a line of more than
@@ -165,7 +165,7 @@ def _check_length(length: int) -> None:
 def read_arrays(
     file: Path, cure: str, most: int, check: Callable[[Mapping[str, ArrayType]], None] | None = None
 ) -> dict[str, Array]:
-    """Return the arrays of an ``.npz`` file by name; checksums are tested, objects are refused.
+    """Return the arrays of an ``.npz`` file by name; checksums are verified, objects are refused.
 
     ``check`` gets the shapes and types of all arrays by name before any is unpacked.
 
@@ -181,7 +181,7 @@ def read_arrays(
         if len(set(names)) < len(names):
             raise ValueError("a name occurs twice")
         if any(member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for member in members):
-            raise ValueError("compressed by another method than deflate")
+            raise ValueError("compressed by a method other than deflate")
         if check is not None:
             check(dict(zip(names, (_read_type(archive, member) for member in members), strict=True)))
         arrays = (parse_array(_unpack(archive, member)) for member in members)
@@ -197,7 +197,7 @@ def _read_type(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayType:
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     """Return the content of a member, up to the size that it states."""
     with archive.open(member) as file:
-        # Without a length, zipfile unpacks 2 GiB at a time. One byte more reaches the end, which tests the checksum.
+        # Without a length, zipfile unpacks 2 GiB at a time. One more byte reaches the end and verifies the checksum.
         return file.read(member.file_size + 1)
 
 
@@ -212,7 +212,7 @@ def parse_array(data: bytes) -> Array:
     if dtype.hasobject:
         raise ValueError("an array of Python objects")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-        raise ValueError("an array of another length than its header says")
+        raise ValueError("an array whose length differs from its header")
     if not math.prod(shape) or not dtype.itemsize:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, offset=stream.tell())
@@ -220,7 +220,7 @@ def parse_array(data: bytes) -> Array:
 
 
 def read_array_header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read shape, whether the order is Fortran's, and dtype of a ``.npy`` file; stop at the first byte of data.
+    """Read shape, Fortran order and dtype of a ``.npy`` file; stop at the first byte of data.
 
     Raises:
         Exception: One of :data:`DAMAGE`.

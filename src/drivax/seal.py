@@ -1,7 +1,7 @@
 """Seals: ``seal.json`` in a folder holds the SHA-256 of the files that decide results, and is written last.
 
 A seal detects accidents and edits, not forgery: a forger can write the seal, too. Files without an entry, such
-as the metrics of an unfinished training, are not checked; :func:`require_entries` finds the loss of a seal.
+as the metrics of an unfinished training, are not checked; :func:`require_entries` detects a missing seal.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _block: ContextVar[_Block | None] = ContextVar("block", default=None)
 
 
 def seal(folder: Path, *names: str) -> None:
-    """Seal files of a folder in their present state: their content, or that they do not exist."""
+    """Record the present state of files in the seal of their folder: their SHA-256, or that they do not exist."""
     edited = edited_files(folder)  # Their entries do not change, so that they stay edited.
     digests = {name: _digest(folder / name) for name in names if str(folder / name) not in edited}
     write_json(folder / SEAL, {**_read(folder / SEAL), **digests}, follow=False)

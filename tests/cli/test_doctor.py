@@ -91,7 +91,7 @@ def test_a_folder_of_everything(tmp_path, capsys):
         ("av2_motion", "log_map_archive_*.json", "log_map_archive"),
         ("av2_sensor", "*/map", "map"),
         ("av2_sensor", "*/city_SE3_egovehicle.feather", "city_SE3_egovehicle.feather"),
-        ("av2_sensor", "*/annotations.feather", "without annotations, as those of the test split"),
+        ("av2_sensor", "*/annotations.feather", "without annotations, like those of the test split"),
         ("nuscenes", "v1.0-*/sample.json", "tables of nuScenes, but not all that are needed"),
     ],
 )
@@ -167,7 +167,7 @@ def test_scenario_sets_are_referred_to_inspect(tmp_path, capsys):
     (tmp_path / "shard.tfrecord").write_bytes(wire.frame(wire.scenario(steps=11, map=b"")))
     convert(tmp_path / "shard.tfrecord", tmp_path / "set")
     status, out = asked(tmp_path / "set", capsys)
-    assert status == 1 and "a scenario set of drivax already" in out and "drivax inspect" in out
+    assert status == 1 and "already a scenario set of drivax" in out and "drivax inspect" in out
     assert "seal.json" not in out and "changed" not in out
     manifest = tmp_path / "set" / "manifest.json"
     manifest.write_text(manifest.read_text().replace("shard.tfrecord", "other.tfrecord") + " ")
@@ -264,7 +264,7 @@ def test_all_notes_on_a_single_file_are_listed():
     one, other = Description("a", "b", notes=notes), Description("a", "b", notes=notes[:7])
     assert list(_notes([one])) == list(notes)
     assert list(_notes([one, other]))[6:] == [
-        "2 more notes; run drivax doctor on a single file to see all of its own"
+        "2 more notes; run drivax doctor on a single file to see all of its notes"
     ]
 
 

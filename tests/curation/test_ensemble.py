@@ -405,7 +405,7 @@ def test_invalid_settings_are_refused(data, tmp_path, capsys):
         EnsembleConfig(seed=-1)
     with pytest.raises(UsageError, match="policies cannot learn in direct_state"):
         EnsembleConfig(task=Task(actions=DirectState()))
-    with pytest.raises(UsageError, match="rarity is of actions of two dimensions; use weighted: plain"):
+    with pytest.raises(UsageError, match="rarity needs actions of two dimensions; use weighted: plain"):
         EnsembleConfig(weighted="rarity", task=Task(actions=DeltaLocal()))
     call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
     assert main([*call, "--folds", "3"]) == 2

@@ -49,7 +49,7 @@ def test_expressions_against_numpy(text, expected):
     ],
 )  # fmt: skip
 def test_other_expressions_are_refused(text):
-    with pytest.raises(UsageError, match=r"is no query|is a number"):
+    with pytest.raises(UsageError, match=r"is not a query|is a number"):
         evaluate(text, VALUES)
 
 

@@ -514,7 +514,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
     "the file has no dictionary 'dynamic_map_states'": _without("dynamic_map_states"),
     "the ego 'gone' is not one of 3 tracks": lambda tree: tree["metadata"].update(sdc_id="gone"),
     "the ego 'ego' is not one": lambda tree: tree["metadata"].pop("sdc_id"),
-    "has 40 values of heading, 91 steps": lambda tree: tree["tracks"]["17"]["state"].update(heading=np.zeros(40)),
+    "has 40 values of heading for 91 steps": lambda tree: tree["tracks"]["17"]["state"].update(heading=np.zeros(40)),
     "has a velocity of shape (91, 1)": lambda tree: tree["tracks"]["17"]["state"].update(velocity=np.zeros(91)),
     "has no position": lambda tree: tree["tracks"]["17"]["state"].pop("position"),
     "position are not rows of numbers": lambda tree: tree["tracks"]["17"]["state"].update(position=["x"] * 91),
@@ -528,7 +528,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
     "timestamps of shape (90,)": lambda tree: tree["metadata"].update(ts=np.arange(90)),
     "timestamps do not increase": lambda tree: tree["metadata"].update(ts=np.zeros(91)),
     "current_time_index is 91 of 91": lambda tree: tree["metadata"].update(current_time_index=91),
-    "light '2' has 3 states, 91 steps": lambda tree: tree["dynamic_map_states"]["2"].update(
+    "light '2' has 3 states for 91 steps": lambda tree: tree["dynamic_map_states"]["2"].update(
         state={"object_state": ["LANE_STATE_GO"] * 3}
     ),
     "the scenario has no id": lambda tree: (tree.pop("id"), tree["metadata"].pop("id")),

@@ -108,7 +108,7 @@ def test_18_any_other_global_is_refused_with_its_name(called, name, protocol, tm
 
 
 def test_a_constructor_with_odd_arguments_is_refused_with_its_name():
-    with pytest.raises(DataError, match=r"odd arguments for builtins\.set"):
+    with pytest.raises(DataError, match=r"invalid arguments for builtins\.set"):
         pickles.load(pickle.dumps(Runs(set, [1], [2]), 2))
 
 

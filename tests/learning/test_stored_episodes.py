@@ -148,7 +148,7 @@ def test_minari_reads_what_is_exported_and_so_does_drivax(run, episodes, tmp_pat
     assert main([*call, "--overwrite"]) == 0
     (tmp_path / "other").mkdir()
     assert main([*call[:2], str(tmp_path / "other"), *call[3:], "--overwrite"]) == 2
-    assert "is no Minari data set" in capsys.readouterr().err
+    assert "is not a Minari data set" in capsys.readouterr().err
 
 
 @MINARI_WARNS
@@ -286,7 +286,7 @@ def test_environments_that_metadata_name_are_not_made(tmp_path):
     with pytest.raises(DataError, match="metadata lack action_space"):
         read_minari(out)
     shutil.rmtree(out)
-    with pytest.raises(DataError, match="no Minari data set"):
+    with pytest.raises(DataError, match="not a Minari data set"):
         read_minari(out)
 
 
@@ -295,7 +295,7 @@ def test_decisions_of_several_steps_and_unbounded_actions_are_refused(data, tmp_
     run_evaluation(EvaluationConfig(planner="expert", task=task), Expert(), data, tmp_path / "run")
     with pytest.raises(UsageError, match="the task holds decisions for 5 steps"):
         next(observe_episodes(*recorded(data, tmp_path / "run", task)))
-    with pytest.raises(UsageError, match="is no name of a Minari data set"):
+    with pytest.raises(UsageError, match="is not a name of a Minari data set"):
         write_minari(tmp_path / "a b-v0", TASK, [tiny(3, False)])
     with pytest.raises(DataError, match="no episode has a step"):
         write_minari(tmp_path / "none-v0", TASK, [])

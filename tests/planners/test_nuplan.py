@@ -224,7 +224,7 @@ def test_errors_of_the_planner_fail_its_episode(scenarios):
     assert format_crashes(results).startswith("faulty crashed in 1 of 1 episodes")
     late = evaluate(NuplanPlanner(Host(Late, "tests:Late"), SPACE), scenarios[:1], task=TASK)
     assert late.crashes[0].step == 10
-    assert late.crashes[0].error == "the trajectory from 3.5 to 11 s does not go on from now, 3 s"
+    assert late.crashes[0].error == "the trajectory from 3.5 to 11 s does not continue from now, 3 s"
 
 
 @pytest.mark.parametrize(

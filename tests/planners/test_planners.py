@@ -275,5 +275,7 @@ def test_held_planner_decides_at_every_other_step(simulator):
 
 
 def test_only_a_trained_policy_can_be_sampled():
-    with pytest.raises(UsageError, match="'idm' is no trained policy to sample; leave out --sample"):
+    with pytest.raises(
+        UsageError, match="'idm' is not a trained policy, so it cannot sample; leave out --sample"
+    ):
         find_planner("idm", bank_of(straight_road([car()])), sample=True)

@@ -162,7 +162,7 @@ def test_existing_files_and_wrong_arguments_are_refused(runs, tmp_path, hand_set
     assert "already exists" in capsys.readouterr().err
     assert main(["report", *map(str, runs), "--tables", "--out", str(out), "--overwrite"]) == 0
     assert main(["report", str(runs[0]), "--tables", "--video", "all"]) == 2
-    assert "exclude each other" in capsys.readouterr().err
+    assert "are mutually exclusive" in capsys.readouterr().err
     assert main(["report", str(runs[0]), "--metrics", "ade"]) == 2
     assert "pass --tables" in capsys.readouterr().err
     with pytest.raises(UsageError, match="no run folder is an evaluation"):

@@ -154,7 +154,7 @@ WRONG = {
     'roads["lanes"][0]["points"] has shape (1, 2)': lambda a, r: r["lanes"][0].update(points=[(0, 0)]),
     'roads["lanes"][2]["points"] is not an array': lambda a, r: r["lanes"][2].update(points="abc"),
     'roads["edges"][0] has a point that is not finite': lambda a, r: r["edges"].insert(0, [(0, 0), (0, np.nan)]),
-    'agents["id"] has a number that is no integer': lambda a, r: a.update(id=[1.2, 1.7]),
+    'agents["id"] has a number that is not an integer': lambda a, r: a.update(id=[1.2, 1.7]),
     "agents[\"kind\"] is 'vehicle'": lambda a, r: a.update(kind="vehicle"),
     'roads["lanes"] is 3': lambda a, r: r.update(lanes=3),
     'roads["lanes"][0]["points"] is missing': lambda a, r: r["lanes"][0].pop("points"),

@@ -1,4 +1,4 @@
-"""Interfaces of other ecosystems: Gymnasium."""
+"""Interfaces to other ecosystems: Gymnasium and Minari."""
 
 import lazy_loader
 

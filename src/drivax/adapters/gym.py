@@ -187,7 +187,7 @@ class _Backend:
         space = self.task.actions
         try:
             values = np.asarray(actions, None if isinstance(space, Discrete) else np.float32)
-        except (TypeError, ValueError):  # texts, or rows of different lengths
+        except (TypeError, ValueError):  # strings, or rows of different lengths
             values = np.array(None)  # refused below
         if isinstance(space, Discrete):
             choices = values
@@ -263,7 +263,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         """Step the simulation by 0.1 s.
 
         Raises:
-            UsageError: The action has another shape, is not finite, or is no choice of ``Discrete``.
+            UsageError: The action has the wrong shape, is not finite, or is not a choice of ``Discrete``.
             gymnasium.error.ResetNeeded: No episode is running.
         """
         if self._state is None:
@@ -331,7 +331,7 @@ class VectorDrivingEnv(VectorEnv):
             options: ``{"scenarios": [i, ...]}`` chooses a row per environment.
 
         Raises:
-            UsageError: Unknown option or row, or another number of rows than environments.
+            UsageError: Unknown option or row, or the numbers of rows and environments differ.
         """
         super().reset(seed=seed)
         backend, scenarios = self._backend, _option(options, "scenarios")
@@ -354,7 +354,7 @@ class VectorDrivingEnv(VectorEnv):
         """Step every environment by 0.1 s; if its episode has ended, start the next one instead.
 
         Raises:
-            UsageError: The actions have another shape, are not finite, or are no choices of ``Discrete``.
+            UsageError: The actions have the wrong shape, are not finite, or are not choices of ``Discrete``.
             gymnasium.error.ResetNeeded: ``reset`` was never called.
         """
         if self._state is None:

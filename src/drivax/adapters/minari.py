@@ -43,7 +43,7 @@ def write_minari(
     """Write episodes as the folder of a Minari data set; return the numbers of episodes and steps.
 
     The id is ``drivax/NAME-v0`` for a folder NAME, or its path below a folder ``drivax`` if that is an id.
-    ``infos/clipped`` of each step, 0 or 1, says whether the action does not lead to the next state.
+    ``infos/clipped`` is 1 at steps whose action does not lead to the next state, for example because it was clipped.
 
     Args:
         out: Folder to write; it must not exist.
@@ -52,16 +52,18 @@ def write_minari(
         metadata: Further entries of the metadata, such as ``description``.
 
     Raises:
-        UsageError: The name of the folder is no id of Minari, or actions are not continuous in [-1, 1].
+        UsageError: The name of the folder is not an id of Minari, or actions are not continuous in [-1, 1].
     """
     actions = action_space(task)
     if not isinstance(actions, spaces.Box):
-        raise UsageError("actions are choices", cure="export episodes of a continuous action space")
+        raise UsageError("actions are discrete", cure="export episodes of a continuous action space")
     name = out.name if "-v" in out.name else f"{out.name}-v0"
     try:
         parse_dataset_id(f"drivax/{name}")
     except ValueError as error:
-        raise UsageError(f"{name!r} is no name of a Minari data set", file=out, cure="use letters") from error
+        raise UsageError(
+            f"{name!r} is not a name of a Minari data set", file=out, cure="use letters"
+        ) from error
     stream = iter(episodes)
     count = steps = 0
     with replace_folder(out) as partial:
@@ -114,7 +116,7 @@ def read_minari(path: str | Path) -> StoredEpisodes:
     """
     folder = minari_folder(path)
     if folder is None:
-        raise DataError("no Minari data set", file=path, cure=_CURE)
+        raise DataError("not a Minari data set", file=path, cure=_CURE)
     metadata = read_json(folder / METADATA_FILE_NAME, _CURE)
     for name in ("observation_space", "action_space"):  # without these, Minari makes the environment
         if not isinstance(metadata, Mapping) or not isinstance(metadata.get(name), str):
@@ -146,7 +148,7 @@ def read_minari(path: str | Path) -> StoredEpisodes:
 
 
 def _check_content(file: Path, most_bytes: int) -> None:
-    """Check a file of HDF5.
+    """Check an HDF5 file.
 
     Raises:
         DataError: It contains links, or its arrays are too large, or lie in other files.

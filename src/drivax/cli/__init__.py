@@ -190,7 +190,7 @@ class _SignalHandler:
 
     A signal waits, 10 s at most, for the end of
 
-    - an import: modules of C++ crash when an exception interrupts their initialisation;
+    - an import: C++ extension modules crash when an exception interrupts their initialisation;
     - the start of a worker process, which would otherwise miss its arguments;
     - the creation or removal of a semaphore, which Python's resource tracker would otherwise lose;
     - the use of an event loop by Orbax, which would otherwise report an unclosed loop.
@@ -243,7 +243,7 @@ class _SignalHandler:
         self._send_later(error.signal if isinstance(error, Stopped) else signal.SIGINT, _RESEND_S)
 
     def _send_later(self, number: int, wait_s: float) -> None:
-        """Send a signal to the main thread again after ``wait_s``; it wakes a waiting thread."""
+        """Send a signal to the main thread again after ``wait_s``; the signal wakes the thread if it is waiting."""
         if number in self._timers:
             self._timers[number].cancel()
         main_thread = threading.main_thread().ident

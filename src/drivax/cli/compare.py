@@ -44,7 +44,7 @@ class Compare:
 
 
 def run(args: Compare, overrides: Sequence[str] = ()) -> int:
-    """Compare by the plan, or write the plan."""
+    """Compare the runs by the plan, or write the plan."""
     from drivax import settings
     from drivax.errors import UsageError
     from drivax.evaluation.comparison import compare

@@ -44,7 +44,8 @@ class Curate:
 
     mixture: the scores of several --tables. random_matched: those of --like, permuted. uniform: equal scores.
 
-    oracle: labels of rare events in the built-in world; oracle_critical: also of recordings that begin with a conflict.
+    oracle: labels of rare events in the built-in world; oracle_critical: also all steps of recordings that begin with a
+    conflict.
 
     package.module:name: your own function or dataclass.
 

@@ -34,6 +34,7 @@ _EXTRAS = {
     "show": (("matplotlib", "av"), "pictures and videos"),
     "track": (("tensorboardX",), "TensorBoard"),
     "gym": (("gymnasium",), "Gymnasium"),
+    "minari": (("minari", "h5py"), "Minari"),
 }
 #: Program that lists the devices; in a separate process, since a broken accelerator may hang or crash JAX.
 _LIST_DEVICES = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
@@ -54,7 +55,7 @@ class Doctor:
     path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]")] = None
     """File or folder to identify; this machine by default."""
     digest: bool = False
-    """Simulate standard episodes, and print a digest that is equal on machines that simulate the same."""
+    """Simulate standard episodes, and print a digest of them, which is equal on machines with the same results."""
 
 
 def run(args: Doctor) -> int:
@@ -116,7 +117,7 @@ def devices(timeout_s: float = 60.0) -> str:
         result = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         if result.returncode == 0:
             kinds = json.loads(result.stdout.splitlines()[-1])
-            return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)
+            return ", ".join(kind if kind == backend else f"{backend}: {kind}" for backend, kind in kinds)
     except subprocess.TimeoutExpired:
         return f"JAX does not answer (within {timeout_s:.0f} s); check the driver, or set JAX_PLATFORMS=cpu"
     except (ValueError, IndexError):

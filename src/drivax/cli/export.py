@@ -13,7 +13,7 @@ from drivax.cli import record_of
 from drivax.errors import UsageError
 from drivax.escaping import show
 
-#: Formats of episodes; the others are of scenario sets.
+#: Formats of episodes; the other formats are for scenario sets.
 _EPISODE_FORMATS = ("npz", "minari")
 
 
@@ -27,7 +27,7 @@ class Export:
 
     gpudrive: one JSON file per scenario.
 
-    npz, minari: of a folder of drivax record or drivax evaluate, the transitions of its episodes as one file with the
+    npz, minari: the transitions of the episodes in a folder of drivax record or drivax evaluate, as one file with the
     names of D4RL, or as a Minari data set. --task.KEY VALUE changes observation and reward.
 
     Example: drivax export sets/womd sets/turns --filter type=turn_left --filter lights=yes
@@ -103,7 +103,7 @@ def _export_episodes(args: Export, overrides: Sequence[str]) -> int:
             raise UsageError(f"{option} is for scenario sets", cure=f"leave out {option}")
     check_output(args.out, args.overwrite, folder=args.format == "minari")
     if args.out.is_dir() and minari_folder(args.out) is None:
-        raise UsageError("is no Minari data set", file=args.out, cure="choose another OUT")
+        raise UsageError("is not a Minari data set", file=args.out, cure="choose another OUT")
     folder = episode_folders(args.set)[0]
     scenarios = EpisodeTable.read(folder).open_set(args.data)
     config = RunFolder.open(folder).config(EvaluationConfig, overrides)

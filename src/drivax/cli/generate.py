@@ -38,9 +38,10 @@ class Generate:  # noqa: D101
     Many kinds of roads, other road users that follow, yield and stop, labelled rare events, and an expert log without
     collisions that stays on the road. The same seed gives the same set, byte for byte.
 
-    Settings of the world follow as --domain {"|".join(DOMAINS)} (wide lanes, lights and higher speeds, or narrow,
-    dense and roundabouts), --rare_rate 0.05 (share of scenarios with a labelled rare event), --critical_share,
-    --lane_change_share, --scenarios_per_map and --noise.KEY, --sensor.KEY (docs/guide/world.md has all).
+    Settings of the world follow as --domain {"|".join(DOMAINS)} (wide lanes, lights and higher speeds, or narrow
+    streets, dense traffic and roundabouts), --rare_rate 0.05 (share of scenarios with a labelled rare event),
+    --critical_share, --lane_change_share, --scenarios_per_map and --noise.KEY, --sensor.KEY (docs/guide/world.md has
+    all).
 
     Example: drivax generate sets/world --scenarios 256 --seed 0
 
@@ -66,7 +67,7 @@ class Generate:  # noqa: D101
     egos: int = 1
     """Vehicles per scenario with a route and a goal, 1 to 8, which training with `egos: moving` drives."""
     split: str | None = None
-    """Write lists for train/validation/test to OUT/splits, by map: percentages, as 80/10/10."""
+    """Write lists for train/validation/test to OUT/splits, by map: percentages, such as 80/10/10."""
     overwrite: bool = False
     """Replace OUT if it is a scenario set."""
 
@@ -108,26 +109,26 @@ def summary(result: GeneratedSet) -> str:
     rate = result.scenarios / max(result.seconds, 1e-9)
     lines = [f"{result.path}: {result.scenarios:,} scenarios in {result.seconds:.1f} s ({rate:.1f}/s)"]
     width = max(map(len, result.families))
-    for name, count in result.families.items():
-        causes = ", ".join(f"{cause} {times}" for cause, times in sorted(count.rejected.items()))
-        line = f"  {name:<{width}}  {count.kept:>6,} kept, {count.rejection_rate:6.2%} of draws rejected"
+    for name, family in result.families.items():
+        causes = ", ".join(f"{cause} {times}" for cause, times in sorted(family.rejected.items()))
+        line = f"  {name:<{width}}  {family.kept:>6,} kept, {family.rejection_rate:6.2%} of draws rejected"
         line += f" ({causes})" if causes else ""
-        lines.append(line + (f"; {count.unsuited:,} without occasion" if count.unsuited else ""))
+        lines.append(line + (f"; {family.unsuited:,} without the event" if family.unsuited else ""))
     return "\n".join((*lines, *coverage(result.families)))
 
 
 def coverage(families: Mapping[str, FamilyCount]) -> list[str]:
     """Return the lines of a table of events (rows) and the families in which they happened."""
     totals: Counter[str] = Counter()
-    for count in families.values():
-        totals.update(count.events)
+    for family in families.values():
+        totals.update(family.events)
     if not totals:
         return []
     width = max(map(len, totals))
     lines = [f"  {sum(totals.values()):,} scenarios with an event:"]
     for event in sorted(totals):
         counts_text = ", ".join(
-            f"{name} {count.events[event]}" for name, count in families.items() if event in count.events
+            f"{name} {family.events[event]}" for name, family in families.items() if event in family.events
         )
         lines.append(f"    {event:<{width}}  {totals[event]:>6,} ({counts_text})")
     return lines

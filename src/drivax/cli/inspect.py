@@ -41,7 +41,7 @@ class Inspect:
     html: Path | None = None
     """Write a page with histograms to this file instead of printing tables."""
     no_check: bool = False
-    """Skip the test of checksums, which reads the whole set."""
+    """Skip the verification of checksums, which reads the whole set."""
     observations: bool = False
     """Describe the observations of a planner: distributions, correlation with collisions and actions."""
     planner: str | None = None
@@ -67,7 +67,7 @@ def run(args: Inspect) -> int:
     if not args.sets:
         raise UsageError("no scenario set given", cure="write drivax inspect SET")
     if args.json and args.html is not None:
-        raise UsageError("--json and --html exclude each other", cure="call drivax inspect twice")
+        raise UsageError("--json and --html are mutually exclusive", cure="run drivax inspect twice")
     _check_flags(args)
     selection = Selection.parse(args.filter)
     inspections = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
@@ -112,7 +112,7 @@ def _print(inspections: list[Inspection]) -> None:
 
 
 def _check_flags(args: Inspect) -> None:
-    """Refuse flags that exclude each other, and an existing picture."""
+    """Refuse mutually exclusive flags, and an existing picture."""
     from drivax.errors import UsageError
     from drivax.files import check_output
 

@@ -36,17 +36,17 @@ MIXTURES: dict[str, tuple[tuple[str, float], ...]] = {
         ("zoo:bc", 0.0), ("zoo:aggressive", 0.0),
     ),
 }  # fmt: skip
-#: Ends the name of a training run of which all checkpoints drive: the mixture ``replay`` of D4RL.
+#: Suffix of a training run whose checkpoints are all recorded, as in the ``replay`` data sets of D4RL.
 _ALL = "@all"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordConfig:
-    """Configuration of a recording, stored as ``config.yaml``.
+    """Configuration of recorded episodes, stored as ``config.yaml``.
 
     Attributes:
         noise: Standard deviations of noise on the actions of each planner; mixtures have their own.
-        seeds: Number of episodes of each kind per scenario; without noise and samples they are equal.
+        seeds: Number of episodes of each kind per scenario; without noise and sampling they are identical.
         seed: First seed.
         sample: Let trained policies sample their actions instead of taking the mode.
         traffic: Traffic model, as for drivax evaluate; training must have the same.
@@ -69,7 +69,7 @@ class RecordConfig:
         check_at_least(self, 1, "seeds")
         if not self.planners or not self.noise:
             raise UsageError(
-                "no planner to record" if self.noise else "no level of noise", cure="give one or more"
+                "no planner to record" if self.noise else "no noise level", cure="give one or more"
             )
 
 
@@ -77,10 +77,10 @@ class RecordConfig:
 class Record(RecordConfig):
     """Record episodes of planners on every scenario of a set, failures included, for offline learning.
 
-    PLANNER is that of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium (a clone,
-    without and with noise) or mixed (the log, and a driver that follows it with noise; pdm; idm without and with noise;
-    a clone; an aggressive driver; one that ignores traffic). --task.KEY VALUE changes the task of planners that are not
-    trained.
+    PLANNER is a planner of drivax evaluate, RUN@all (every checkpoint of a training run), or a mixture: medium
+    (behaviour cloning without and with noise) or mixed (the log, and a driver that follows it with noise; pdm; idm
+    without and with noise; behaviour cloning; an aggressive driver; one that ignores traffic). --task.KEY VALUE changes
+    the task of planners that are not trained.
 
     OUT has a run folder of drivax evaluate per planner, noise and seed; drivax train --episodes OUT learns from them.
 
@@ -99,7 +99,7 @@ class Record(RecordConfig):
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
     """Run code of this module of yours that a trained policy names; repeat it to trust several."""
     overwrite: bool = False
-    """Replace OUT if it is an earlier recording."""
+    """Replace OUT if it is a folder of recorded episodes."""
 
 
 def run(args: Record, overrides: Sequence[str] = ()) -> int:
@@ -120,7 +120,7 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
         drivers[name, noise] = planner, driver_task, is_trained
     runs = []
     with replace_folder(args.out) as partial_folder:
-        recording = RunFolder.create(
+        run_folder = RunFolder.create(
             partial_folder, record_of(RecordConfig, args), [data], overwrite=True, kind="episodes"
         )
         for number, ((name, noise), seed) in enumerate(itertools.product(drivers, seeds)):
@@ -142,7 +142,7 @@ def run(args: Record, overrides: Sequence[str] = ()) -> int:
                 config, planner, data, partial_folder / runs[-1], traffic=traffic, sizes=first.sizes
             )
             summaries.append(table.summary())
-        recording.note(runs=runs)
+        run_folder.note(runs=runs)
     show(format_summary(summaries))
     show(f"wrote {args.out}")
     return 0

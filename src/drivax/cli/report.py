@@ -61,8 +61,8 @@ def run(args: Report) -> int:
     if not args.runs:
         raise UsageError("no run is named", cure="drivax report RUN [RUN ...]")
     if sum((args.video is not None, args.side_by_side is not None, args.tables)) > 1:
-        problem = "--video, --side-by-side and --tables exclude each other"
-        raise UsageError(problem, cure="call drivax report once for each")
+        problem = "--video, --side-by-side and --tables are mutually exclusive"
+        raise UsageError(problem, cure="run drivax report once for each")
     if args.metrics and not args.tables:
         raise UsageError("--metrics chooses columns of --tables", cure="pass --tables, or leave it out")
     episodes = args.video if args.video is not None else args.side_by_side

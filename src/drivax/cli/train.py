@@ -60,8 +60,8 @@ class Train:
     out: Path
     """Run folder to write."""
     validation: Annotated[str, tyro.conf.arg(metavar="SET|none")] = "held_out"
-    """Scenario set for the choice of the best checkpoint. By default, whole recordings of DATA are held out: about a
-    tenth of its scenarios (at most 256), or the smallest of several if none fits; `none` trains on all of them."""
+    """Scenario set for the choice of the best checkpoint. By default, whole recordings of DATA are held out: at most a
+    tenth of its scenarios and 256, or the smallest of several recordings if none fits; `none` trains on all."""
     episodes: tuple[Path, ...] = ()
     """Episodes to learn from instead of the logs, by bc and offline algorithms: folders of drivax record or runs of
     drivax evaluate, on DATA, or a Minari data set."""
@@ -74,7 +74,7 @@ class Train:
     weighting: WeightConfig = field(default_factory=WeightConfig)
     """Conversion of scores to weights; with --scores or --arm."""
     seeds: int = 1
-    """Number of consecutive seeds to train in one program; of several, each has a folder in OUT."""
+    """Number of consecutive seeds to train in one program; each of several seeds has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
     """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
@@ -125,7 +125,7 @@ def _data(args: Train, config: TrainConfig) -> TrainingSet:
     traffic = config.traffic if isinstance(config.traffic, str) else "mixed"
     stored = [path for path in args.episodes if minari_folder(path) is not None]
     if len(stored) and len(args.episodes) > 1:
-        raise UsageError("is a Minari data set, not the only one", file=stored[0], cure="give it alone")
+        raise UsageError("a Minari data set cannot be combined", file=stored[0], cure="pass it alone")
     if stored:
         from drivax.adapters.minari import read_minari
 
@@ -159,7 +159,7 @@ def _arm_data(args: Train, name: str, config: TrainConfig, training: TrainingSet
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
-    """Refuse another algorithm than the arm's, and flags that the arm ignores."""
+    """Refuse an algorithm other than the arm's, and flags that the arm ignores."""
     algorithm, arm_algorithm = _algorithm(config), _algorithm(settings.load(TrainConfig, arm.preset))
     if algorithm != arm_algorithm:
         problem = f"arm {args.arm} is trained by {arm_algorithm}, not {algorithm}"

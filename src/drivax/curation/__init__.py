@@ -1,7 +1,8 @@
 """Criticality scores of logged scenarios, sampling weights, and the most critical subset of a set.
 
-``methods`` registers the methods and applies them to a set: ``kinematic`` and ``rarity`` compute components of every
-step of the logs (read by ``logged``), and ``ensemble`` trains policies, whose disagreement ``methods`` scores.
+``methods`` registers the methods and applies them to a set: ``kinematic``, ``rarity``, ``novelty``, ``query`` and
+``failures`` compute components of every step of the logs (read by ``logged``), and ``ensemble`` trains policies, whose
+disagreement ``methods`` scores.
 ``scores`` holds the table of scores, ``weights`` converts a table to sampling weights, and ``subset`` writes the most
 critical scenarios.
 """

@@ -106,7 +106,7 @@ class EnsembleConfig:
         check_at_least(self, 0, "seed")
         check_learnable(self.task.actions)
         if self.weighted == "rarity" and self.task.actions.size != 2:
-            raise UsageError("rarity is of actions of two dimensions", cure="use weighted: plain")
+            raise UsageError("rarity needs actions of two dimensions", cure="use weighted: plain")
 
     @property
     def iterations(self) -> int:
@@ -334,7 +334,7 @@ def experience_of(
 
 
 def _check_finite(step: int, state: Any, logs: dict[str, Array], finite: Bool[Array, " K"]) -> None:
-    """Raise DivergenceError if a loss of a member, or a trained leaf by ``finite``, is not finite."""
+    """Raise DivergenceError if a loss or (by ``finite``) a trained leaf of a member is not finite."""
     losses, is_finite = jax.device_get((logs, finite))
     for number in range(len(is_finite)):
         problem = nonfinite_log({name: float(values[number]) for name, values in losses.items()})

@@ -30,7 +30,7 @@ from drivax.simulator.traffic.reactive import TRAFFIC, make_traffic
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 
-#: Its reward reads the time to collision.
+#: A task whose reward reads the time to collision, so that the simulator computes it.
 _TASK = Task(rewards=RewardConfig("safety", urgency=-1.0), metrics="none", to_the_end=True)
 
 
@@ -60,10 +60,10 @@ def failure_components(
     """Return components of every step of a set, means over the episodes of each scenario in all runs.
 
     ``failure`` rises towards the first collision, off-road step and red light, and is 0 after them; ``near_miss`` is
-    the scaled inverse time to collision. Both are 0 before the start of the episodes, and without an episode.
+    the scaled inverse time to collision, 0 before the start of the episodes. Both are 0 without an episode.
 
     Raises:
-        UsageError: There is no run.
+        UsageError: There is no run, or the traffic of a run cannot be simulated again.
         DataError: A run is of another set, or its trajectories are damaged.
     """
     if not runs:
@@ -77,23 +77,23 @@ def failure_components(
             raise DataError(
                 f"its episodes are not in {data.path}", file=run.folder, cure="evaluate on this set"
             )
-        known = [number for number, key in enumerate(run.scenarios) if key in row_of]
-        rows = np.array([row_of[run.scenarios[number]] for number in known], int)
-        np.add.at(sums["failure"], rows, _failures(config, run, shape[1])[known])
+        episodes = [number for number, key in enumerate(run.scenarios) if key in row_of]
+        rows = np.array([row_of[run.scenarios[number]] for number in episodes], int)
+        np.add.at(sums["failure"], rows, _failures(config, run, shape[1])[episodes])
         np.add.at(sums["near_miss"], rows, _near_misses(config, run, data, row_of, progress)[rows])
         np.add.at(count, rows, 1.0)
     return {name: total / np.maximum(count, 1.0)[:, None] for name, total in sums.items()}
 
 
 def _failures(config: FailureConfig, run: EpisodeTable, steps: int) -> Float[Numbers, "E T"]:
-    """Return the rise before the failures of each episode."""
+    """Return the component ``failure`` of each episode."""
     step, result = np.arange(steps), np.zeros((len(run), steps))
     for name in EVENTS:
         event = run.trajectories.events[name].copy()
         if name == "collision" and config.at_fault and "at_fault_collision" in run.metrics:
             event[~(run.metrics["at_fault_collision"] > 0)] = -1
-        ahead_s = (event[:, None] - step) * DT_S
-        rise = np.where((event[:, None] >= 0) & (ahead_s >= 0.0), 1.0 - ahead_s / config.before_s, 0.0)
+        until_s = (event[:, None] - step) * DT_S
+        rise = np.where((event[:, None] >= 0) & (until_s >= 0.0), 1.0 - until_s / config.before_s, 0.0)
         result = np.maximum(result, rise)
     return result
 
@@ -106,19 +106,18 @@ def _near_misses(
     progress: Progress | None,
 ) -> Float[Numbers, "N T"]:
     """Return the scaled inverse time to collision along the motion of each scenario's last episode."""
-    driven = run.trajectories
-    starts = set(driven.start.tolist())
-    if len(starts) != 1 or not np.isfinite(driven.ego).all():
+    ego, starts = run.trajectories.ego, set(run.trajectories.start.tolist())
+    if len(starts) != 1 or not np.isfinite(ego).all():
         raise DataError(
             "episodes begin at different steps, or are not finite", file=run.folder, cure="evaluate again"
         )
     (start,) = starts
-    motion = np.zeros((len(data), *driven.ego.shape[1:]), np.float32)
+    motion = np.zeros((len(data), *ego.shape[1:]), np.float32)
     for number, key in enumerate(run.scenarios):
         if key in row_of:
-            motion[row_of[key]] = driven.ego[number]
-    if driven.ego.shape[1] != data.capacity.steps - start:
-        raise DataError(f"episodes of {driven.ego.shape[1]} steps", file=run.folder, cure="evaluate again")
+            motion[row_of[key]] = ego[number]
+    if ego.shape[1] != data.capacity.steps - start:
+        raise DataError(f"episodes of {ego.shape[1]} steps", file=run.folder, cure="evaluate again")
     if run.traffic not in TRAFFIC:
         problem = f"its traffic is {run.traffic}, which is not simulated again"
         raise UsageError(problem, file=run.folder, cure=f"evaluate in {' or '.join(TRAFFIC)}")
@@ -136,7 +135,7 @@ def _near_misses(
 def times_to_collision(
     simulator: Simulator, bank: ScenarioBank, motion: Float[Array, "N S 4"], start_step: int
 ) -> Float[Array, "N T"]:
-    """Return the time to collision along motions from a step on; the horizon before it and at standstill."""
+    """Return the time to collision (s) along motions from a step on; the horizon before it and where undefined."""
 
     def episode(index: Int[Array, ""], motion: Float[Array, "S 4"]) -> Float[Array, " S"]:
         state = simulator.reset(bank, index, start_step)

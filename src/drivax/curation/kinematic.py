@@ -132,8 +132,8 @@ def post_encroachment_time(bank: ScenarioBank, log: LoggedScenario) -> Float[Arr
     """Return the shortest post-encroachment time (s) of the conflicts of every step, infinite without one.
 
     An agent conflicts if its box moves over a strip of ego's width along ego's path, at more than 26 degrees to it, and
-    ego reaches this place at 3 m/s or more. Its time is the shortest over all steps at which it is there, 0 if both are
-    there at once. It belongs to the steps from 2 s before the first of both enters until the last does.
+    ego reaches this place at 3 m/s or more. The time is the shortest over all steps at which the agent is there, 0 if
+    ego is there, too. It applies to the steps from 2 s before the first of the two enters until the second does.
     """
     slots = bank.agents.shape[2]  # parked agents follow
     frame = log.frame
@@ -141,9 +141,9 @@ def post_encroachment_time(bank: ScenarioBank, log: LoggedScenario) -> Float[Arr
     ego, steps = frame.box[:, log.slot], jnp.arange(len(frame.box))
     length, half_width = ego[0, 4], ego[0, 5] / 2
     level = jnp.abs(z - frame.z[:, log.slot, None]) <= queries.LEVEL_M
-    counts = valid & level & (norm(velocity) >= STOPPED_MPS) & ~log.ignored[:, :slots]
-    counts &= jnp.arange(slots) != log.slot
-    first_m, last_m, cos = jax.vmap(jax.vmap(partial(_covered_interval, log, half_width)))(box, counts)
+    included = valid & level & (norm(velocity) >= STOPPED_MPS) & ~log.ignored[:, :slots]
+    included &= jnp.arange(slots) != log.slot
+    first_m, last_m, cos = jax.vmap(jax.vmap(partial(_covered_interval, log, half_width)))(box, included)
     # Ego's front enters the area at the first of these steps, and its rear has left it at the second.
     enters = jnp.searchsorted(log.along_m + length / 2, first_m)
     leaves = jnp.searchsorted(log.along_m - length / 2, last_m, side="right")
@@ -159,12 +159,12 @@ def post_encroachment_time(bank: ScenarioBank, log: LoggedScenario) -> Float[Arr
 
 
 def _covered_interval(
-    log: LoggedScenario, half_width: Float[Array, ""], box: Float[Array, "6"], counts: Bool[Array, ""]
+    log: LoggedScenario, half_width: Float[Array, ""], box: Float[Array, "6"], included: Bool[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Return first and last arc length of ego's path that a box covers, and the cosine of the angle between both.
+    """Return first and last arc length (m) of ego's path under a box, and the cosine of the angle between path and box.
 
-    Only the points within 16 m of the nearest one are considered. Without an overlap, or if the box does not count, the
-    first is infinite, and the cosine 1.
+    Only the points within 16 m of the nearest one are considered. Without an overlap, or if the box is not
+    ``included``, the first is infinite, and the cosine 1.
     """
     points, cos, sin = len(log.path), box[2], box[3]
     coarse = log.path[::_COARSE, RouteColumn.XY]
@@ -176,13 +176,13 @@ def _covered_interval(
     path = jax.lax.dynamic_slice(log.path, (start, 0), (size, RouteColumn.LIMIT))
     offset, heading = path[:, RouteColumn.XY] - box[:2], path[:, RouteColumn.HEADING]
     ahead, left = offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin
-    # Components of the path's normal along and across the box: half of ego's width reaches as far.
+    # The box grows by half of ego's width times the components of the path's normal along and across it.
     across = heading[:, 0] * cos + heading[:, 1] * sin
     along = heading[:, 1] * cos - heading[:, 0] * sin
     covers = jnp.abs(ahead) <= box[4] / 2 + half_width * jnp.abs(along)
     covers &= jnp.abs(left) <= box[5] / 2 + half_width * jnp.abs(across)
     point = start + jnp.arange(size)
-    covers &= counts & (point < log.path_points)
+    covers &= included & (point < log.path_points)
     first = jnp.min(jnp.where(covers, point, points))
     last = jnp.max(jnp.where(covers, point, -1))
     middle = jnp.max(jnp.where(covers & (point <= (first + last) // 2), point, -1)) - start
@@ -192,14 +192,14 @@ def _covered_interval(
 
 def _required_braking(log: LoggedScenario) -> Float[Array, " T"]:
     def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
-        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) != log.slot)
-        return _braking_at_step(log, frame, counts, along_m, speed)
+        included = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) != log.slot)
+        return _braking_at_step(log, frame, included, along_m, speed)
 
     return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
 def _braking_at_step(
-    log: LoggedScenario, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
+    log: LoggedScenario, frame: Frame, included: Bool[Array, " S"], along_m: Float[Array, ""],
     speed_mps: Float[Array, ""],
 ) -> Float[Array, ""]:  # fmt: skip
     """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's path.
@@ -207,18 +207,18 @@ def _braking_at_step(
     Oncoming agents count as standing, so that ego need not brake while it stands. The result is 0 if no agent is on the
     path, or if ego does not approach it. A gap below 0.1 m, or an overlap, counts as 0.1 m.
 
-    ``counts`` masks the agents to consider; ``along_m`` is ego's arc length along the path.
+    ``included`` masks the agents to consider; ``along_m`` is ego's arc length along the path.
     """
-    gap, agent_mps = gaps_on_path(log, frame, counts, along_m)
+    gap, agent_mps = gaps_on_path(log, frame, included, along_m)
     nearest = jnp.argmin(gap)
     closing_mps = jnp.maximum(speed_mps - jnp.maximum(agent_mps[nearest], 0.0), 0.0)
     return closing_mps * closing_mps / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
 
 def gaps_on_path(
-    log: LoggedScenario, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""]
+    log: LoggedScenario, frame: Frame, included: Bool[Array, " S"], along_m: Float[Array, ""]
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-    """Return the gap (m) to each agent ahead on ego's path, infinite for others, and its speed along it (m/s).
+    """Return the gap (m) to each agent ahead on ego's path, infinite for others, and each agent's speed along it (m/s).
 
     An agent is on the path if its box overlaps a strip of ego's width along it, on ego's level, up to about 75 m ahead.
     """
@@ -238,10 +238,10 @@ def gaps_on_path(
     cos = jnp.sum(frame.box[:, 2:4] * projections.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     half_length, half_width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    counts = counts & (jnp.abs(frame.z - frame.z[log.slot]) <= queries.LEVEL_M)
+    included = included & (jnp.abs(frame.z - frame.z[log.slot]) <= queries.LEVEL_M)
     on_path = projections.distance_m < jnp.abs(sin) * half_length + jnp.abs(cos) * half_width + ego_box[5] / 2
     gap = projections.along_m - along_m - (jnp.abs(cos) * half_length + sin * half_width) - ego_box[4] / 2
-    gap = jnp.where(counts & on_path & (projections.along_m > along_m), gap, jnp.inf)
+    gap = jnp.where(included & on_path & (projections.along_m > along_m), gap, jnp.inf)
     return gap, jnp.sum(frame.velocity * projections.heading, axis=-1)
 
 
@@ -364,7 +364,7 @@ def _interaction(config: PublishedConfig, log: LoggedScenario) -> Float[Array, "
     def at_step(frame: Frame, velocity: Array) -> Array:
         offset, relative_velocity = frame.box[:, :2] - frame.box[log.slot, :2], frame.velocity - velocity
         product = -jnp.sum(offset * relative_velocity, axis=-1)
-        counts = frame.valid & (jnp.arange(len(product)) != log.slot)
-        return jnp.max(jnp.where(counts, jnp.clip(product / config.interaction_m2ps, 0.0, 1.0), 0.0))
+        included = frame.valid & (jnp.arange(len(product)) != log.slot)
+        return jnp.max(jnp.where(included, jnp.clip(product / config.interaction_m2ps, 0.0, 1.0), 0.0))
 
     return jax.vmap(at_step)(log.frame, log.velocity)

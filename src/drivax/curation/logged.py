@@ -24,6 +24,8 @@ from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: Scenarios per batch.
 BATCH = 64
+#: The search for ego on its path reaches this multiple of the movement in a step, and this much farther (m).
+_SEARCH_FACTOR, _SEARCH_MARGIN_M = 1.5, 2.0
 #: Called with (scenarios done, scenarios).
 Progress = Callable[[int, int], None]
 Numbers = np.ndarray[Any, Any]
@@ -31,15 +33,15 @@ Numbers = np.ndarray[Any, Any]
 
 @record
 class LoggedScenario:
-    """Log of one ego of a scenario; while unobserved, it has its last observed motion, or at the start its first.
+    """Log of one ego of a scenario; while ego is unobserved, it has its last observed motion, at the start its first.
 
     Attributes:
         context, frame: Context of ego, and all agents, at every step.
         motion, velocity: x, y (m), heading (rad) and speed (m/s) of ego, and its logged velocity (m/s).
         valid: Whether ego is observed.
         ignored: Agents that overlap ego when they appear, until they separate; metrics ignore them, too.
-        path, path_points: Points 1 m apart of ego's path (``RouteColumn``), and their number. It is the logged path of
-            a recorded ego, and the route of a further one, for which no such points of its logged path are stored.
+        path, path_points: Points 1 m apart of ego's path (``RouteColumn``), and their number. The path is the logged
+            one of the recorded ego, and the route of a further ego, for whose logged path no such points are stored.
         along_m, ground_m: Arc length of ego along its path, and height of the ground under ego.
     """
 
@@ -71,7 +73,7 @@ class LoggedScenario:
 
 
 def read_log(bank: ScenarioBank, row: Int[Array, ""]) -> LoggedScenario:
-    """Return the log of the ego of a row of the bank; without an ego no step is valid."""
+    """Return the log of the ego at a row of the bank; if the row has no ego, no step is valid."""
     index, slot, steps = bank.scenario_of(row), jnp.maximum(bank.ego_slot(row), 0), jnp.arange(bank.steps)
     ego = bank.agents[index, :, slot]
     valid = (ego[:, AgentColumn.VALID] > 0) & (steps <= bank.last_step[row]) & (bank.ego_slot(row) >= 0)
@@ -137,7 +139,7 @@ def _along_path(
     def step(along_m: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         # Search only as far as the car can have moved, as the simulator does.
         point, distance_m = inputs
-        ahead_m = 1.5 * distance_m + 2.0
+        ahead_m = _SEARCH_FACTOR * distance_m + _SEARCH_MARGIN_M
         projection = project_on_path(path[None], points[None], jnp.int32(0), point, along_m, ahead_m)
         along_m = jnp.maximum(along_m, projection.along_m)
         return along_m, along_m

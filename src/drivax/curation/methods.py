@@ -75,8 +75,8 @@ _ARGUMENTS = {
     "random_matched": ("like", "--like SCORES"), "mixture": ("tables", "--tables SCORES SCORES"),
     "failures": ("runs", "--runs RUN"),
 }  # fmt: skip
-#: Aggregator of a user's method without a combination.
-_TOP = "top10"
+#: Aggregator of methods without a combination: users' methods and ``mixture``.
+_DEFAULT_AGGREGATOR = "top10"
 #: Percentile of a set's disagreement that scores 0.5.
 _SCALE_PERCENTILE = 99.0
 
@@ -129,9 +129,9 @@ class Request:
 class Method:
     """A method; ``config`` are its default settings, None for a method without settings.
 
-    ``score`` takes the name of the method and a request. ``combination`` and ``extra_components`` take settings, and
-    return the combination of the components (None: their mean, and :data:`_TOP` of a scenario's steps) and the names of
-    further components, which have no weight.
+    ``score`` takes the name of the method and a request. ``combination`` takes settings and returns the combination of
+    the components (None: their mean, aggregated by :data:`_DEFAULT_AGGREGATOR`). ``extra_components`` takes settings
+    and returns the names of further components, which have no weight.
     """
 
     name: str
@@ -149,7 +149,7 @@ def find_method(name: str) -> Method:
     ``__call__``, whose fields are its settings. An attribute ``combination`` combines the components.
 
     Raises:
-        UsageError: The method is unknown, or is neither.
+        UsageError: The name is unknown, or leads to neither a function nor a dataclass of this kind.
     """
     if name in METHODS:
         return METHODS[name]
@@ -249,7 +249,7 @@ def make_table(
     zeros, values = np.zeros(valid.shape), {**(plain(config) if is_dataclass(config) else {}), **details}
     table = ScoreTable(name, values, data.hash, ids, valid, zeros, np.zeros(len(ids)), components, egos)
     combination = find_method(name).combination(config)
-    return table.recombine(combination or Combination(dict.fromkeys(components, 1.0), _TOP))
+    return table.recombine(combination or Combination(dict.fromkeys(components, 1.0), _DEFAULT_AGGREGATOR))
 
 
 def ensemble_table(
@@ -430,7 +430,7 @@ def _novelty(name: str, request: Request) -> ScoreTable:
     return make_table(name, request.config, request.data, components, details, egos)
 
 
-def _fail(name: str, request: Request) -> ScoreTable:
+def _score_failures(name: str, request: Request) -> ScoreTable:
     if request.egos != "recorded":
         raise UsageError("planners drive the recorded ego", cure="leave out --egos")
     runs = [EpisodeTable.read(path) for path in request.runs]
@@ -457,7 +457,7 @@ _METHODS = (
     Method("novelty", _novelty, NoveltyConfig(), lambda _: NOVELTY),
     Method("query", _query, QueryConfig(), lambda _: Combination({"match": 1.0})),
     Method("mixture", _mix, combination=lambda _: None),
-    Method("failures", _fail, FailureConfig(), lambda _: FAILURES),
+    Method("failures", _score_failures, FailureConfig(), lambda _: FAILURES),
     *(Method(name, _oracle) for name in ORACLES),
 )
 #: All methods by name.

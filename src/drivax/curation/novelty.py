@@ -60,7 +60,7 @@ class NoveltyConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Encoder:
-    """The encoder of an environment's observations: its structure, or that of a policy that has one."""
+    """Encoder of an environment's observations; ``graph`` is its structure, or that of a policy that contains it."""
 
     environment: Driving
     graph: Any
@@ -71,11 +71,11 @@ class _Encoder:
         network: Any = nnx.merge(self.graph, parameters)
         encoder, observe = getattr(network, "encoder", network), self.environment.observe_recorded
 
-        def log(arguments: tuple[Array, Array]) -> Array:
+        def embed_log(arguments: tuple[Array, Array]) -> Array:
             row, step = arguments
             return encoder(observe(bank, (jnp.full_like(step, row), step)))
 
-        return jax.lax.map(log, (jnp.arange(len(steps)), steps), batch_size=_LOG_BATCH)
+        return jax.lax.map(embed_log, (jnp.arange(len(steps)), steps), batch_size=_LOG_BATCH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +120,11 @@ class Embedding:
         order = np.argsort(np.where(valid, rng.random(valid.shape), 2.0), axis=1)[:, :per_log]
         is_reference = np.take_along_axis(valid, order, axis=1)
         recording = np.repeat(np.unique(recordings_of(data.entries), return_inverse=True)[1], logs)
-        number = np.broadcast_to(recording[:, None], order.shape)[is_reference]
-        if len(np.unique(number)) < 2:
-            raise DataError("novelty compares recordings", file=data.path, cure="use a set of two or more")
-        kept = np.sort(rng.permutation(len(number))[: config.reference])
+        reference_recording = np.broadcast_to(recording[:, None], order.shape)[is_reference]
+        if len(np.unique(reference_recording)) < 2:
+            problem = "fewer than two recordings have a valid step"
+            raise DataError(problem, file=data.path, cure="use a set of two or more")
+        kept = np.sort(rng.permutation(len(reference_recording))[: config.reference])
 
         def reference(bank: ScenarioBank, rows: Numbers) -> dict[str, Array]:
             log = (rows[:, None] * logs + np.arange(logs)).reshape(-1)
@@ -133,9 +134,9 @@ class Embedding:
         values = map_batches(data, reference)["embedding"][is_reference][kept]
         mean, deviation = values.mean(axis=0), np.maximum(values.std(axis=0), 1e-6)
         standardised = jnp.asarray((values - mean) / deviation, jnp.float32)
-        numbers = jnp.asarray(number[kept])
+        recordings = jnp.asarray(reference_recording[kept])
         return cls(
-            encoder, parameters, standardised, numbers, jnp.asarray(mean), jnp.asarray(deviation)
+            encoder, parameters, standardised, recordings, jnp.asarray(mean), jnp.asarray(deviation)
         )  # fmt: skip
 
     def of_bank(self, bank: ScenarioBank) -> Float[Array, "M T D"]:
@@ -160,9 +161,11 @@ def novelty(
     logs = data.capacity.egos if embedding.encoder.environment.egos == "moving" else 1
 
     def distances(bank: ScenarioBank, rows: Numbers) -> dict[str, Array]:
-        own = jnp.asarray(np.repeat(numbers[rows], logs))
+        recording = jnp.asarray(np.repeat(numbers[rows], logs))
         values = embedding.of_bank(bank)
-        result = nearest_distances(values, own, embedding.reference, embedding.recording, config.neighbours)
+        result = nearest_distances(
+            values, recording, embedding.reference, embedding.recording, config.neighbours
+        )
         return {"distance": result}
 
     return map_batches(data, distances, progress)["distance"]
@@ -175,18 +178,18 @@ def nearest_distances(
 ) -> Float[Array, "M T"]:  # fmt: skip
     """Return the mean distance of steps to the nearest ``neighbours`` reference steps of other recordings."""
 
-    def log(arguments: tuple[Array, Array]) -> Array:
-        steps, own = arguments
-        # As a product: the differences of all pairs would not fit in caches.
+    def log_distances(arguments: tuple[Array, Array]) -> Array:
+        steps, log_recording = arguments
+        # Expand the square to a matrix product: the differences of all pairs would not fit in caches.
         squares = jnp.sum(steps**2, axis=-1)[:, None] + jnp.sum(reference**2, axis=-1)
         squared = jnp.maximum(squares - 2.0 * steps @ reference.T, 0.0)
-        squared = jnp.where(reference_recording == own, jnp.inf, squared)
+        squared = jnp.where(reference_recording == log_recording, jnp.inf, squared)
         nearest = -jax.lax.top_k(-squared, min(neighbours, len(reference)))[0]
         is_other = jnp.isfinite(nearest)
         total = jnp.sum(jnp.where(is_other, jnp.sqrt(nearest), 0.0), axis=-1)
         return total / jnp.maximum(is_other.sum(axis=-1), 1)
 
-    return jax.lax.map(log, (values, recording))
+    return jax.lax.map(log_distances, (values, recording))
 
 
 def scenario_embeddings(

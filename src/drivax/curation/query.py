@@ -1,6 +1,6 @@
 """Queries: steps of logs at which an expression over quantities of driving holds.
 
-Expressions have numbers, the quantities of :data:`QUANTITIES`, ``+ - * /``, comparisons, and ``and``, ``or`` and
+Expressions contain numbers, the quantities of :data:`QUANTITIES`, ``+ - * /``, comparisons, and ``and``, ``or`` and
 ``not``. They are parsed and evaluated here; nothing in them is executed by Python.
 """
 
@@ -33,7 +33,7 @@ QUANTITIES = {
     "acceleration": "change of the speed to the next step, m/s2",
     "yaw_rate": "change of the heading to the next step, rad/s",
     "lateral_acceleration": "speed times yaw_rate, m/s2",
-    "ttc": "time to collision, s; 5 if none is nearer, or at standstill",
+    "ttc": "time to collision, s; 5 if no collision is nearer, or at standstill",
     "gap": "gap to the nearest agent ahead on ego's path, m",
     "closing": "speed of approach to that agent, m/s",
     "cut_in": "gap to an agent that drives ahead on ego's path, and was not on it a second ago, m",
@@ -73,7 +73,7 @@ class QueryConfig:
     def matches(
         self, quantities: Mapping[str, Float[Numbers, "M T"]], valid: Bool[Numbers, "M T"]
     ) -> Bool[Numbers, "M T"]:
-        """Return the mask of valid steps at which the query holds, for as long as it must.
+        """Return the mask of valid steps at which the query holds, in runs of ``for_s`` or longer.
 
         Raises:
             UsageError: There is no expression.
@@ -83,11 +83,11 @@ class QueryConfig:
         holds = evaluate(self.where, quantities) & valid
         steps = max(round(self.for_s / DT_S), 1)
         # A step matches if it lies in a run of at least that many steps.
-        last = np.pad(holds, ((0, 0), (1, 0))).cumsum(axis=1)
-        full = last[:, steps:] - last[:, :-steps] == steps if holds.shape[1] >= steps else holds[:, :0]
+        total = np.pad(holds, ((0, 0), (1, 0))).cumsum(axis=1)
+        begins = total[:, steps:] - total[:, :-steps] == steps if holds.shape[1] >= steps else holds[:, :0]
         result = np.zeros(holds.shape, bool)
         for offset in range(steps):
-            result[:, offset : offset + full.shape[1]] |= full
+            result[:, offset : offset + begins.shape[1]] |= begins
         return result
 
 
@@ -95,7 +95,7 @@ def evaluate(expression: str, quantities: Mapping[str, Numbers]) -> Bool[Numbers
     """Return where an expression holds.
 
     Raises:
-        UsageError: It is no such expression, or names an unknown quantity.
+        UsageError: The expression is invalid, or names an unknown quantity.
     """
     cure = 'write for example "cut_in < 20 and speed > 10"'
     try:
@@ -105,7 +105,7 @@ def evaluate(expression: str, quantities: Mapping[str, Numbers]) -> Bool[Numbers
         with np.errstate(all="ignore"):
             result = _value(tree.body, quantities)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise UsageError(f"{expression!r} is no query: {error}", cure=cure) from error
+        raise UsageError(f"{expression!r} is not a query: {error}", cure=cure) from error
     if np.asarray(result).dtype != bool:
         raise UsageError(f"{expression!r} is a number, not a condition", cure=cure)
     return np.broadcast_to(result, next(iter(quantities.values())).shape)
@@ -162,8 +162,8 @@ class Quantities:
         slots = jnp.arange(log.frame.valid.shape[1])
 
         def at_step(frame: Frame, ignored: Array, along_m: Array) -> tuple[Array, Array, Array, Array]:
-            counts = frame.valid & ~ignored & (slots != log.slot)
-            gap, agent_mps = gaps_on_path(log, frame, counts, along_m)
+            included = frame.valid & ~ignored & (slots != log.slot)
+            gap, agent_mps = gaps_on_path(log, frame, included, along_m)
             return (
                 gap,
                 agent_mps,
@@ -194,5 +194,5 @@ class Quantities:
 
 
 def _to_next(values: Float[Array, " K"]) -> Float[Array, " T"]:
-    """Repeat the last change, which has no next step."""
+    """Append the last change again, for the last step, which has no next one."""
     return jnp.concatenate([values, values[-1:]])

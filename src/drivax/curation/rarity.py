@@ -1,7 +1,7 @@
 """Action rarity: inverse density of the expert's action among all expert actions of a set.
 
 Actions are in units of the action space, [-1, 1] in both dimensions. A histogram of the actions of one set can be saved
-and score others.
+and used to score others.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ _SPACE = Physical()
 #: Maximum number of bins along each dimension, maximum standard deviation of a kernel, and maximum bytes of a file:
 #: smoothing takes seconds with the largest ones.
 _MOST_CELLS, _MOST_BANDWIDTH, _MOST_BYTES = 1024, 0.5, 16 << 20
+#: Number of bins of the published histogram along each dimension, and constant that is added to its scores.
+_PUBLISHED_BINS, _PUBLISHED_CONSTANT = 89, 0.01
 _CURE = "write it with `drivax curate action_rarity --actions FILE`"
 
 
@@ -48,7 +50,7 @@ class ActionHistogram:
         counts: Number of actions in each bin of acceleration and of curvature.
         edges: Edges of the bins along both dimensions: in units of the action space (:class:`KernelRarity`), or in m/s2
             and 1/m.
-        median: Density of the action of median density (only of :class:`KernelRarity`; otherwise 0).
+        median: Median density of the actions (only of :class:`KernelRarity`; otherwise 0).
     """
 
     counts: Int[np.ndarray[Any, Any], "rows columns"]
@@ -164,7 +166,7 @@ class PublishedRarity:
 
     def histogram(self, actions: Actions) -> ActionHistogram:
         """Return the histogram of actions, which are in [-1, 1]; its edges are in m/s2 and 1/m."""
-        counts = np.zeros((89, 89), np.int64)
+        counts = np.zeros((_PUBLISHED_BINS, _PUBLISHED_BINS), np.int64)
         np.add.at(counts, self._cell(actions), 1)
         return ActionHistogram(counts, self.edges)
 
@@ -172,7 +174,7 @@ class PublishedRarity:
         """Return the scores of the actions ``at``, in [0, 1], from the counts of a set in their bins."""
         weight = 1.0 / (histogram.counts + 1.0)
         rarity = np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
-        return np.minimum(rarity + 0.01, 1.0)
+        return np.minimum(rarity + _PUBLISHED_CONSTANT, 1.0)
 
     def _cell(self, actions: QueryActions) -> tuple[Cells, Cells]:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)

@@ -21,7 +21,7 @@ from drivax.reading import explain_damage, parse_json, read_arrays
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files, note_edited, refuse_edited
 
-#: Of M logs: one of each of N scenarios, or one of each of their egos.
+#: Values of M logs: one log of each of N scenarios, or one log of each of their egos.
 Steps = Float[np.ndarray[Any, Any], "M T"]
 Valid = Bool[np.ndarray[Any, Any], "M T"]
 Scenarios = Float[np.ndarray[Any, Any], " N"]

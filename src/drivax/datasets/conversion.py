@@ -48,7 +48,7 @@ _WITHOUT_EFFECT = ("workers", "strict", "overwrite")
 _BATCH = 64
 #: Bytes of the head and of the tail of a file that are hashed to identify it.
 _ENDS = 1 << 16
-#: A scenario or bad record, and the place after it: file number, items read of that file.
+#: A scenario or bad record, and the position after it: file number, and number of items read from that file.
 _Item = tuple[Scenario | BadRecord, tuple[int, int]]
 #: Called with (files done, files, scenarios so far).
 Progress = Callable[[int, int, int], None]
@@ -60,23 +60,23 @@ _SPOOLED = np.zeros(())
 
 @dataclass(frozen=True)
 class Conversion:
-    """How to convert.
+    """Options of a conversion.
 
     Attributes:
         format: Format of the files; auto detects it file by file.
         capacity: Padded sizes; large for scenarios with more than 80 moving agents or very dense maps.
         limit: Stop when the set holds N scenarios; all by default.
         filters: Only scenarios that meet this condition (NAME=A|B, NAME!=A, NAME>=N); repeat it to combine several.
-        routes: How to find routes: our generator, or the published breadth-first search.
+        routes: How to find routes: drivax's own search, or the published breadth-first search.
         future_s: Seconds of a scenario after its current step, 8 in WOMD, 15 in nuPlan's challenges; longer
             recordings become windows, shorter ones end earlier.
         egos: Vehicles per scenario with a route and a goal, 1 to 8: the recorded ego and moving vehicles near it, which
             training with `egos: moving` drives.
         stride: Steps between the starts of two windows of a longer recording.
-        split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
+        split: Write lists for train/validation/test to OUT/splits, by recording: percentages, such as 80/10/10.
         workers: Processes that read, each a file at a time; 1 reads in the main process.
         strict: Stop at the first record that cannot be converted or is a duplicate instead of skipping it.
-        overwrite: Replace an existing scenario set, or start again after another, interrupted conversion.
+        overwrite: Replace an existing scenario set, or discard an interrupted conversion with other options.
         shard_size: Scenarios per shard of the set, the unit of resume.
     """
 
@@ -243,7 +243,7 @@ def convert(
     Args:
         src: A file, or a folder that is searched to any depth.
         out: The scenario set to write.
-        options: How to convert.
+        options: Options of the conversion.
         progress: Called after every scenario, bad record and file.
         audit: Called in this process with batches of scenarios; its results are stored with them.
         announce: Called once before the work begins.
@@ -521,7 +521,7 @@ def convert_ahead(
 
     Args:
         tasks: Arguments of ``convert``, which can be pickled.
-        convert: A function of a module, which workers call.
+        convert: A module-level function, which workers call.
         capacity: Padded sizes of the scenarios.
         workers: Number of processes.
         folder: An existing folder for the records of about ``workers + 2`` tasks.

@@ -22,15 +22,17 @@ from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES, STEPS, Capacity, record_dtype
 from drivax.seal import SEAL, check_seal, require_entries
 
-#: Most files of a format that are inspected; they stand for the others.
+#: Maximum number of files of a format that are inspected, as a sample of all.
 _SAMPLE = 24
-#: Most files of a format whose scenarios are counted; where there are more, the count is scaled by file size.
+#: Maximum number of files of a format whose scenarios are counted; the count of a sample is scaled by file size.
 _COUNT_FILES = 48
-#: Most files of unknown format that are named.
+#: Maximum number of files of unknown format that are named.
 _MOST_NAMES = 10
-#: Most notes and flavours that are listed for several files of one kind, and runs of missing shards for a family.
+#: Maximum numbers of notes and flavours listed for several files of one kind, and of runs of missing shards.
 _NOTES, _FLAVOURS, _RUNS = 6, 3, 8
-_NO_SEAL = f"no {SEAL}, as in folders of earlier versions: changes of files that decide results are not found"
+_NO_SEAL = (
+    f"no {SEAL}, as in folders of earlier versions: changes to files that decide results are not detected"
+)
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
 
 
@@ -39,7 +41,7 @@ class Part:
     """Files of one format, data set and version.
 
     ``description`` merges those of ``sample_size`` files (all intact ones if ``whole``): sum of ``recordings`` (None if
-    unknown for a file), most frequent ``notes``, all ``missing`` files. ``convertible``: some file lacks none.
+    unknown for a file), most frequent ``notes``, all ``missing`` files. ``convertible``: at least one is complete.
     """
 
     format: str
@@ -134,7 +136,7 @@ def _check_run(folder: Path) -> None:
 
 
 def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
-    """Describe a sample of the files of each format; list files of no format, and damaged ones of the sample."""
+    """Describe a sample of the files of each format; list files of unknown format, and damaged files of the sample."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
     unknown = data.paths(None)[:_MOST_NAMES]
     problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
@@ -169,14 +171,14 @@ def _merge(sample: Sequence[Description]) -> Description:
 
 
 def _notes(sample: Sequence[Description]) -> Iterator[str]:
-    """Yield the notes on a file, or the most frequent ones on several, with the number of files unless all have it."""
+    """Yield the notes on a file, or the most frequent ones on several, with the number of files unless it is all."""
     counts = Counter(note for description in sample for note in dict.fromkeys(description.notes))
     most = _NOTES if len(sample) > 1 else len(counts)
     for note, times in counts.most_common(most):
         yield note if times == len(sample) else f"{note} (in {times} of {len(sample)} files)"
     if len(counts) > most:
         more = count_text(len(counts) - most, "more note")
-        yield f"{more}; run drivax doctor on a single file to see all of its own"
+        yield f"{more}; run drivax doctor on a single file to see all of its notes"
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:

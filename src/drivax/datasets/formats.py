@@ -59,7 +59,7 @@ def detect(path: str | Path) -> Reader:
     """Return the reader that recognises a file.
 
     Raises:
-        DataError: The file is missing, no regular file, damaged at its beginning, or of no format that drivax reads.
+        DataError: The file is missing, not a regular file, damaged at its beginning, or of no format that drivax reads.
     """
     check_regular(Path(path), _NAME_FILE)
     if (reader := recognise(Path(path))) is None:
@@ -108,9 +108,9 @@ class Survey:
 def survey(src: str | Path, name: str = AUTO) -> Survey:
     """Find the files to read, and their formats.
 
-    A file given by name is always read. In a folder (searched to any depth, without hidden files and links to folders)
-    these are the files that a reader recognises, and those named like a format's files, so that damaged ones are
-    reported.
+    A file given by name is always read. In a folder (searched to any depth, without hidden files and links to folders),
+    the files to read are those that a reader recognises, and those named like a format's files, so that damaged ones
+    are reported.
 
     Args:
         src: A file or a folder.

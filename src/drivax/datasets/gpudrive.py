@@ -101,7 +101,7 @@ class GpuDrive:
         if not recording.lights:
             notes.append("no traffic lights; the published files leave out every scenario that has one")
         if (parsing.spacing_m(recording.features) or 0.0) > _DENSE_M:
-            notes.append("its points were thinned, so it is none of the published files")
+            notes.append("its points were thinned, so it is not one of the published files")
         return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
 
     def count(self, path: Path) -> int:
@@ -268,11 +268,11 @@ def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
     if not CURRENT_STEP < steps <= _MOST_STEPS:
         raise DataError(f"has {steps} steps, not {CURRENT_STEP + 1} to {_MOST_STEPS}", cure=_SKIP)
     tables, masks = [], []
-    for row, states in enumerate(objects):
+    for row, track in enumerate(objects):
         names = ("position", "heading", "velocity", "valid")
-        position, heading, velocity, valid = _columns(states, names, f"object {row}")
+        position, heading, velocity, valid = _columns(track, names, f"object {row}")
         if len(position) != steps:
-            raise DataError(f"object {row} has {len(position)} states, {steps} steps", cure=_SKIP)
+            raise DataError(f"object {row} has {len(position)} states for {steps} steps", cure=_SKIP)
         headings = [{"heading": value} for value in heading]
         columns = (
             _table(position, "xyz", f"the position of object {row}"),

@@ -41,11 +41,11 @@ _LONGEST = 64
 MPS_PER_MPH = 0.44704
 _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
-#: Ids of windows: ``scene-0001_<token>`` of nuScenes, with one or two tokens; of drivax ``<id>@<first step>`` or, with
+#: Ids of windows: in nuScenes ``scene-0001_<token>``, with one or two tokens; in drivax ``<id>@<first step>`` or, with
 #: another ego, ``<id>@<first step>#<track>``.
 _WINDOW = re.compile(r"(scene-\d+)(?:_[0-9a-f]{32}){1,2}|(.+)@\d+(?:#\d+)?")
 #: Note of ``drivax doctor`` on recordings whose frames are not evenly spaced.
-UNEVEN = "frames are missing or off their time: steps are interpolated by time, and cut at gaps"
+UNEVEN = "frames are missing or unevenly spaced: steps are interpolated by time, and cut at gaps"
 #: Spacing of samples of map lines for nearest-point queries, m; wider if there would be too many samples.
 _SPACING_M = 1.0
 _MOST_SAMPLES = 1_000_000
@@ -74,7 +74,7 @@ class Lights:
         self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
-        """Add one observation; of several for one lane and step the first that is not UNKNOWN counts.
+        """Add one observation; of several for the same lane and step, the first that is not UNKNOWN counts.
 
         The stop point of a lane is the first that is not zero; states that WOMD lacks count as UNKNOWN.
         """
@@ -84,7 +84,7 @@ class Lights:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collect(self, features: Sequence[MapFeature]) -> tuple[tuple[Light, ...], int]:
-        """Return the lights in order of first observation, and the number of those dropped without a position.
+        """Return the lights in order of first observation, and the number of lights dropped for lack of a position.
 
         States are -1 where a light is not observed. A light whose stop point is all zeros stands where its lane begins.
         """
@@ -99,7 +99,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str, rows_of: str = "track") -> tuple[int, ...]:
-    """Return row numbers as ints; refuse those outside 0 to ``count - 1``; ``rows_of`` says of what they are rows."""
+    """Return row numbers as ints; refuse those outside 0 to ``count - 1``; ``rows_of`` says what they are rows of."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names {rows_of} {row}, there are {count}", cure="skip this record")
@@ -173,7 +173,7 @@ def check_within(most: float, *arrays: np.ndarray[Any, Any]) -> None:
 def lift(tracks: Tracks, features: Sequence[MapFeature]) -> Tracks:
     """Place agents of a source without heights on its 3-D map: at the nearest map line, plus half their height.
 
-    The line is the nearest in the plane, so where roads cross above each other it may be of the other level. Without a
+    The line is the nearest in the plane, so where roads cross at different levels it may be of the wrong one. Without a
     map the ground is at 0.
     """
     z = np.where(tracks.valid, _half_heights(tracks), 0.0)

@@ -63,7 +63,7 @@ class Description:
         dataset: Full name of the public data set; ``flavour`` describes the file, ``version`` is None if it is unknown.
         recordings: Number of recordings; None for a file that would have to be read whole.
         notes: What the file holds or lacks that its user should know, one short sentence each.
-        missing: Files that it needs next to it and that are not there.
+        missing: Files that have to lie next to it but do not exist.
     """
 
     dataset: str

@@ -15,7 +15,7 @@ from drivax.errors import DataError, UsageError, explain_system
 from drivax.reading import read_json
 from drivax.scenario.manifest import AGAIN, MANIFEST
 
-#: Kinds of files by their first bytes (of a tar archive those from ``_TAR_BYTE`` on), and cures.
+#: Kinds of files by their first bytes (for a tar archive, its bytes from ``_TAR_BYTE`` on), and cures.
 _TAR, _TAR_BYTE = b"ustar", 257
 _MAGIC = {
     b"\x1f\x8b": ("the file is gzip-compressed", "decompress it first (gunzip, or tar xzf for a .tgz)"),
@@ -89,7 +89,7 @@ def explain(path: Path) -> DataError:
 
 
 def _tfrecord(path: Path) -> DataError:
-    """Return the error for a file by its first TFRecord record, or for one that is no TFRecord file."""
+    """Return the error for a file by its first TFRecord record, or for one that is not a TFRecord file."""
     try:
         _, payload = next(read_records(path))
         if isinstance(payload, DataError):
@@ -166,7 +166,7 @@ def _contains(folder: Path, *patterns: str) -> bool:
 
 
 _OWN_FOLDERS: _Folders = (
-    (_is_scenario_set, "a scenario set of drivax already", "run drivax inspect on it"),
+    (_is_scenario_set, "already a scenario set of drivax", "run drivax inspect on it"),
     (
         lambda folder: (folder / "run.json").exists(),
         "a run folder of drivax, not recordings",
@@ -183,7 +183,7 @@ _FOLDERS: _Folders = (
         lambda folder: (
             _contains(folder, "city_SE3_egovehicle.feather") and not _contains(folder, "annotations*.feather")
         ),
-        "a sensor log of Argoverse 2 without annotations, as those of the test split",
+        "a sensor log of Argoverse 2 without annotations, like those of the test split",
         "use the train or val split",
     ),
     (

@@ -161,7 +161,7 @@ def _replay_batch(scenarios: Sequence[Scenario]) -> list[Findings]:
 
 
 def _replay_findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Findings:
-    """Return the findings of one replay; entry 0, the current step, counts for ``first_onroad_step`` and overlaps."""
+    """Return findings of one replay; entry 0, the current step, only counts for ``first_onroad_step`` and overlaps."""
     flags, in_log = scenario.has, series["logged"]
     evaluated = in_log.copy()
     evaluated[0] = False
@@ -202,16 +202,16 @@ def _reverse_and_forward_m(scenario: Scenario) -> Float[np.ndarray, "2 agent"]:
     valid, heading = scenario.agent_valid[future], scenario.agent_heading[future][:-1]
     displacement = np.diff(scenario.agent_xy[future].astype(np.float64), axis=0)
     forward_m = displacement[..., 0] * np.cos(heading) + displacement[..., 1] * np.sin(heading)
-    counts = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
-    distances = (np.where(counts, sign * forward_m, 0.0) for sign in (-1, 1))
+    included = valid[1:] & valid[:-1] & np.isin(scenario.agent_kind, _DRIVERS)
+    distances = (np.where(included, sign * forward_m, 0.0) for sign in (-1, 1))
     return np.stack([np.where(step_m > CREEP_MPS * DT_S, step_m, 0.0).sum(axis=0) for step_m in distances])
 
 
 def _clipped_share(is_clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
     """Return the share of clipped actions; only actions between evaluated steps, or from the current step, count."""
-    counts = evaluated.copy()
-    counts[2:] &= evaluated[1:-1]
-    return _round(is_clipped[counts].mean(), 4) if counts.any() else None
+    included = evaluated.copy()
+    included[2:] &= evaluated[1:-1]
+    return _round(is_clipped[included].mean(), 4) if included.any() else None
 
 
 def _first_step(condition: np.ndarray[Any, Any]) -> int | None:

@@ -41,7 +41,7 @@ _DEVKIT_ORDER = (0, 3, 2, 1)
 _STOPPED_MPS, _TTC_STOPPED_MPS = 0.05, 0.005
 _AHEAD_DEG, _BEHIND_DEG = 30.0, 150.0
 _TTC_STEP_S, _TTC_HORIZON_S, _MIN_TTC_S = 0.1, 3.0, 0.95
-_OUTSIDE_M, _OVERSPEED_MPS, _MIN_PROGRESS_M = 0.3, 2.23, 2.0
+_OUTSIDE_M, _OVERSPEED_MPS, _MIN_PROGRESS_M, _MIN_PROGRESS_RATIO = 0.3, 2.23, 2.0, 0.2
 _WRONG_WAY_M, _FAR_WRONG_WAY_M, _DIRECTION_S = 2.0, 6.0, 1.0
 #: Largest distance at which ego is still assigned to the connector that it has left, m.
 _MAX_EXIT_M = 5.0
@@ -264,7 +264,7 @@ def devkit_verdict(ego: EgoMotion, tracks: Tracks, road: Road, expert_xy: Points
         "speed": _speed_compliance(road, ego_route, ego.speed),
         "comfortable": float(all(comfort.within.values())),
     }
-    terms["making_progress"] = float(terms["progress"] >= 0.2)
+    terms["making_progress"] = float(terms["progress"] >= _MIN_PROGRESS_RATIO)
     term_names = {"progress_ratio": "progress", "speed_compliance": "speed"}
     weighted_sum = sum(weight * terms[term_names.get(name, name)] for name, weight in NUPLAN_WEIGHTS.items())
     mean = weighted_sum / sum(NUPLAN_WEIGHTS.values())

@@ -3,7 +3,7 @@
 Rule-based planners drive 64 scenarios of the built-in world. The digest covers booleans, counts, which of them are
 defined, and the steps of first events exactly, and some continuous quantities as cells of a grid. On a fixed grid,
 values near an edge would fall into different cells on different machines. The grid of each quantity is therefore
-shifted by the multiple of an eighth of its cell whose edges are farthest from all 64 values
+shifted by that multiple of an eighth of its cell that keeps the edges farthest from all 64 values
 (docs/guide/reproducibility.md has the distances).
 """
 

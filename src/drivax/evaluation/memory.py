@@ -36,7 +36,7 @@ def memory_of(device: Any) -> int | None:
 
 
 def free_memory(device: Any, share: int = 1) -> int | None:
-    """Return the free bytes of a device, None if unknown; for a CPU, those of machine or container over ``share``.
+    """Return the free bytes of a device, None if unknown; of a CPU, those of the machine or container over ``share``.
 
     The page cache of Linux counts as free; on other systems, all memory of a CPU counts as free.
     """

@@ -117,8 +117,8 @@ def devkit_episode(scenario: Scenario, trajectories: Trajectories, row: int, siz
         row: Row of the episode in ``trajectories``.
         sizes: Sizes of the set's banks.
     """
-    start, last = trajectories.begin(row, scenario), int(scenario.steps)
-    steps, count = slice(start, last), last - start
+    start, end = trajectories.begin(row, scenario), int(scenario.steps)
+    steps, count = slice(start, end), end - start
     ego = _ego(scenario, trajectories.ego[row, :count].astype(np.float64), start)
     expert = scenario.agent_xy[steps, 0][scenario.agent_valid[steps, 0]].astype(np.float64)
     others = None if trajectories.others is None else unpack_poses(trajectories.others[row, :count])

@@ -52,6 +52,8 @@ from drivax.tracking.run_folder import RunFolder, policy_training_sets
 #: Scenarios per program call on a CPU, where larger batches exceed the caches with some planners and are faster with
 #: others (docs/log/2026-11-22-evaluation.md), and on other devices.
 CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
+#: Approximate bytes of a step in a run folder, measured on the built-in world: of ego, and of each simulated agent.
+_EGO_BYTES, _AGENT_BYTES = 22, 3
 #: Maximum number of scenarios in an error message, and of crashes in a list.
 _MAX_NAMED = _MAX_LISTED = 5
 #: Columns of the headline table, with their short names.
@@ -153,8 +155,8 @@ def run_evaluation(
 
 
 def _episode_bytes(traffic: str, sizes: Sizes, steps: int) -> int:
-    """Return the approximate size of an episode in a run folder, measured on the built-in world."""
-    return 22 * steps if traffic == "log" else steps * (22 + 3 * sizes.agents)
+    """Return the approximate size of an episode in a run folder, bytes."""
+    return steps * (_EGO_BYTES + (0 if traffic == "log" else _AGENT_BYTES * sizes.agents))
 
 
 def with_metrics(task: Task, extra: tuple[str, ...]) -> Task:

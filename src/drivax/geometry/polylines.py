@@ -66,16 +66,16 @@ class Polylines:
 
     @cached_property
     def _key(self) -> Float[Array, " point"]:
-        """Position of every point on that axis."""
+        """Position of every point on the axis of :attr:`_base`."""
         return self.arc + self._base[self.row]
 
     def locate(self, row: Array, s: Array) -> tuple[Int[Array, "*query"], Float[Array, "*query"]]:
         """Find the segment at arc length ``s`` of polyline ``row``, which has two points or more.
 
         Returns:
-            The index of its first point, and the fraction of the segment at ``s``. Beyond an end, the segment is the
-            first with a length, or the last: evaluation continues straight on, but stays at a last point that is
-            repeated.
+            The index of its first point, and the fraction of the segment at ``s``. Before the beginning the
+            segment is the first with a length, beyond the end the last: evaluation continues straight on, but stays at
+            a last point that is repeated.
         """
         # Minimum and maximum are several times as fast as clip on few elements.
         key = np.minimum(np.maximum(s, 0.0), self.length[row]) + self._base[row]
@@ -132,7 +132,7 @@ def point_to_segment(
 def _distance_to_chords(offset: Sequence[Array], chord: Sequence[Array]) -> tuple[Array, Array]:
     """Distance from points to chords, and the fraction in [0, 1] of the nearest point.
 
-    ``offset`` is that of each point from the start of its chord. Arguments are sequences of coordinates: one array per
+    ``offset`` points from the start of each chord to its point. Arguments are sequences of coordinates: one array per
     coordinate is faster than an axis of two.
     """
     square = _dot(chord, chord)

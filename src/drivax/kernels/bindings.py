@@ -35,7 +35,7 @@ class Agents(NamedTuple):
     """All agents at a step.
 
     Attributes:
-        box: x, y, cosine, sine, length, width.
+        box: x, y (m), cosine and sine of the heading, length, width (m).
         velocity: m/s.
         z: Height of the box centre, m.
         valid: Whether the slot has an agent.
@@ -55,14 +55,14 @@ def read_frame(
 ) -> tuple[Agents, Int[Array, " L"]]:  # fmt: skip
     """Return the agents at a step, the driven one with ``motion`` but its logged height, and the states of lights.
 
-    The simulated height is left out because measuring changes it; without it, XLA computes the frame once per step.
+    The simulated height is left out because measuring changes it: this way, XLA computes the frame once per step.
 
     Args:
         logs: Arrays of all scenarios.
         index: Scenario.
         step: Step of the log.
         slot: Slot of the driven agent; no agent is driven if it is beyond the slots of moving agents.
-        motion: The driven agent's x, y, heading and speed.
+        motion: The driven agent's x, y (m), heading (rad) and speed (m/s).
         direction: Cosine and sine of its heading.
     """
     slots, lights = logs[1].shape[1], logs[4].shape[2]
@@ -117,7 +117,7 @@ def look_ahead(
         numbers: Slot, scenario and route of the driven agent, and row of the arc lengths of stop lines on that route.
         route_m: Arc length of the driven agent along its route, m.
         speed: Speed of the driven agent, m/s.
-        min_gap_m: Gap that the driver keeps behind a standing leader.
+        min_gap_m: Gap that the driver keeps behind a standing leader, m.
         rules: ``FollowingRules`` in ``native/following.cc``.
     """
     number = jax.ShapeDtypeStruct((), jnp.float32)
@@ -134,9 +134,9 @@ class SegmentGrid(NamedTuple):
     Attributes:
         segments: Segments of lanes or of edges, by feature.
         start: Index of the first segment of each cell, and of the end of the last cell.
-        origin: Smallest x, y of each grid.
-        cell_m, longest_run: Size of a cell; largest number of segments in three neighbouring cells of a row.
-        long_ego: Whether corners of some ego can lie outside of the cells around its centre.
+        origin: Smallest x, y of each grid, m.
+        cell_m, longest_run: Size of a cell, m; largest number of segments in three neighbouring cells of a row.
+        long_ego: Whether corners of some ego can lie outside the cells around its centre.
     """
 
     segments: Float[Array, "N features S"]
@@ -152,7 +152,7 @@ class SegmentGrid(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Box of a vehicle: centre, heading (cosine, sine) and corners, and the height of the ground."""
+    """Box of a vehicle: centre (m), heading (cosine, sine), corners (m), and the height of the ground (m)."""
 
     centre: Float[Array, "2"]
     heading: Float[Array, "2"]
@@ -161,7 +161,7 @@ class Box(NamedTuple):
 
 
 class Lanes(NamedTuple):
-    """Values of ``queries.LaneHits``; ``nearest_z`` is the height of the nearest lane, also if it is not near."""
+    """Values of ``queries.LaneHits``; ``nearest_z`` is the height of the nearest lane, near or not."""
 
     near: Bool[Array, "*batch"]
     corners_near: Bool[Array, "*batch 4"]
@@ -190,11 +190,11 @@ def query_lanes(
 
     Args:
         grid: Segments of lanes.
-        map_box: Smallest and largest x, y of each map.
+        map_box: Smallest and largest x, y of each map, m.
         index: Scenario.
         box: Pose of the box.
         ego: Number of the scenario's ego whose corridor counts.
-        routed: Whether the box drives lanes of the corridor rather than other lanes that fit.
+        routed: Whether lanes of the corridor come before other lanes that fit.
         rules: ``cutoff_m``, ``level_m``, ``margin_m``, ``goes_on_m``, ``joint_m`` and ``parallel_cos``.
     """
     flag, number = (jax.ShapeDtypeStruct((), dtype) for dtype in (jnp.bool_, jnp.float32))
@@ -217,8 +217,8 @@ def query_edges(
         grid: Segments of edges.
         sides: Packed drivable sides of the parts of cells, ``split`` along each axis.
         index: Scenario.
-        centre: Centre of the box.
-        corners: Corners of the box.
+        centre: Centre of the box, m.
+        corners: Corners of the box, m.
         near_lane: Whether a lane is near each corner.
         ground: Height of the ground, m.
         rules: ``cutoff_m``, ``level_m``, and for the parts of cells ``split`` and ``not_drivable``.
@@ -240,7 +240,7 @@ class Ego:
         slot: Slot in frames.
         route_m: Arc length along its route, m.
         has_route: Whether it has a route on lanes.
-        motion: x, y, heading, speed.
+        motion: x, y (m), heading (rad), speed (m/s).
         direction: Cosine and sine of the heading.
     """
 
@@ -311,7 +311,7 @@ def observe_route(
 
     Args:
         routes: Routes and their numbers of points.
-        goal: x, y of each route's goal.
+        goal: x, y of each route's goal, m.
         ego: The driven agent.
         columns: Numbers of the F columns among all columns of the group.
         offsets_m: Arc lengths of the K points relative to ego, m.

@@ -19,7 +19,7 @@ from jax.sharding import AxisType, PartitionSpec
 
 from drivax.kernels.stamp import read_stamp, stamp
 
-#: ``make native`` and the wheels for Linux on x86-64 put it here. Loading it runs its code: no variable moves it.
+#: ``make native`` and the wheels for Linux on x86-64 put it here. Loading it runs its code: no variable overrides it.
 PATH = Path(__file__).parent / "libdrivax.so"
 #: Its sources, in a checkout.
 SOURCES = Path(__file__).parents[3] / "native"
@@ -49,7 +49,7 @@ def _load() -> ctypes.CDLL | str:
 
 
 def _access_problem() -> str | None:
-    """Return why the library is easier to write than the package's own code, and the cure, or None."""
+    """Return why more users can write the library than the package's own code, and the cure, or None."""
     own_status = Path(__file__).stat()
     for path in (PATH.resolve(), PATH.resolve().parent, PATH.parent):
         status = path.stat()
@@ -61,7 +61,7 @@ def _access_problem() -> str | None:
 
 
 def _build_problem() -> str | None:
-    """Return why the library, which has not been loaded yet, is no build for this package and machine, or None."""
+    """Return why the library, which has not been loaded yet, was not built for this package and machine, or None."""
     if not PATH.is_file():
         return "is not a regular file"
     built = read_stamp(PATH.read_bytes())
@@ -144,14 +144,14 @@ def call(
     Args:
         kernel: Its name.
         results: Shapes of the results of one sample.
-        common: Arguments that all samples share, such as weights. A ``vmap`` over them is a loop of calls.
+        common: Arguments that all samples share, such as weights. A ``vmap`` over them becomes a loop of calls.
         batched: The other arguments; each has the batch's axes first.
         axes: Number of the batch's axes.
         attributes: Constants.
-        sums: Whether the results are sums over the batch. A ``vmap`` is a loop of calls then, too.
+        sums: Whether the results are sums over the batch. Then, too, a ``vmap`` becomes a loop of calls.
 
     Returns:
-        The results, with the batch's axes first unless they are sums. A batch is divided among the devices of the
+        The results, with the batch's axes first unless they are sums. A batch is sharded over the devices of the
         current mesh.
     """
     library = _load()
@@ -160,7 +160,7 @@ def call(
 
     @custom_vmap
     def run(common: Any, batched: Any) -> list[Any]:
-        return _divide(run_share, lead(batched), sums)(common, batched)
+        return _shard(run_share, lead(batched), sums)(common, batched)
 
     def run_share(common: Any, batched: Any) -> list[Any]:
         axes_shape = () if sums else lead(batched)
@@ -185,8 +185,8 @@ def call(
     return run(list(common), list(batched))
 
 
-def _divide(function: Any, lead: tuple[int, ...], sums: bool) -> Any:
-    """Divide a batch among the devices of the current mesh by its first axis that they divide."""
+def _shard(function: Any, lead: tuple[int, ...], sums: bool) -> Any:
+    """Shard a batch over the devices of the current mesh, along the first axis that their number divides."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1 or AxisType.Manual in mesh.axis_types:
         return function

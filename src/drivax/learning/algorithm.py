@@ -20,7 +20,7 @@ AuxiliaryLoss = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 class LearnerState(Protocol):
     """A pytree with all that a run needs to continue: a ``scenario.record.record``, so that leaves have names.
 
-    A class attribute ``networks`` names the fields that fine-tuning takes over from another run, by default
+    A class attribute ``networks`` names the fields that fine-tuning loads from another run, by default
     ``parameters``; a field may itself be such a state. Training stops if a number is not finite, except in the fields
     ``environments`` and ``replay``.
     """
@@ -122,7 +122,10 @@ class HasCritics(Protocol):
     """A learner that can tell at the end of a run whether its critics are healthy."""
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
-        """Return what is wrong with the critics, given the rows of ``metrics.jsonl`` up to the policy, or None."""
+        """Return what is wrong with the critics, given the rows of ``metrics.jsonl`` up to the loaded checkpoint.
+
+        None if the run did not check them.
+        """
         ...
 
 

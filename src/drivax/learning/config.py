@@ -38,7 +38,7 @@ Algorithm = (
 
 #: Name of the traffic in which the policy in training drives several vehicles.
 SELF = "self"
-#: Largest number of kinds of traffic in a training.
+#: Largest number of kinds of traffic in a training run.
 MOST_SHARES = 16
 #: Largest deviation of the sum of shares from 1.
 _ROUNDING = 1e-3
@@ -63,8 +63,8 @@ class TrainConfig:
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two (exceptions:
             :class:`~drivax.learning.driving.Driving`). The first episodes of a run may also begin later, so that they
             end at different times.
-        begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are taken
-            over, the rest of the state is fresh. All other settings may differ as long as the networks fit.
+        begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are loaded,
+            the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.
         checkpoint_every: Iterations between checkpoints; validations and the last iteration always have one.
         keep: Number of newest checkpoints to keep in addition to the best.

@@ -1,8 +1,8 @@
 """Health of critics: whether Q values are returns, rank episodes by their return, and have converged.
 
-Q values that diverge, or that only fit the data, still train a policy: in effect an imitation. Each validation of an
-offline run in driving compares the critics with simulated returns of the present policy, and with returns of held-out
-episodes; the end of the run names what is wrong.
+With Q values that diverge or only fit the data, training still yields a policy, but in effect one that imitates. Each
+validation of an offline run in :class:`~drivax.learning.driving.Driving` compares the critics with simulated returns of
+the current policy, and with returns of held-out episodes; at its end, the run reports what is wrong.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ def policy_returns(
     """Drive a policy in all scenarios from the current step to the end of the episode.
 
     Returns:
-        Discounted return; ``gamma^n`` of the final state after n steps, 0 where the episode terminated; and the
-        observations of the first and the final states. The return of an endless episode is their return plus that power
-        of ``gamma`` times the final state's value.
+        Discounted return; ``gamma^n`` for an episode of n steps, 0 where it terminated; and the observations of the
+        first and the final states. To bootstrap a truncated episode, add this discount times the value of the final
+        state to the return.
     """
     simulator = Simulator(replace(environment.task, metrics="none"), environment.simulator.traffic)
 
     def step(carry: Any, is_first: Array) -> tuple[Any, None]:
-        # One step more than the episode has, so that the final state is observed here, too: tracing takes long.
+        # One step more than the episode has, which observes the final state: a second trace would take long.
         state, over, value, discount, first, _ = carry
         observation = dict(simulator.observe(bank, state.context))
         action = act(jax.tree.map(lambda leaf: leaf[None], observation))[0]
@@ -90,7 +90,7 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
 
 
 def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str] | None:
-    """Return what is wrong with the critics of a run, given the rows of its ``metrics.jsonl`` up to its policy.
+    """Return what is wrong with the critics of a run, given its rows of ``metrics.jsonl`` up to the loaded policy.
 
     None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
     None for a policy without one.

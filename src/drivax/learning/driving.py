@@ -61,9 +61,9 @@ class Driving:
 
     Attributes:
         simulator: Task, traffic and kind of start.
-        latest_start, earliest_start: Episodes begin at a random step of the log between the two, those of
-            :meth:`start` up to the third last. They begin at step 10 if the ego is not valid at that step, or if the
-            third last step of its log is before ``earliest_start``.
+        latest_start, earliest_start: Episodes begin at a random step of the log between the two; those of
+            :meth:`start`, between ``earliest_start`` and the third last step. They begin at step 10 if the ego is not
+            valid at the drawn step, or if the third last step of its log is before ``earliest_start``.
         egos: Vehicle to drive: the recorded ego, or a uniformly drawn ego of the scenario. Rows of logged steps
             (:data:`~drivax.learning.experience.StepIndex`) are scenarios, or the rows of all egos in the bank.
     """
@@ -236,8 +236,8 @@ class Driving:
 
         Steps lie between the current one and the third last, because an expert's action looks two steps ahead. They are
         observed as if the expert had driven there in the simulator: the last action is that of the expert, as executed.
-        Steps are drawn uniformly from those at which the ego is valid, as it is at the two after them; if an ego has no
-        such step, step 10 is drawn.
+        Steps are drawn uniformly from those at which the ego is valid and stays valid for two more steps; if an ego has
+        no such step, step 10 is drawn.
         """
 
         def demonstrate(bank: ScenarioBank, *index: Any) -> tuple[dict[str, Array], Array, Array]:
@@ -380,7 +380,7 @@ def _bind_bank(function: Callable[..., Any], bank: ScenarioBank) -> Callable[...
 def _has_expert_action(bank: ScenarioBank, egos: int) -> Bool[Array, "M T"]:
     """Mask of steps with an expert action, for the first ``egos`` egos of each scenario.
 
-    These are steps from the current one on at which the ego is valid, as it is at the next two.
+    These are steps from the current one on at which the ego is valid and stays valid for two more steps.
     """
     steps, slot = jnp.arange(bank.steps), bank.egos[:, :egos, None]
     valid = bank.agents[jnp.arange(len(bank))[:, None, None], steps, slot, AgentColumn.VALID] > 0

@@ -43,8 +43,8 @@ class Outcome:
         terminated: The episode ended by a failure: bootstrap zero.
         truncated: The episode was cut off: bootstrap the value of the next state.
         cache: :meth:`Environment.cache` of the new state.
-        totals: Sums to log over environments that were not over: ``"<name>"`` with its count ``"<name>/n"``, and
-            ``"reward/<name>"`` over steps. Each is an array of partial sums, of any shape.
+        totals: Values to log, summed over environments whose episode was not over: ``"<name>"`` with its count
+            ``"<name>/n"``, and ``"reward/<name>"`` over steps. Each is an array of partial sums, of any shape.
         terms: Weighted terms of the reward by name; algorithms read those of ``Environment.penalties``.
     """
 
@@ -222,7 +222,7 @@ def collect(
 def any_across_learners(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
     """Return whether a condition holds anywhere in the batch and, under ``vmap``, in any learner.
 
-    With a condition per learner, ``jax.lax.cond`` computes both branches; with this single one it computes one.
+    With a condition per learner, ``jax.lax.cond`` computes both branches; with a single condition, only one of them.
     """
     return condition.any()
 

@@ -103,8 +103,8 @@ class ExpertSteps:
 
     Values of steps that are not ``usable`` are undefined. A ``clipped`` action does not lead to the next state: it was
     clipped to the bounds, or is not at the first step of its decision. ``hold`` is the number of steps per decision
-    (``Task.hold``), ``egos`` that of logs per scenario. Episodes have ``scenario``, the scenario of each, out of
-    ``scenarios``.
+    (``Task.hold``), ``egos`` the number of logs per scenario. Recorded episodes also have ``scenario``, the row of
+    the scenario of each, and the number of ``scenarios``.
     """
 
     action: Float[Array, "M T D"]

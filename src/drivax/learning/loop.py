@@ -90,7 +90,7 @@ class TrainOptions:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder; no effect with ``resume``.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
-        log: Called with lines about held-out scenarios, memory, pretrained networks and early stops, and warnings.
+        log: Called with lines about held-out scenarios, memory, pretrained networks and early stops, and with warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
             in the traffic may name.
     """
@@ -114,13 +114,13 @@ def train(
     """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
     Args:
-        config: Settings of the training.
+        config: Settings of the training run.
         data: Scenarios to train on, all held on the device. Weights are for ``bc``, offline algorithms, and ``sac`` and
             ``bc_sac`` with ``demonstrations``; episodes for ``bc`` and offline algorithms.
         out: Run folder.
-        validation: Scenarios that rank checkpoints; by default ``data`` holds out whole recordings: at most a tenth of
-            its scenarios (and 256), else the smallest recording; none if there is only one. None trains on all
-            scenarios without validation.
+        validation: Scenarios that rank checkpoints. By default, whole recordings of ``data`` are held out: at most a
+            tenth of its scenarios and at most 256, or the smallest recording if none fits; nothing if there is only one
+            recording. None trains on all scenarios without validation.
         options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
     Raises:
@@ -211,7 +211,8 @@ def usable_steps(
 ) -> np.ndarray:
     """Return the mask ``[M, T]`` of the logged steps that training with weights can draw, for each ego it drives.
 
-    With episodes, it holds where any episode of the scenario has such a step. ``trust`` is as for :func:`train`.
+    With episodes, the mask is ``[N, T]`` and holds where any episode of the scenario has such a step. ``trust`` is as
+    for :func:`train`.
 
     Raises:
         UsageError: The algorithm does not draw logged steps by weight.
@@ -287,7 +288,7 @@ def _held_out(
 def _environment(
     config: TrainConfig, data: Sequence[Scenario], trust: Sequence[str], training: TrainingSet
 ) -> tuple[Driving | Mixture, Any]:
-    """Return the environment of a training, and its data: the bank, or episodes in it.
+    """Return the environment of a training run, and its data: the bank, or episodes in it.
 
     Raises:
         UsageError: ``egos`` is moving, but the set has no further egos; or the training cannot use the episodes.
@@ -361,7 +362,7 @@ def _resumed_folders(
     resumed = replace(config, devices=devices) if devices <= jax.local_device_count() else config
     if folder.kind != "seeds":
         return resumed, [folder]
-    # A process that was killed at its start may not have created all of them.
+    # A process that was killed at its start may not have created all folders.
     notes = {name: folder.info[name] for name in _INHERITED_NOTES if name in folder.info}
     numbers = range(config.seed, config.seed + count)
     return resumed, [_seed_folder(config, data, notes, out, number) for number in numbers]
@@ -369,7 +370,7 @@ def _resumed_folders(
 
 @dataclass(frozen=True)
 class _Training:
-    """The iterations of a training, with the log of each seed; ``networks`` are the pretrained ones of a new run."""
+    """The iterations of a training run, and the log of each seed; ``networks`` are the pretrained ones of a new run."""
 
     config: TrainConfig
     program: Program

@@ -161,7 +161,7 @@ class Mixture:
 
 
 def training_environment(config: TrainConfig, trust: Sequence[str] = ()) -> Driving | Mixture:
-    """Return the environment of a training: one block, or a mixture of several.
+    """Return the environment of a training run: one block, or a mixture of several.
 
     ``trust`` are the modules whose code policies in the traffic may name.
     """

@@ -28,9 +28,9 @@ from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, t
 POLICY_FILE = "policy.npz"
 #: Entries of ``run.json`` that an exported policy keeps from its training; only the command may contain paths.
 _PROVENANCE = ("command", "started", "versions", "git", "validation", "step", "critics")
-#: Ends the name of a policy whose critics are not healthy (:mod:`drivax.learning.critic_health`).
+#: Suffix of the name of a policy whose critics are not healthy (:mod:`drivax.learning.critic_health`).
 _UNHEALTHY = " (unhealthy critics)"
-#: Overrides: parameters do not depend on traffic and starts, and the training's traffic may no longer exist.
+#: Overrides: parameters do not depend on traffic and starts, and the traffic of the training run may no longer exist.
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 
 
@@ -111,7 +111,7 @@ def export_policy(
         out: Folder to write; its name is that of the policy.
         bank: Any bank; only shapes of its observations are read.
         notes: More entries for ``run.json``, plain JSON values.
-        overwrite: Replace ``out`` if it is a run folder, but not that of a training.
+        overwrite: Replace ``out`` if it is a run folder, but not that of a training run.
         trust: As for :func:`load_policy`.
     """
     folder = open_policy(run)
@@ -184,7 +184,7 @@ def find_traffic(name: str, trust: Sequence[str] = ()) -> Traffic:
     after a plus sign (``zoo:NAME+idm``). ``trust`` is that of :func:`load_policy`.
 
     Raises:
-        UsageError: There is no such traffic, or the run in the folder is no training.
+        UsageError: There is no such traffic, or the run in the folder is not a training run.
         DataError: It is not a run folder.
     """
     run, base = split_traffic(name)

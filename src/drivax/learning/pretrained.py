@@ -1,4 +1,4 @@
-"""Networks of another run to start from: fine-tuning takes them over, the rest of the state is fresh."""
+"""Networks of another run to start from: fine-tuning loads them, the rest of the state is fresh."""
 
 from __future__ import annotations
 

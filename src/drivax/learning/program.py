@@ -32,7 +32,7 @@ from drivax.tracking.workers import available_cores
 _THREADS = 8
 #: Flag of XLA that sets the number of CPU devices.
 _DEVICE_FLAG = "--xla_force_host_platform_device_count"
-#: Name of the mesh axis of devices that divide the work of each seed, and of devices that divide the seeds.
+#: Names of the mesh axes: devices that divide the work of each seed, and devices that divide the seeds.
 _AXIS, _SEEDS = "devices", "seeds"
 
 _NETWORKS = "networks and optimiser"
@@ -427,9 +427,9 @@ class MemoryAccount:
 
     def text(self) -> str:
         """Return the account as one line."""
-        sizes = ", ".join(f"{name} {_readable(size)}" for name, size in self.sizes.items() if size)
-        limit = "" if self.limit is None else f" of {_readable(self.limit)} free"
-        return f"memory: {_readable(self.total)}{limit} on {self.device}: {sizes}"
+        sizes = ", ".join(f"{name} {_format_bytes(size)}" for name, size in self.sizes.items() if size)
+        limit = "" if self.limit is None else f" of {_format_bytes(self.limit)} free"
+        return f"memory: {_format_bytes(self.total)}{limit} on {self.device}: {sizes}"
 
     @property
     def cure(self) -> str:
@@ -481,7 +481,7 @@ def _program_bytes(compiled: jax.stages.Compiled) -> int:
     return analysis.temp_size_in_bytes + results + analysis.generated_code_size_in_bytes
 
 
-def _readable(size: int) -> str:
+def _format_bytes(size: int) -> str:
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= scale:
             return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:.0f} {unit}"

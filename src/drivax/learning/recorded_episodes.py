@@ -1,8 +1,8 @@
-"""Recorded episodes: evaluations of any drivers, as logged steps that offline algorithms learn from.
+"""Recorded episodes: evaluations of any planners, as logged steps that offline algorithms learn from.
 
-An evaluation stores the motion and the executed actions of its driver. Before training, every episode is replayed once,
-with the rewards and episode ends of the training. Only what observations depend on is kept: some 60 bytes per step in
-log traffic, more in reactive traffic.
+An evaluation stores the motion and the executed actions of its planner. Before training, every episode is replayed once
+with the rewards and episode ends of the training task. Only what observations depend on is kept: some 60 bytes per step
+in log traffic, more in reactive traffic.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class RecordedEpisodes:
         bank: The scenarios.
         contexts: Fields of the context (:class:`~drivax.simulator.types.AgentContext`) at these steps, ``[M, T, ...]``,
             without its ``history``.
-        motion: x, y, heading, speed at these steps, and at the ``HISTORY - 1`` steps before the first.
-        steps: Actions of the drivers and their outcome.
+        motion: x, y (m), heading (rad), speed (m/s) at these steps, and at the ``HISTORY - 1`` steps before the first.
+        steps: Actions of the planners and their outcome.
     """
 
     bank: ScenarioBank
@@ -69,9 +69,9 @@ class RecordedDriving(Driving):
     ) -> tuple[dict[str, Any], Float[Array, "times 4"], tuple[Array, ...]]:
         """Replay an episode, which begins as logged.
 
-        Returns contexts and motion from ``start_step`` on, and of each step action, reward, ends, and whether the
-        action does not lead to the next state: it exceeds the bounds, or reaches them in an exact replay of the log,
-        where evaluations clip it.
+        Returns contexts and motion from ``start_step`` on, and for each step the action, the reward, the episode ends,
+        and whether the action does not lead to the next state: it exceeds the bounds, or reaches them in an exact
+        replay of the log, where evaluations clip it.
         """
         index, motion, action = episode
         simulator = Simulator(replace(self.task, metrics="none"), self.simulator.traffic)

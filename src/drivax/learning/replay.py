@@ -5,7 +5,7 @@ world), and is observed whenever it is sampled, twice per transition. An observa
 ``sac``) to 44 kB (``published/sac``).
 
 A row holds one step of all environments. Its successor is the next row; the final state of an episode is in the row
-that resets it. The newest row has no successor yet and is not sampled.
+that resets the environment. The newest row has no successor yet and is not sampled.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class Transitions:
 
     Attributes:
         reward: Discounted sum of the rewards of these steps, which belong to one episode.
-        terminated: Whether the episode ended by a failure in them.
-        next_observation: Observation after them, final states included.
+        terminated: Whether the episode ended by a failure within these steps.
+        next_observation: Observation after these steps, final states included.
         discount: ``gamma`` to the power of the number of these steps (of decisions, where they are held).
     """
 
@@ -155,7 +155,7 @@ class ReplayBuffer:
         return replace(replay, **columns, next_row=(replay.next_row + steps) % rows)
 
     def draw(self, replay: Replay, key: Array, shape: tuple[int, ...]) -> ReplayIndex:
-        """Draw steps uniformly, with replacement, among those with a successor, of which there must be one.
+        """Draw steps uniformly, with replacement, among those with a successor, of which there must be at least one.
 
         Call it once for all batches of an iteration, because it reads every row.
         """
@@ -171,8 +171,8 @@ class ReplayBuffer:
         block = jnp.searchsorted(running, rank, side="right").astype(jnp.int32)
         rank_in_block = rank - (running - counts)[block]
         count_in_block = jnp.cumsum(sampleable.reshape(-1, size)[block], axis=-1, dtype=jnp.int32)
-        place = jnp.argmax(count_in_block > rank_in_block[..., None], axis=-1).astype(jnp.int32)
-        step = block * size + place
+        position = jnp.argmax(count_in_block > rank_in_block[..., None], axis=-1).astype(jnp.int32)
+        step = block * size + position
         return step // environments, step % environments
 
     def sample(

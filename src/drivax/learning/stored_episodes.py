@@ -1,4 +1,4 @@
-"""Episodes stored with their observations: for other programs, or by them.
+"""Episodes stored with their observations, to exchange them with other programs.
 
 drivax itself observes steps when they are drawn, so that one recording serves every observation and reward. Other
 programs need the transitions of one task.
@@ -107,7 +107,7 @@ class StoredDriving(Driving):
 
 
 def minari_folder(path: str | Path) -> Path | None:
-    """Return the folder of the data of a Minari data set, given this folder or that of the set; None: it is none."""
+    """Return the data folder of a Minari data set, given the folder of the set or its data; None for other folders."""
     folders = (Path(path) / "data", Path(path))
     return next((folder for folder in folders if (folder / "metadata.json").is_file()), None)
 
@@ -123,7 +123,9 @@ def match_observations(
     stored = {name: values.shape[2:] for name, values in episodes.observation.items()}
     expected = {name: shape for name, shape in shapes.items() if 0 not in shape}
     if stored != expected:
-        problem = f"observations of the episodes are {_text(stored)}, those of the task {_text(expected)}"
+        problem = (
+            f"observations of the episodes are {_describe(stored)}, those of the task {_describe(expected)}"
+        )
         raise UsageError(problem, cure="train with their observation (task.observation)")
     if (size := episodes.steps.action.shape[-1]) != action_size:
         problem = f"actions of the episodes have {size} numbers, those of the task {action_size}"
@@ -136,7 +138,7 @@ def match_observations(
     return StoredEpisodes(observation, episodes.steps)
 
 
-def _text(shapes: Mapping[str, tuple[int, ...]]) -> str:
+def _describe(shapes: Mapping[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name} {'x'.join(map(str, shape))}" for name, shape in sorted(shapes.items()))
 
 
@@ -180,11 +182,12 @@ def _observe(
 
 
 def write_npz(out: Path, episodes: Iterable[StoredEpisode]) -> tuple[int, int]:
-    """Write the transitions of episodes as a compressed npz file with the names of D4RL; return both numbers.
+    """Write the transitions of episodes as a compressed npz file with the names of D4RL.
 
-    ``observations`` and ``next_observations`` are ``[N, F]``: all groups in alphabetical order, each flattened, as
-    ``layout`` (JSON: shape by name) says. ``actions [N, D]``, ``rewards``, ``terminals`` (failures), ``timeouts`` (the
-    episode was cut off after this step), ``clipped`` (:class:`StoredEpisode`) and ``scenario`` (row) are ``[N, ...]``.
+    ``observations`` and ``next_observations`` are ``[N, F]``: all groups in alphabetical order, each flattened;
+    ``layout`` has their shapes by name (JSON). ``actions`` are ``[N, D]``; ``rewards``, ``terminals`` (failures),
+    ``timeouts`` (the episode was cut off after this step), ``clipped`` (:class:`StoredEpisode`) and ``scenario`` (row)
+    are ``[N]``. Returns the number of episodes and the number N of transitions.
     """
     columns: dict[str, list[np.ndarray]] = {}
     layout, count = {}, 0
@@ -207,7 +210,7 @@ def write_npz(out: Path, episodes: Iterable[StoredEpisode]) -> tuple[int, int]:
             columns.setdefault(name, []).append(rows)
         count += 1
     transitions = sum(map(len, columns.get("rewards", ())))
-    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
+    arrays = {name: np.concatenate(chunks) for name, chunks in columns.items()}
     with atomic_write(out) as file:
         np.savez_compressed(file, allow_pickle=False, layout=np.array(json.dumps(layout)), **arrays)
     return count, transitions

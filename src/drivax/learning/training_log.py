@@ -117,9 +117,9 @@ class Preempted(DrivaxError):
 
 
 class StopSignal:
-    """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
+    """Context that records SIGTERM instead of ending the process; a second SIGTERM ends it.
 
-    Batch systems send it some seconds before they end a job. The context has no effect outside of the main thread.
+    Batch systems send SIGTERM some seconds before they end a job. The context has no effect outside of the main thread.
     """
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ class StopSignal:
 class TrainingLog:
     """The run folder of one seed during training: metrics, checkpoints, and the ranks of its validations.
 
-    ``rule``, ``keep`` and ``patience`` are those of the training's configuration.
+    ``rule``, ``keep`` and ``patience`` are those of the training configuration.
     """
 
     def __init__(self, folder: RunFolder, rule: Rule, keep: int, patience: int) -> None:

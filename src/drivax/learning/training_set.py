@@ -1,4 +1,4 @@
-"""Sets to train on, and recorded episodes in them: evaluations of any drivers."""
+"""Sets to train on, and recorded episodes in them: evaluations of any planners."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TrainingSet:
         scenarios: The scenarios.
         weights: Sampling weights of steps, at least 0, ``[M, T]`` (:meth:`ExperienceConfig.of`); None: uniform.
         episodes: Episodes to learn from instead of the logs: recorded in these scenarios (:func:`read_episodes`), or
-            stored with the observations of the training.
+            stored with the observations of the training task.
     """
 
     scenarios: ScenarioSet
@@ -53,7 +53,10 @@ def recorded_environment(environment: Driving, episodes: Sequence[EpisodeTable])
 
 
 def episodes_digest(episodes: Iterable[EpisodeTable] | StoredEpisodes) -> str | None:
-    """Return a SHA-256 of the actions of episodes and what they see, for ``run.json``; None without episodes."""
+    """Return a SHA-256 for ``run.json``: of scenarios, motion and actions, or of all arrays of stored episodes.
+
+    None if there are no episodes.
+    """
     digest, empty = hashlib.sha256(), True
     if isinstance(episodes, StoredEpisodes):
         for values in jax.tree.leaves(episodes):
@@ -74,8 +77,8 @@ def read_episodes(
 
     Raises:
         DataError: A folder is missing or damaged, or its episodes are in another set.
-        UsageError: They have another action space, decision interval or traffic than the training, began elsewhere than
-            on the log, or at different steps.
+        UsageError: Action space, decision interval or traffic of the episodes differ from those of the training task,
+            or the episodes do not begin as logged, or not at the same step.
     """
     tables = tuple(EpisodeTable.read(folder) for path in paths for folder in episode_folders(path))
     expected: dict[str, Any] = {"task.hold": task.hold, "traffic": traffic, "noisy_start": False}
@@ -125,7 +128,9 @@ def prepare_episodes(
     scenarios: Sequence[Scenario],
     tables: Sequence[EpisodeTable],
 ) -> RecordedEpisodes | None:
-    """Return the episodes of tables in the scenarios of a bank, prepared for the environment's traffic; None without.
+    """Return the episodes of tables in the scenarios of a bank, prepared for the environment's traffic.
+
+    None if no episode is in these scenarios.
 
     Raises:
         DataError: Trajectories are damaged.
@@ -133,8 +138,8 @@ def prepare_episodes(
     row_of = {
         (name["dataset"], name["scenario_id"]): row for row, name in enumerate(scenario_names(scenarios))
     }
-    parts = [_episodes_in(table, row_of, environment, bank.steps) for table in tables]
-    index, motion, action = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    episodes = [_episodes_in(table, row_of, environment, bank.steps) for table in tables]
+    index, motion, action = (np.concatenate(columns) for columns in zip(*episodes, strict=True))
     if not len(index):
         return None
     return replay_episodes(environment, bank, *map(jnp.asarray, (index, motion, action)))

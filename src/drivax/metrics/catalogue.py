@@ -119,6 +119,10 @@ NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_MULTIPLIERS)
 VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_MULTIPLIERS)
 #: Smallest safe time to collision, and mean speeding at which compliance is 0 (nuPlan).
 _SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
+#: A log stands if it gains less than the first distance, and moves if it drives more than the second, m.
+_STANDS_M, _MOVES_M = 0.5, 5.0
+#: The goal is reached within this distance, m, or from this progress ratio on.
+_GOAL_M, _GOAL_RATIO = 3.0, 0.95
 
 
 def _boolean(value: Bool[Array, ""], defined: Any = True) -> Value:
@@ -156,7 +160,9 @@ def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     log_progress = end.bank.log_progress[end.row]
     log_gain = log_progress[end.bank.last_step[end.row]] - log_progress[end.start]
     gain = inputs["progress"]
-    ratio = jnp.where(log_gain < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(log_gain, 0.5), 0.0, 1.0))
+    ratio = jnp.where(
+        log_gain < _STANDS_M, 1.0, jnp.clip(gain.value / jnp.maximum(log_gain, _STANDS_M), 0.0, 1.0)
+    )
     return Value(ratio, gain.defined)
 
 
@@ -167,12 +173,14 @@ def _log_lead(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
     log_sum = jnp.sum(jnp.where((step > 0) & (step <= end.steps), log_progress, 0.0))
     gain = log_progress[end.start + end.steps] - log_progress[end.start]
     area = (value.value * end.steps - log_sum) * DT_S
-    return Value(area / jnp.maximum(gain, 0.5), value.defined & (gain >= 0.5))
+    return Value(area / jnp.maximum(gain, _STANDS_M), value.defined & (gain >= _STANDS_M))
 
 
 def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    is_near = inputs["goal_distance"].value <= 3.0
-    return _boolean(is_near | (inputs["progress_ratio"].value >= 0.95), inputs["progress_ratio"].defined)
+    is_near = inputs["goal_distance"].value <= _GOAL_M
+    return _boolean(
+        is_near | (inputs["progress_ratio"].value >= _GOAL_RATIO), inputs["progress_ratio"].defined
+    )
 
 
 def _ttc_ok(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
@@ -200,7 +208,7 @@ def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
 
 
 def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
-    moves = end.bank.log_ahead[end.row, end.start] > 5.0
+    moves = end.bank.log_ahead[end.row, end.start] > _MOVES_M
     return Value(inputs["success"].value, inputs["success"].defined & moves)
 
 
@@ -358,7 +366,7 @@ METRICS: dict[str, Metric] = {
 CODES = ("collision_type",)
 #: Metrics whose first step is stored.
 EVENTS = ("collision", "offroad", "red_light")
-#: Metrics of training logs, which need no fault, time to collision, comfort or speed limits.
+#: Metrics of training logs; they need no fault classification, time to collision, comfort or speed limits.
 TRAINING = (
     "success", "success_moving", "accuracy", "collision", "offroad", "left_map", "red_light", "off_route",
     "progress", "progress_ratio", "making_progress", "reached_goal", "goal_distance", "distance", "steps",

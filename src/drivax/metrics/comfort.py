@@ -2,8 +2,8 @@
 
 Jerk is the derivative over 15 samples of accelerations that are smoothed over 8 samples. A simulation therefore
 evaluates step t - 11 at step t, and the last twelve steps at the end of the episode, as in SciPy's ``interp`` mode. The
-result equals ``scipy.signal.savgol_filter`` over logged past and episode (tests). Windows and orders are those of
-nuPlan's devkit (decision 0011).
+result equals ``scipy.signal.savgol_filter`` over the logged past and the episode, as tests verify. Windows and orders
+are those of nuPlan's devkit (decision 0011).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.
     last window. As in SciPy, interior row i of an even window gives the value at i + 0.5.
     """
     half = window // 2
-    rows = np.zeros((samples, samples))
+    matrix = np.zeros((samples, samples))
     for sample in range(samples):
         interior = half <= sample < samples - half
         if interior:
@@ -60,8 +60,8 @@ def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.
         else:
             first = 0 if sample < half else samples - window
             position = sample - first
-        rows[sample, first : first + window] = _weights(window, order, derivative, position)
-    return rows
+        matrix[sample, first : first + window] = _weights(window, order, derivative, position)
+    return matrix
 
 
 def _weights(window: int, order: int, derivative: int, position: float) -> np.ndarray[Any, Any]:
@@ -73,7 +73,7 @@ def _weights(window: int, order: int, derivative: int, position: float) -> np.nd
 
 @record
 class ComfortSteps:
-    """Comfort, jerk and lateral acceleration of consecutive steps, oldest first."""
+    """Comfort, and magnitudes of jerk and lateral acceleration, of consecutive steps, oldest first."""
 
     comfortable: Bool[Array, " steps"]
     jerk_mps3: Float[Array, " steps"]
@@ -81,7 +81,7 @@ class ComfortSteps:
 
 
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Evaluate a trip (x, y, heading, speed; at least 23 rows) from row 11 on, the first row with centred windows.
+    """Evaluate a trip (x, y, heading, speed; 23 rows or more) from row 11 on, the first with centred windows.
 
     For plots and tables: an episode evaluates the same steps one by one, from its first step on.
     """

@@ -1,4 +1,4 @@
-"""Step values: quantities of one step, which an episode accumulates to metrics.
+"""Step values: quantities of one step, which an episode accumulates into metrics.
 
 A step value names the facts that it reads, so that only the facts of selected metrics are computed.
 """
@@ -48,7 +48,10 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " tail"]]:
-        """Comfort of the last twelve steps, and a mask of those that count after the start: the oldest, finally all."""
+        """Comfort of the last twelve steps, and a mask of those that count.
+
+        A step after the start counts if it is the oldest of the twelve, or if the episode ends now.
+        """
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts

@@ -66,7 +66,7 @@ class Distribution(Protocol):
         ...
 
     def raw_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch raw"]:
-        """Return the raw action that gives an action, clipped inside the bounds or, on the grid, its nearest levels."""
+        """Return the raw action of an action after clipping, or on the grid that of its nearest levels."""
         ...
 
     def mode(self) -> Float[Array, "*batch action"]:
@@ -138,7 +138,7 @@ class SquashedGaussian(_SquashedActions):
 
 @record
 class Beta:
-    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)``; above 1, both parameters give a single peak."""
+    """``2 x - 1`` of independent ``x ~ Beta(alpha, beta)``; with both parameters above 1, the density has one peak."""
 
     alpha: Float[Array, "*batch action"]
     beta: Float[Array, "*batch action"]
@@ -150,7 +150,7 @@ class Beta:
         return cls(alpha, beta)
 
     def sample(self, key: Array) -> Float[Array, "*batch action"]:
-        """Sample in [1e-6, 1 - 1e-6], reparametrised implicitly (Figurnov et al. 2018, arXiv 1805.08498)."""
+        """Sample in [1e-6, 1 - 1e-6], reparameterised implicitly (Figurnov et al. 2018, arXiv 1805.08498)."""
         return jnp.clip(jax.random.beta(key, self.alpha, self.beta), _EDGE, 1.0 - _EDGE)
 
     def log_prob(self, raw_action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:

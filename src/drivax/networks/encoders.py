@@ -137,7 +137,7 @@ class MlpEncoder(nnx.Module):
 
 
 def check_widths(name: str, widths: tuple[int, ...]) -> None:
-    """Raise UsageError if a layer of the setting ``name`` has no outputs or too many, or if there are too many."""
+    """Raise UsageError if a layer of the setting ``name`` has no outputs or too many, or if it has too many layers."""
     if min(widths, default=1) < 1:
         raise UsageError(f"{name} has a layer of width {min(widths)}", cure="use 1 or more")
     if max(widths, default=1) > MOST_WIDTH:

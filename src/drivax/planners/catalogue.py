@@ -30,7 +30,7 @@ def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
     """Make a planner by its name in :data:`PLANNERS` or its dotted name ``package.module:name``.
 
     A dotted name leads to a planner, or to a class or function that returns one without arguments. ``actions`` replaces
-    the action space of the planner, and of a planner that it wraps, where it is a field.
+    the field ``actions`` of the planner, and of a planner that it wraps, if they have one.
 
     Raises:
         UsageError: Unknown name, or the dotted name leads to no planner.

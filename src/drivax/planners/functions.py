@@ -75,7 +75,7 @@ def python_planner(function: Drive) -> FunctionPlanner:
     """Create a planner from a Python function ``(situation, observation) -> action``.
 
     Each call gets numpy arrays of one scenario at one step. An error fails the episode (``evaluation.runner``). The
-    function must not call JAX, which waits for it.
+    function must not call JAX: the compiled program waits for the function, so both would wait forever.
     """
     return FunctionPlanner(function, in_python=True)
 
@@ -83,9 +83,9 @@ def python_planner(function: Drive) -> FunctionPlanner:
 def python_actions(
     function: Callable[..., Any], identity: Array, step: Array, arguments: tuple[Any, ...], size: int
 ) -> Array:
-    """Return ``size`` numbers of a Python function that is called outside the compiled program.
+    """Call a Python function outside the compiled program, and return its ``size`` numbers.
 
-    In :func:`collect_errors` they are NaN if it raises an error, which otherwise ends the program.
+    If the function raises an error, the numbers are NaN within :func:`collect_errors`; elsewhere the program ends.
 
     Args:
         function: Gets ``arguments`` as numpy arrays of one scenario.
@@ -106,13 +106,13 @@ def python_actions(
 
 @record
 class NetworkPlanner(Memoryless):
-    """A policy network that acts by its mode, or by a sample.
+    """A policy network that acts by the mode of its action distribution, or by a sample.
 
     Attributes:
         parameters: Weights of the network.
         graph: Structure of the network.
         name: Name in tables.
-        samples: Whether to act by a sample.
+        samples: Whether to sample the action instead of taking the mode.
     """
 
     parameters: Any

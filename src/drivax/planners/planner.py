@@ -20,7 +20,7 @@ from drivax.tasks.actions import ActionSpace, Discrete, Physical, action_of
 
 #: Correlation time of the noise on actions, s.
 _CORRELATION_S = 1.0
-#: Time constant of the speed limiter, s, and its largest deceleration.
+#: Time constant of the speed limiter, s, and its largest deceleration, m/s2.
 _LIMITER_S, _LIMITER_MPS2 = 1.0, 2.0
 
 
@@ -41,7 +41,7 @@ class Planner(Protocol):
 
     @property
     def replays(self) -> bool:
-        """Whether the logged motion is replayed exactly instead of driving the action through the dynamics."""
+        """Whether the logged motion is replayed exactly, instead of applying actions to the dynamics."""
         ...
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
@@ -146,7 +146,7 @@ class _Wrapper:
 
 @record
 class Noisy(_Wrapper):
-    """A planner with noise on its actions: Gaussian, with a correlation time of one second, independent by component.
+    """A planner with noise on its actions: Gaussian, with a correlation time of one second, independent per component.
 
     Attributes:
         planner: The planner.
@@ -183,7 +183,7 @@ class Noisy(_Wrapper):
 
 
 def add_noise(planner: Planner, deviation: float) -> Planner:
-    """Return a planner with noise of a standard deviation on its actions; 0: the planner.
+    """Return a planner with noise of a standard deviation on its actions, or the planner itself for 0.
 
     Raises:
         UsageError: The deviation is negative, or the planner replays the log.
@@ -231,16 +231,18 @@ class SpeedLimited(_Wrapper):
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
         limit = situation.surroundings.lanes.limit
         limit = self.share * jnp.where(limit > 0.0, limit, FALLBACK_LIMIT_MPS)
-        most = jnp.maximum((limit - situation.context.history[-1, MOTION_SPEED]) / _LIMITER_S, -_LIMITER_MPS2)
-        most = most / jnp.where(most < 0.0, self.space.braking_mps2, self.space.acceleration_mps2)
-        return action.at[0].set(jnp.where(action[0] > most, most, action[0])), carry
+        speed = situation.context.history[-1, MOTION_SPEED]
+        limiter_mps2 = jnp.maximum((limit - speed) / _LIMITER_S, -_LIMITER_MPS2)
+        unit_mps2 = jnp.where(limiter_mps2 < 0.0, self.space.braking_mps2, self.space.acceleration_mps2)
+        largest = limiter_mps2 / unit_mps2
+        return action.at[0].set(jnp.where(action[0] > largest, largest, action[0])), carry
 
 
 def limit_speed(planner: Planner, share: float | None, actions: ActionSpace) -> Planner:
-    """Return a planner with a speed limiter at a share of the speed limit; None: the planner.
+    """Return a planner with a speed limiter at a share of the speed limit, or the planner itself for None.
 
     Raises:
-        UsageError: The share is not positive, the planner replays the log, or its actions are no accelerations.
+        UsageError: The share is not positive, the planner replays the log, or its actions are not accelerations.
     """
     if share is None:
         return planner

@@ -1,4 +1,4 @@
-"""Traffic in which a planner drives some agents: a trained policy against which another one is evaluated."""
+"""Traffic in which a planner drives some agents, for example to evaluate one policy among agents of another."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class PlannerTraffic:
 
     @property
     def name(self) -> str:
-        """``driven``, followed by the name of another base than the log (``driven+idm``)."""
+        """``driven``, followed by the name of the base if that is not the log (``driven+idm``)."""
         return "driven" if self.base.name == "log" else f"driven+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:

@@ -58,7 +58,7 @@ def chart(
     x_ticks = ticks(min(0.0, float(values[:, 0].min())), float(values[:, 0].max()), 5)
     low, high = float(values[:, 1].min()), float(values[:, 1].max())
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
-    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # a length above 0
+    last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # an axis needs a length above 0
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
     shapes = [axes.grid_line(value, compact(value)) for value in y_ticks]
     shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]

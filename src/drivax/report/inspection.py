@@ -309,7 +309,7 @@ def _counts(entry: Entry) -> tuple[int, ...]:
 
 
 def with_distinct_names(inspections: Sequence[Inspection]) -> list[Inspection]:
-    """Return the sets; those that share a name get the shortest ends of their paths that distinguish them as names."""
+    """Return the sets, those that share a name renamed to the shortest ends of their paths that distinguish them."""
     paths = [inspection.scenarios.path.resolve() for inspection in inspections]
     others = [[other for other in paths if other.name == path.name and other != path] for path in paths]
     triples = zip(inspections, paths, others, strict=True)
@@ -338,7 +338,7 @@ def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), 
     return _table("sets", names, [*rows, *extra], **options)
 
 
-#: Rows of the table of contents before the quantities.
+#: Rows of :func:`content_table` before the quantities.
 _CONTENT: Mapping[str, Callable[[Inspection], str]] = {
     "scenarios": lambda inspection: _count_text(inspection),
     "recordings": lambda inspection: f"{inspection.recordings:,}",

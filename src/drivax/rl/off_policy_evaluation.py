@@ -1,7 +1,7 @@
 """Estimators of a policy's return from episodes of other policies.
 
-Episodes have T steps; steps that are not ``usable`` (after the end) have no reward, and keep the ratio of the last
-usable one. ``ratio`` is the probability of the action under the evaluated policy over that under the behaviour policy.
+Episodes have T steps; steps that are not ``usable`` (after the end) have no reward, and their ratio counts as 1.
+``ratio`` is the probability of the action under the evaluated policy over that under the behaviour policy.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ def doubly_robust(
         ratio: Ratios of probabilities.
         usable: Mask of the steps.
         q: Estimated Q of the evaluated policy for the actions of the episodes.
-        value: Its estimated value of the states.
+        value: Estimated value of the states under the evaluated policy.
         gamma: Discount.
     """
     weights, effective = _weights(ratio, usable)
-    before = jnp.concatenate([jnp.full((len(reward), 1), 1.0 / len(reward)), weights[:, :-1]], axis=1)
+    previous = jnp.concatenate([jnp.full((len(reward), 1), 1.0 / len(reward)), weights[:, :-1]], axis=1)
     discount = gamma ** jnp.arange(reward.shape[1])
-    terms = weights * (reward - q) + before * value
+    terms = weights * (reward - q) + previous * value
     return Estimate(jnp.sum(discount * jnp.where(usable, terms, 0.0)), effective)
 
 

@@ -210,7 +210,7 @@ def _tracks(agents: Mapping[str, Any], ego: int, needs_z: bool) -> Tracks:
     heading = _zero_invalid(_array(agents, "heading", float, (count, steps)), valid)
     track_id = _array(agents, "id", float, (count,)) if "id" in agents else np.arange(count)
     if (track_id != np.floor(track_id)).any():
-        raise UsageError('agents["id"] has a number that is no integer', cure="number the agents")
+        raise UsageError('agents["id"] has a number that is not an integer', cure="number the agents")
     return Tracks(xy, z, heading, velocity, size, valid, kind, track_id.astype(np.int64))
 
 
@@ -242,19 +242,19 @@ def _member(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -
 
 def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
     """Lanes, edges, crosswalks and stop signs, numbered in this order: the id of a lane is its index."""
-    lanes, number = len(roads.get("lanes", ())), itertools.count()
-    for row, lane in enumerate(roads.get("lanes", ())):
-        yield _lane(next(number), lane, f'roads["lanes"][{row}]', lanes)
+    lane_count, number = len(roads.get("lanes", ())), itertools.count()
+    for i, lane in enumerate(roads.get("lanes", ())):
+        yield _lane(next(number), lane, f'roads["lanes"][{i}]', lane_count)
     for name, kind, minimum in (("edges", RoadKind.EDGE_BOUNDARY, 2), ("crosswalks", RoadKind.CROSSWALK, 3)):
-        for row, line in enumerate(roads.get(name, ())):
-            yield MapFeature(next(number), kind, _points(line, f'roads["{name}"][{row}]', minimum))
-    for row, sign in enumerate(roads.get("stop_signs", ())):
-        what = f'roads["stop_signs"][{row}]'
+        for i, line in enumerate(roads.get(name, ())):
+            yield MapFeature(next(number), kind, _points(line, f'roads["{name}"][{i}]', minimum))
+    for i, sign in enumerate(roads.get("stop_signs", ())):
+        what = f'roads["stop_signs"][{i}]'
         _check_keys(sign, ("point", "lanes"), what)
         if "point" not in sign:
             raise UsageError(f'{what}["point"] is missing', cure="see recording_from_arrays")
         point = _points([sign["point"]], f'{what}["point"]', 1)
-        controls = _lane_indices(sign.get("lanes", ()), lanes, what)
+        controls = _lane_indices(sign.get("lanes", ()), lane_count, what)
         yield MapFeature(next(number), RoadKind.STOP_SIGN, point, lanes=controls)
 
 
@@ -273,7 +273,7 @@ def _points(line: Any, what: str, minimum: int) -> Array:
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
-def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
+def _lane(number: int, lane: Any, what: str, lane_count: int) -> MapFeature:
     _check_keys(lane, _LANE_KEYS, what)
     if "points" not in lane:
         raise UsageError(f'{what}["points"] is missing', cure="see recording_from_arrays")
@@ -286,19 +286,19 @@ def _lane(number: int, lane: Any, what: str, lanes: int) -> MapFeature:
         points=_points(lane["points"], f'{what}["points"]', 2),
         limit_mps=_number(lane.get("limit_mps"), f'{what}["limit_mps"]'),
         width_m=_number(lane.get("width_m"), f'{what}["width_m"]'),
-        successors=_lane_indices(lane.get("successors", ()), lanes, f'{what}["successors"]'),
-        left_neighbours=_lane_indices(lane.get("left", ()), lanes, f'{what}["left"]'),
-        right_neighbours=_lane_indices(lane.get("right", ()), lanes, f'{what}["right"]'),
+        successors=_lane_indices(lane.get("successors", ()), lane_count, f'{what}["successors"]'),
+        left_neighbours=_lane_indices(lane.get("left", ()), lane_count, f'{what}["left"]'),
+        right_neighbours=_lane_indices(lane.get("right", ()), lane_count, f'{what}["right"]'),
     )
 
 
-def _lane_indices(indices: Any, lanes: int, what: str) -> tuple[int, ...]:
+def _lane_indices(indices: Any, lane_count: int, what: str) -> tuple[int, ...]:
     """Check the index or indices of lanes, and return them as a tuple."""
-    rows = [indices] if isinstance(indices, int | np.integer) else _items(indices, what)
-    for row in rows:
-        if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
-            raise UsageError(f"{what} names lane {row!r}, there are {lanes}", cure="count lanes from 0")
-    return tuple(int(row) for row in rows)
+    lanes = [indices] if isinstance(indices, int | np.integer) else _items(indices, what)
+    for lane in lanes:
+        if not isinstance(lane, int | np.integer) or not 0 <= lane < lane_count:
+            raise UsageError(f"{what} names lane {lane!r}, there are {lane_count}", cure="count lanes from 0")
+    return tuple(int(lane) for lane in lanes)
 
 
 def _light(light: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:

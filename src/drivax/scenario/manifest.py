@@ -1,4 +1,4 @@
-"""The manifest of a scenario set: what it says of shards and scenarios, and how it is read."""
+"""The manifest of a scenario set: entries of shards and scenarios, reading and checks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AGAIN = "convert or generate the set again"
 _MOST_MANIFEST = 1 << 30
 #: Types of the values of a manifest entry.
 _ENTRY = {**dict.fromkeys(NAMES, str), "flags": list, "overflow": dict, "audit": dict, "tags": dict}
-#: Types of the values of a manifest that are read besides its lists.
+#: Types of the values that are read from a manifest, other than its lists.
 _MANIFEST = {"record_bytes": int, "drivax_version": str, "source": dict}
 
 

@@ -20,7 +20,7 @@ def static(*, default: Any = MISSING) -> Any:
 def record(cls: type[Record]) -> type[Record]:
     """Make a class a frozen dataclass and a pytree.
 
-    Unflattening bypasses ``__init__``: transformations put other objects than arrays into leaves, which a constructor
+    Unflattening bypasses ``__init__``: transformations put objects other than arrays into leaves, which a constructor
     that checks shapes would refuse.
     """
     data_class = dataclass(frozen=True)(cls)

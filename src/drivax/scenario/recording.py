@@ -17,7 +17,8 @@ from drivax.scenario.schema import CURRENT_STEP, DT_S, NAMES, STEPS, AgentKind, 
 
 Array = np.ndarray[Any, Any]
 STEP_TOLERANCE_S = 0.005
-#: Deviation of a step from the median above which a recording is resampled, s; length of a gap, in median steps.
+#: A recording is resampled if a step deviates from the median by more than the first, s, and split at steps longer than
+#: the second, in median steps.
 LATE_S, GAP_STEPS = 0.02, 2.5
 DATASET_BYTES = 16
 #: Largest distance from the ego and largest speed, both along an axis; beyond them a track or file is damaged, or its
@@ -381,7 +382,7 @@ def _check_shapes(recording: Recording) -> Finding:
     for name, shape in shapes.items():
         actual = np.shape(attrgetter(name)(recording))
         if actual != shape:
-            return f"{name} has shape {actual}, not {shape}", "give every track every step"
+            return f"{name} has shape {actual}, not {shape}", "give every track a value per step"
     rows = (recording.ego, *recording.to_predict, *recording.of_interest)
     if wrong := [row for row in rows if not 0 <= row < count]:
         return f"track row {wrong[0]} of {count} tracks", "name rows of the track table"
@@ -417,7 +418,7 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 
 
 def _check_extent(recording: Recording) -> Finding:
-    """Refuse implausible values of ego and lights, which exhaust memory or float32; other tracks lose such steps."""
+    """Refuse implausible ego and lights, which exhaust memory or float32 precision; other tracks lose such steps."""
     ego, row = _ego_position(recording), recording.ego
     steps = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
     if len(steps):

@@ -28,7 +28,7 @@ CURRENT_STEP = 10
 DT_S = 0.1
 #: Fewest steps of a log that is evaluated or trained on: 20 follow the current one.
 LEAST_STEPS = CURRENT_STEP + 1 + 20
-#: Most egos of a scenario: a bank holds a bit per ego and lane (``scenario.bank.columns.LaneRow``).
+#: Largest number of egos in a scenario: a bank holds a bit per ego and lane (``scenario.bank.columns.LaneRow``).
 MOST_EGOS = 8
 
 
@@ -202,7 +202,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
     t, a, p, s, m, n = c.steps, c.agents, c.parked, c.segments, c.features, c.lanes
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
     cells = c.grid * c.grid
-    fields: dict[str, tuple[str, tuple[int, ...]]] = {
+    layout: dict[str, tuple[str, tuple[int, ...]]] = {
         # Longer names are shortened (stored_name); the manifest has them in full.
         "scenario_id": ("S64", ()), "dataset": ("S16", ()), "segment": ("S64", ()), "origin": ("f8", (3,)),
         "dt_s": ("f4", ()), "current_step": ("i2", ()), "steps": ("i2", ()), "flags": ("u4", ()),
@@ -249,7 +249,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "event_kind": ("i1", (c.events,)), "event_start": ("i2", (c.events,)),
         "event_end": ("i2", (c.events,)), "event_actor": ("i4", (c.events, 4)),
     }  # fmt: skip
-    return fields | _ego_fields(c.egos - 1, t, r) if c.egos > 1 else fields
+    return layout | _ego_fields(c.egos - 1, t, r) if c.egos > 1 else layout
 
 
 def _ego_fields(egos: int, steps: int, points: int) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -281,12 +281,12 @@ def stored_name(text: str, size: int) -> bytes:
 @cache
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
     """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
-    fields = scenario_fields(capacity)
+    layout = scenario_fields(capacity)
     offsets, end = [], 0
-    for field_type in fields.values():
+    for field_type in layout.values():
         offsets.append(-(-end // 64) * 64)
         end = offsets[-1] + np.dtype(field_type).itemsize
-    names, formats, itemsize = list(fields), list(fields.values()), -(-end // 4096) * 4096
+    names, formats, itemsize = list(layout), list(layout.values()), -(-end // 4096) * 4096
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
 
 
@@ -298,7 +298,7 @@ def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) 
     return np.concatenate(values).reshape(len(values), *values[0].shape)  # faster than np.stack
 
 
-#: Least and largest numbers.
+#: Smallest and largest stored value of each; -1 is none or unobserved.
 _AGENT_KINDS, _ROAD_KINDS, _LIGHT_STATES = (
     (least, int(max(kind))) for least, kind in ((0, AgentKind), (-1, RoadKind), (-1, LightState))
 )
@@ -311,9 +311,9 @@ def _float_names(dtype: np.dtype[Any]) -> tuple[str, ...]:
 
 
 def find_impossible(record: Any) -> str | None:
-    """Return why no scenario has the numbers of a record, or None.
+    """Return why a record cannot be that of a scenario, or None.
 
-    Integers that arrays are sized or indexed by are within bounds, and all other numbers are finite.
+    Integers that size or index arrays must be within bounds, and all floating-point numbers finite.
     """
     steps, agents = record["agent_valid"].shape
     points, segments = record["route_lane"].shape[-1], len(record["segment_lane"])

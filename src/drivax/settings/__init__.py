@@ -1,7 +1,7 @@
 """Configuration records: frozen dataclasses to and from YAML, with command-line overrides.
 
 A configuration record holds scalars, strings, literals, paths, tuples, mappings, other records, unions of records,
-which carry a ``kind`` key in YAML (:func:`kind_of`), and objects of the user by ``package.module:name``. Missing keys
+which carry a ``kind`` key in YAML (:func:`kind_of`), and user-defined objects by ``package.module:name``. Missing keys
 keep the defaults of the enclosing record. In a record with presets (a class method ``preset(name)``), the key
 ``preset`` names the preset to start from. A file may extend a preset (``extends: ppo``) or a file relative to it
 (``extends: base.yaml``): its settings are merged over those of the other. No file shadows a preset: write ``./NAME``
@@ -35,7 +35,7 @@ def load(
 
     Args:
         cls: The dataclass to build; its defaults apply to keys that ``source`` lacks.
-        source: The name of a preset, a YAML file (text is one if :func:`is_path`), or a mapping.
+        source: The name of a preset, a YAML file (a string is its path if :func:`is_path`), or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
             count as underscores. A ``kind`` other than that in ``source`` discards the settings of its section.
         trust: None for a source that the user wrote. Otherwise the source is data, such as the configuration of a
@@ -81,7 +81,7 @@ def presets() -> list[str]:
 
 
 def is_path(name: str) -> bool:
-    """Return whether a name that is no preset is a path: it has a folder (``./NAME``) or a suffix (``NAME.yaml``)."""
+    """Return whether a name, if not a preset, is a path: it has a folder (``./NAME``) or a suffix (``NAME.yaml``)."""
     return Path(name).name != name or Path(name).suffix != ""
 
 
@@ -199,7 +199,7 @@ def check_names(values: Any, trust: Collection[str], file: Path | None = None) -
     """Check the dotted names in plain values of a file before any of them is imported; those in flags are trusted.
 
     Raises:
-        UsageError: A name leads to a module that is not trusted, or to something that is no component.
+        UsageError: A name leads to a module that is not trusted, or to something that is not a component.
     """
     names = sorted(_names(values))
     if foreign := [name for name in names if not is_trusted(name, trust)]:

@@ -1,8 +1,8 @@
 """Conversion of YAML to plain values, of plain values to configuration records, and back.
 
 Errors name the line, or the dotted path of the wrong value. YAML follows the 1.2 core rules: ``3e-4`` is a number,
-``no`` a string, ``010`` ten. Unlike there, ``0x10`` and ``0o17`` are strings, ``1_000`` is a number and ``None`` null.
-Duplicate keys, and keys that are not strings, are errors.
+``no`` a string, ``010`` ten. Unlike in YAML 1.2, ``0x10`` and ``0o17`` are strings, ``1_000`` is a number and ``None``
+null. Duplicate keys, and keys that are not strings, are errors.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Flag(str):
 
 
 class NameAlone(str):
-    """The key ``kind`` of a section that was a name alone; plain mappings, which have no kind, ignore it."""
+    """The key ``kind`` of a section that was written as a bare name; plain mappings, which have no kind, ignore it."""
 
     __slots__ = ()
 

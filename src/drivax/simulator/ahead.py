@@ -68,7 +68,7 @@ class Ahead:
 
 
 def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float | Scalar) -> Ahead:
-    """Look 90 m ahead of the driven agent along its route, for stop lines 92 m ahead of its front bumper.
+    """Look 90 m ahead of the driven agent along its route, and for stop lines 92 m ahead of its front bumper.
 
     ``min_gap_m`` is the gap that the driver keeps behind a standing leader.
     """

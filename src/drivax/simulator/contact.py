@@ -39,8 +39,8 @@ class Contact(enum.IntEnum):
 
     ``IGNORED``: has overlapped since it appeared and does not count until it separates; ``HIT``: overlaps without the
     evaluated agent's fault, ``AT_FAULT`` with it; ``PARTED``: separated again after ``HIT`` or ``AT_FAULT``;
-    ``GONE``: absent after any of these three; ``RETURNED``: was gone and has overlapped since it reappeared, ignored
-    until it is ``PARTED``.
+    ``GONE``: absent after ``HIT``, ``AT_FAULT``, ``PARTED`` or ``RETURNED``; ``RETURNED``: was gone and has overlapped
+    since it reappeared, ignored until it is ``PARTED``.
     """
 
     ABSENT = 0
@@ -110,7 +110,7 @@ def next_contacts(
 
 
 def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
-    """Return the centre of every slot in the agent's frame (ahead, left), and cosine and sine of its heading in it."""
+    """Return every slot's centre (ahead, left, m), and cosine and sine of its heading, in the agent's frame."""
     ego = frame.box[slot]
     dx, dy = frame.box[:, X] - ego[X], frame.box[:, Y] - ego[Y]
     cos = frame.box[:, COS] * ego[COS] + frame.box[:, SIN] * ego[SIN]
@@ -155,8 +155,8 @@ def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -
     """Return the time to the first overlap at constant velocities and headings, s, at most 5.
 
     Agents entirely behind the rear axle are followers and do not count, nor do those in ``ignored``, such as one that
-    ran into the agent without its fault. All others count, in any direction: one that overlaps within the horizon is
-    ahead or comes into the lane that the agent sweeps.
+    ran into the agent without the agent's fault. All others count, in any direction: one that overlaps within the
+    horizon is ahead or comes into the lane that the agent sweeps.
     """
     ego = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
@@ -169,7 +169,7 @@ def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -
 def nearest_gap(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -> Scalar:
     """Return the gap to the nearest other box on the agent's level, m, at most 50; 0 where they overlap.
 
-    Agents in ``ignored`` do not count, such as those that have overlapped it since they appeared.
+    Agents in ``ignored`` do not count, such as those that have overlapped the agent since they appeared.
     """
     is_relevant = others_on_level(frame, slot) & ~ignored
     # Boxes of empty slots are arbitrary; the agent's own box in their place keeps gradients finite.

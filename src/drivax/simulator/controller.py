@@ -29,7 +29,7 @@ Actuators = Float[Array, " 3"]
 ACCELERATION, STEERING, RATE = range(3)
 #: Regularisation of the first curvature, which a plan without motion does not determine.
 _FIRST_CURVATURE = 1e-10
-#: Steps over which initial acceleration and steering are measured; distance in them up to which steering is 0, m.
+#: Steps for initial acceleration and steering; distance driven in them up to which steering is 0, m.
 _RECENT, _STILL_M = 5, 0.5
 #: Settings that cannot be 0: most divide, or keep a divisor away from 0.
 _POSITIVE = (
@@ -82,7 +82,7 @@ class TrackingConfig:
 
 
 def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:
-    """Acceleration a that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a`` and desired speed v*, m/s2."""
+    """Acceleration a, m/s2, minimising ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a`` and desired speed v*."""
     q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
     return b * q * (desired - speed) / (b * q * b + r)
 
@@ -98,11 +98,11 @@ def steering_rate(
     error: tuple[Array, Array, Array], speeds: Float[Array, " N"], curvatures: Float[Array, " N"],
     wheelbase: Scalar, config: TrackingConfig,
 ) -> Scalar:  # fmt: skip
-    """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
+    """Constant steering rate u (rad/s) that minimises ``x_N' Q x_N + r u^2``.
 
-    x = (lateral error e, heading error h, steering angle d) starts at ``error``. In a step with speed v, curvature k
-    and wheelbase L, ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z the state at
-    the horizon for ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``.
+    x = (lateral error e, m; heading error h and steering angle d, rad) starts at ``error``. In a step with speed v,
+    curvature k and wheelbase L, ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z
+    the state at the horizon for ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``.
     """
     e, h, d = error
     be, bh, bd = (jnp.zeros(()) for _ in range(3))
@@ -117,7 +117,7 @@ def steering_rate(
 
 
 def fit_speeds(poses: Poses, config: TrackingConfig) -> Float[Array, " m"]:
-    """Speeds v of the m steps between poses: the least squares of ``dt v_k - s_k`` plus a penalty on jerk.
+    """Fit speeds v (m/s) of steps between poses: least squares of ``dt v_k - s_k`` plus a penalty on jerk.
 
     s is the displacement along the heading at the start of each step; ``v_k = v_0 + dt (a_0 + ... + a_(k-1))``, and the
     penalty is on ``(a_(k+1) - a_k)^2``. The solution is linear in s.
@@ -139,11 +139,11 @@ def _speed_fit(steps: int, penalty: float) -> np.ndarray[tuple[int, int], np.dty
 
 
 def fit_curvatures(poses: Poses, speeds: Float[Array, " m"], config: TrackingConfig) -> Float[Array, " m"]:
-    """Curvatures k of the steps between poses: the least squares of ``dt v k - turn`` plus a penalty on their rate.
+    """Fit curvatures k (1/m) of steps between poses: least squares of ``dt v k - turn`` plus a penalty on their rate.
 
-    The solution is ``k = c (1 - g) + u``: u are the later curvatures for a first curvature of 0, ``1 - g`` their
-    derivative by the first one (two tridiagonal systems), and c is the first one. This elimination is accurate in
-    single precision at any speed.
+    The solution is ``k = c (1 - g) + u``: u are the curvatures for a first curvature of 0, ``1 - g`` their
+    derivative with respect to the first one (two tridiagonal systems), and c is the first one. This elimination is
+    accurate in single precision at any speed.
     """
     turn, distance = wrap(jnp.diff(poses[:, 2])), speeds * DT_S
     weight = config.curvature_rate_penalty / DT_S**2

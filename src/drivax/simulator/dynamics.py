@@ -40,7 +40,7 @@ def bicycle(motion: Motion, acceleration: Scalar, curvature: Scalar) -> Motion:
 
 
 def accelerate(speed: Float[Array, "*R"], acceleration: Float[Array, "*R"]) -> tuple[Array, Array]:
-    """Return the distance of a step at a constant acceleration (m), and the speed after it.
+    """Return the distance (m) of a step at a constant acceleration, and the speed (m/s) after it.
 
     A car that would reach a negative speed stops within the step after ``v^2 / (2 |a|)``: no creep, no reverse.
     """

@@ -1,6 +1,6 @@
-"""The Intelligent Driver Model: the one car-following law of traffic, planners and the built-in world.
+"""The Intelligent Driver Model: the car-following law of traffic, planners and the built-in world.
 
-Free of JAX, so that the built-in world can use it in worker processes; takes numpy or JAX arrays.
+Free of JAX, so that the built-in world can use it in worker processes; takes NumPy or JAX arrays.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def idm_acceleration(
     (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000), limited to ``[-max_braking, a_max]``.
 
     Args:
-        speed: Own speed, m/s, not negative.
+        speed: Speed of the follower, m/s, not negative.
         desired_speed: v0, m/s; below 0.1 m/s it counts as 0.1.
         gap: Bumper-to-bumper distance, m; below 0.1 m it counts as 0.1. Infinite for a free road.
-        leader_speed: Speed of the leader along the own path, m/s.
-        parameters: The driver.
+        leader_speed: Speed of the leader along the follower's path, m/s.
+        parameters: Parameters of the follower.
     """
     xp = speed.__array_namespace__()
     p = parameters

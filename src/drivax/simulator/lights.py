@@ -16,7 +16,7 @@ from drivax.simulator.types import MOTION_SPEED, AgentContext, LightMemory
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
 #: Steps of the history, the present one included, that are searched for a stop before the episode.
 _LOOK_BACK_STEPS = 16
-#: Steps after lines were crossed off the route at which the agent's heading decides which light counts.
+#: Steps from crossing lines away from the route until the agent's heading decides which light counts.
 _DECISION_STEPS = 20
 
 

@@ -39,7 +39,7 @@ from drivax.simulator.types import (
 _ON_ROUTE_M = 2.0
 #: Rows of the history, the present one included, in which a lane change may begin before an episode.
 _ENTRY_STEPS = 16
-#: Steps over which accelerations and yaw rates are differences.
+#: Steps between the two values whose difference gives an acceleration or a yaw rate.
 _RATE_STEPS = 5
 #: Steps in a second; distance below which a log stands still, m, as in ``progress_ratio``.
 _SECOND, _STANDS_M = round(1.0 / DT_S), 0.5
@@ -138,7 +138,7 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     ego, ground = frame.box[context.slot], _ground(bank, context, frame)
     is_ego, pose = context.slot == bank.ego_slot(context.row), (ego[:2], ego[2:4], corners(ego))
     lanes = queries.around_lanes(bank, context.index, *pose, ground, is_ego, context.row)
-    # On the inside of a bend a step is longer along the route.
+    # On the inside of a bend the agent gains more along the route than it drives.
     ahead_m = 1.5 * _step_length(context) + 2.0
     route = queries.project_on_route(bank, context.row, ego[:2], context.route_m, ahead_m)
     return Surroundings(frame, lanes, route)
@@ -230,7 +230,7 @@ def _passage_facts(bank: ScenarioBank, context: AgentContext, frame: Frame, stra
 
 
 def completed_share(bank: ScenarioBank, context: AgentContext) -> Scalar:
-    """Return the completed share of the log's path from its current step to its end, in [0, 1]; 1 if it stands."""
+    """Return the completed share of the log's path from its current step to its end, in [0, 1]; 1 if the log stands."""
     log_m, last = bank.log_progress[context.row], bank.last_step[context.row]
     log_gain, gain = log_m[last] - log_m[CURRENT_STEP], context.route_m - log_m[CURRENT_STEP]
     log_moves = log_gain >= _STANDS_M
@@ -274,7 +274,7 @@ def measure_offroad(
 
 
 def _rates(history: Float[Array, "history 4"]) -> tuple[Scalar, Scalar, Scalar]:
-    """Return causal acceleration, jerk and lateral acceleration: differences over 0.5 s."""
+    """Return acceleration (m/s2), jerk (m/s3) and lateral acceleration (m/s2) by backward differences over 0.5 s."""
     speed, heading = history[:, MOTION_SPEED], history[:, MOTION_HEADING]
     n, span_s = _RATE_STEPS, _RATE_STEPS * DT_S
     acceleration = (speed[-1] - speed[-1 - n]) / span_s

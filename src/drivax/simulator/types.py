@@ -169,14 +169,14 @@ class LightMemory:
     """Memory of stop lines."""
 
     pause: Int[Array, "*batch L"]  # Steps since the agent last stood before the line; saturates
-    # Steps since the agent crossed the line off its route, from 1 on, until the crossing is decided: positive if it
-    # was against a red light, negative otherwise, 0 without a crossing
+    # Steps since the agent crossed the line while off its route, from 1 on, until the crossing is decided: positive if
+    # it was against a red light, negative otherwise, 0 without a crossing
     crossed: Int[Array, "*batch L"]
 
 
 @record
 class EpisodeStart:
-    """First context of an episode, its stop-line memory, and the strand of its lane a moment earlier, if measured."""
+    """First context of an episode, its stop-line memory, and the agent's strand 1.5 s before, if measured."""
 
     context: AgentContext
     lights: LightMemory
@@ -261,7 +261,7 @@ class Task(Protocol):
         ...
 
     def motion(self, motion: Motion, action: Action, length: Any) -> Motion:
-        """Return the next motion of the driven agent."""
+        """Return the next motion of the driven agent, whose box is ``length`` metres long."""
         ...
 
     def actuate(self, bank: ScenarioBank, context: AgentContext, action: Action) -> Action:

@@ -37,7 +37,7 @@ def as_values(values: Any) -> Values:
     """Convert to float64, with NaN for undefined values.
 
     Raises:
-        UsageError: A value is infinite or no number, or the values are not a flat list.
+        UsageError: A value is infinite or not numeric, or the values are not a flat list.
     """
     problem = "values must be a list of finite numbers, NaN or None"
     try:

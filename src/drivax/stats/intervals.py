@@ -207,7 +207,7 @@ def interquartile_bootstrap(
     if any(seed_values.size != labels.size for seed_values in by_seed):
         raise UsageError("seeds have different episodes", cure="give one value per seed and episode")
     sums, counts = _seed_totals(np.stack(by_seed), labels)
-    # Seeds and clusters without a value are no part of the sample.
+    # Seeds and clusters without a value are not part of the sample.
     has_values = np.ix_(counts.any(axis=1), counts.any(axis=0))
     sums, counts = sums[has_values], counts[has_values]
     n, (seeds, cluster_count) = int(counts.sum()), sums.shape

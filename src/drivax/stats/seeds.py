@@ -104,11 +104,11 @@ class CrossedEffect:
         return self._probability(abs(difference) / self.standard_error - self._critical(confidence))
 
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of seeds per policy above the present one that detects the difference, or None."""
+        """Return the smallest number of seeds per policy above the current one that detects the difference, or None."""
         return self._smallest_number(self.with_seeds, max(self.seed_counts), power, confidence)
 
     def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
-        """Return the smallest number of clusters above the present one that detects the difference, or None."""
+        """Return the smallest number of clusters above the current one that detects the difference, or None."""
         return self._smallest_number(self.with_clusters, self.clusters, power, confidence)
 
     def _probability(self, t: float) -> float:
@@ -143,20 +143,20 @@ class CrossedEffect:
         return replace(self, seeds=seeds, scenarios=scenarios, clusters=number, interaction=interaction)
 
     def _smallest_number(
-        self, extrapolate: Callable[[int], CrossedEffect], present: int, power: float, confidence: float
+        self, extrapolate: Callable[[int], CrossedEffect], current: int, power: float, confidence: float
     ) -> int | None:
-        """Return the smallest number above ``present`` that detects this difference; None if there is none."""
+        """Return the smallest number above ``current`` that detects this difference; None if there is none."""
 
         def detects(number: int) -> bool:
             return abs(self.difference) >= extrapolate(number).detectable(power, confidence)
 
         # Detection is not monotonic: as one number grows, the degrees of freedom approach those of the other.
-        candidates = np.geomspace(present + 1, max(_MAX_NUMBER, present + 1), _CANDIDATES)
+        candidates = np.geomspace(current + 1, max(_MAX_NUMBER, current + 1), _CANDIDATES)
         numbers = np.unique(np.round(candidates)).astype(int).tolist()
         first = next((index for index, number in enumerate(numbers) if detects(number)), None)
         if self.difference == 0.0 or first is None:  # without an error, 0 >= 0 holds
             return None
-        low, high = (numbers[first - 1] if first else present), numbers[first]
+        low, high = (numbers[first - 1] if first else current), numbers[first]
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (low, middle) if detects(middle) else (middle, high)

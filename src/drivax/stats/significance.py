@@ -1,4 +1,4 @@
-"""Significance tests of two planners on the same scenarios, or on two arms of a split.
+"""Significance tests of two planners on the same scenarios, or of the two arms of a split.
 
 Tests are two-sided and take one value per scenario. Scenarios (or pairs) with undefined values (``None`` or NaN) are
 ignored. Scenarios of a cluster (recording) stay together; by default every scenario is a cluster.

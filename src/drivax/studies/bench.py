@@ -77,7 +77,7 @@ class BenchConfig:
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
-    """Time steps with resets, observation, reward and metrics, driven by IDM, and each part alone.
+    """Measure the time of steps driven by IDM, with resets, observation, reward and metrics, and of each part alone.
 
     Args:
         bank: Distinct scenarios; when an episode ends, another starts in a random one.

@@ -92,10 +92,10 @@ class Claim:
         group: Group of claims whose p-values are adjusted together.
         metric: Metric of the comparison.
         rows: Scenarios of the comparison.
-        change: Minimum claimed relative change; None for a claim about its direction alone.
+        change: Minimum claimed relative change; None for a claim about the direction alone.
         margin: The arm is claimed to be not worse by more than this (non-inferiority), instead of better.
-        at_equal_progress: Compare at the arm's progress (``progress_ratio``): the reference drives slower, or the arm
-            if it makes more progress.
+        at_equal_progress: Compare at the lower progress of both arms (``progress_ratio``): whichever makes more
+            progress drives slower.
     """
 
     words: str
@@ -205,8 +205,8 @@ class StudyConfig:
     Attributes:
         arms: Names of the arms, including all baselines; empty for all arms.
         seeds: Number of training runs of each arm.
-        total_steps: Number of logged steps to draw in each training; null for that of the preset.
-        training: Further settings of every training, as on the command line: ``[--algorithm.batch, "128"]``; not
+        total_steps: Number of logged steps to draw in each training run; null for that of the preset.
+        training: Further settings of every run, as on the command line: ``[--algorithm.batch, "128"]``; not
             ``checkpoint_rule`` or ``patience``. The study sets ``seed``, ``evaluate_every`` and ``checkpoint_every``.
         validations: Approximate number of closed-loop validations; the test evaluates the best checkpoint.
         weights: Settings of the sampling weights, the same for all methods.
@@ -236,7 +236,7 @@ class StudyConfig:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure=f"use {minimum} or more")
         if not 0 < self.rare < 1:
             raise UsageError(f"rare is {self.rare}", cure="use a number between 0 and 1")
-        if duplicates := [name for row, name in enumerate(self.arms) if name in self.arms[:row]]:
+        if duplicates := [name for number, name in enumerate(self.arms) if name in self.arms[:number]]:
             raise UsageError(f"arm {duplicates[0]!r} is named twice", cure="name each arm once")
 
 
@@ -325,7 +325,7 @@ class Study:
         return [claim for claim in self.definition.claims if {claim.arm, claim.reference} <= set(self.arms)]
 
     def run(self, arm: str, seed: int) -> Path:
-        """Return the run folder of a training."""
+        """Return the run folder of a training run."""
         return inside(self.folder, "runs", arm, f"seed-{seed}")
 
     def evaluation(self, name: str, seed: int | None = None) -> Path:
@@ -333,7 +333,7 @@ class Study:
         return inside(self.folder, "evaluations", name, *([] if seed is None else [f"seed-{seed}"]))
 
     def evaluations(self, arm: str) -> dict[str, float | None]:
-        """Return the speed limiter in each of an arm's evaluations, by name; None without.
+        """Return the speed limiter in each of an arm's evaluations, by name; None for no limiter.
 
         The first baseline is also evaluated at other checkpoints, and arms of claims at equal progress with limiters.
         """

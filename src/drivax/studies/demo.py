@@ -33,7 +33,7 @@ from drivax.tracking.run_folder import describe_run
 REFERENCES = ("expert", "constant_velocity", "constant_speed", "idm")
 #: Metrics of the paired comparison.
 _METRICS = ("success", "vmax_score")
-#: Seeds of the training and the held-out set.
+#: Seeds of the training set and the held-out set.
 _TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
 
 

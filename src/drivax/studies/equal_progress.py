@@ -27,8 +27,8 @@ class EqualProgress:
 
     Attributes:
         values: Values of the first and the second driver, NaN where a metric is undefined at any speed.
-        slower: Which of them drives slower: 0 or 1.
-        share: Its speed limiter, interpolated.
+        slower: Which driver is slowed down: 0 or 1.
+        share: Its speed limiter, interpolated, as a share of the speed limit.
     """
 
     values: tuple[Values, Values]
@@ -41,10 +41,10 @@ def match_progress(
 ) -> EqualProgress:
     """Return a metric of two drivers at the lower ``progress_ratio`` of both.
 
-    The faster driver's metric m is interpolated linearly between the two speeds whose progress p encloses that of the
-    other one, P. With the slope b of m over p, the result has the values of m - b (p - P): mixed over both speeds for
-    the faster driver, at full speed for the other. Their means are the interpolated ones, and their variance is that of
-    the interpolated difference (delta method): the errors of m and p at both speeds, and of P.
+    The faster driver's metric m is interpolated linearly between the two speeds whose progress p encloses the other
+    driver's progress P. With the slope b of m over p, the result has the values of m - b (p - P): mixed over both
+    speeds for the faster driver, at full speed for the other. Their means are the interpolated ones, and their variance
+    is that of the interpolated difference (delta method): the errors of m and p at both speeds, and of P.
 
     Raises:
         ProgressError: The faster driver gets further even at its lowest speed.
@@ -54,8 +54,8 @@ def match_progress(
     every_value = [episodes[name] for driver in drivers for episodes in driver.values() for name in names]
     is_defined = (weights > 0.0) & ~np.isnan(np.concatenate(every_value)).any(axis=0)
     if not is_defined.any():
-        nothing = [np.full_like(driver[1.0][metric], np.nan) for driver in drivers]
-        return EqualProgress((nothing[0], nothing[1]), 0, 1.0)
+        undefined = [np.full_like(driver[1.0][metric], np.nan) for driver in drivers]
+        return EqualProgress((undefined[0], undefined[1]), 0, 1.0)
 
     def mean(values: Values) -> float:
         return float(np.average(values[:, is_defined].mean(axis=0), weights=weights[is_defined]))

@@ -285,7 +285,7 @@ def _verdicts(definition: StudyDefinition, results: Results) -> str:
 
 
 def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> str:
-    """Return the section of a stratum, empty without results."""
+    """Return the section of a stratum; empty if there are no results."""
     table, share = rates_table(results, stratum), results["about"]["share"]
     if not table.rows:
         return ""
@@ -297,13 +297,13 @@ def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> s
 
 
 def _events(definition: StudyDefinition, results: Results) -> str:
-    """Return the section of kinds and severities of events, empty without labels."""
+    """Return the section of kinds and severities of events; empty if there are no labels."""
     table = events_table(results)
     return f"<h3>Events: {escape(_label(definition.metrics[0]))}</h3>{table.html()}" if table.rows else ""
 
 
 def _critics(results: Results) -> str:
-    """Return the section of the critics' checks, empty without any."""
+    """Return the section of the critics' checks; empty if there are none."""
     table = critics_table(results)
     note = "<p><small>An arm is called unhealthy if the critics of one of its seeds fail a check.</small></p>"
     return f"<h3>Health of the critics</h3>{table.html()}{note}" if table.rows else ""

@@ -71,9 +71,9 @@ class Job:
 
     Attributes:
         study: The study.
-        arm, seed: Name of the arm, and seed of the training.
+        arm, seed: Name of the arm, and seed of the run.
         usable: Mask of the logged steps to draw from.
-        episodes: Digest of the recorded episodes, None without.
+        episodes: Digest of the recorded episodes; None if there are none.
         edited: Whether edited files are allowed.
     """
 
@@ -122,7 +122,7 @@ def run_study(
     usable = usable_steps(study.train_config(definition.baselines[0], 0), training)
     for name in definition.planners:
         if study.evaluation(name).is_dir():
-            _check_tested(study, study.evaluation(name))
+            _check_test_set(study, study.evaluation(name))
         else:
             log(f"evaluating {name} on the test set")
             run_evaluation(EvaluationConfig(name), make_planner(name), test, study.evaluation(name))
@@ -283,7 +283,7 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
 
 
 def event_groups(entries: Sequence[Mapping[str, Any]]) -> dict[str, Bool[np.ndarray, " scenario"]]:
-    """Return masks of the scenarios with each kind of event, and with a severity below, or from, the median on."""
+    """Return masks of the scenarios with each kind of event, and with a severity below or at least the median."""
     tags = [entry["tags"] for entry in entries]
     kinds = np.array([tags_of_scenario.get("event", "") for tags_of_scenario in tags])
     severity_mps2 = np.array(
@@ -346,7 +346,7 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
     folders = _evaluation_folders(study, arm, seed)
     existing = [folder for folder in folders if folder.is_dir()]
     for folder in existing:
-        _check_tested(study, folder)
+        _check_test_set(study, folder)
         if _start_time(folder) < _start_time(study.run(arm, seed)):
             raise UsageError(
                 "is older than the run that it evaluates",
@@ -356,7 +356,7 @@ def is_evaluated(study: Study, arm: str, seed: int) -> bool:
     return len(existing) == len(folders)
 
 
-def _check_tested(study: Study, folder: Path) -> None:
+def _check_test_set(study: Study, folder: Path) -> None:
     """Check that an evaluation is of the study's test set, if that exists."""
     if study.test.is_dir():
         tested = RunFolder.open(folder).info["data"][0]["hash"]
@@ -446,7 +446,7 @@ def _validations(study: Study, arm: str) -> list[dict[str, list[Any]]]:
 
 
 def _validation_score(row: Mapping[str, float]) -> float:
-    """Return the score by which a training chooses its best checkpoint."""
+    """Return the score by which a training run chooses its best checkpoint."""
     ranking = rank("score", row)
     assert ranking is not None
     return ranking[0]

@@ -126,9 +126,9 @@ class ClaimResult:
 
     Attributes:
         claim: The claim.
-        effect: The effect to test against 0: the difference, or for a claimed size the log ratio minus its claimed
-            value. None if fewer than two recordings define the metric, or a claimed size has no ratio (a mean is not
-            positive).
+        effect: The effect to test against 0: the difference; for a claim with a margin, the difference shifted by it;
+            for a claimed size, the log ratio minus its claimed value. None if fewer than two recordings define the
+            metric, nothing varies (with a margin), or a claimed size has no ratio (a mean is not positive).
         difference: Arm minus reference; None if fewer than two recordings define the metric.
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).

@@ -1,6 +1,6 @@
 """The built-in traffic world: procedural roads, traffic and events.
 
-``world`` draws a scenario with the roads and drivers of one of the ``domains``; ``generate`` writes scenario sets, and
+``world`` draws a scenario with the roads and traffic of one of the ``domains``; ``generate`` writes scenario sets, and
 defines the splits of the benchmark.
 """
 

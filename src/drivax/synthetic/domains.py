@@ -1,4 +1,4 @@
-"""Domains: worlds with different statistics of roads and drivers, for studies of generalisation."""
+"""Domains: worlds with different statistics of roads and traffic, for studies of generalisation."""
 
 from __future__ import annotations
 

@@ -43,6 +43,8 @@ _CHUNK, _TASKS = 16, 4
 #: Submitted tasks per worker, and batches in the audit, whose results may be outstanding.
 _AHEAD, _AHEAD_BATCHES = 3, 1
 _EVENT = "event"
+#: Least and largest duration of a scenario after its current step, s.
+_MIN_FUTURE_S, _MAX_FUTURE_S = 8.0, 60.0
 #: First seed of the benchmark's splits.
 RESERVED_SEED = 1_000_000_000
 #: Increased when a split changes while the world's version stays.
@@ -56,7 +58,7 @@ Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 
 @contextmanager
 def portable_workers() -> Iterator[None]:
-    """Context in which started worker processes compute the same bits on any x86-64 processor."""
+    """Context in which newly started worker processes compute the same bits on any x86-64 processor."""
     # Features that the variable already disables count as missing in the table, so list them again.
     # NumPy splits the variable at commas, too. "Prescott": OpenBLAS's kernels for the oldest x86-64 processors.
     disabled = os.environ.get(_FEATURES, "").replace(",", " ").split()
@@ -67,7 +69,7 @@ def portable_workers() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Generation:
-    """Options of a generation.
+    """Options for generating a scenario set.
 
     Attributes:
         workers: Number of worker processes. With 0 this process draws the scenarios, and their last bits depend on the
@@ -82,7 +84,7 @@ class Generation:
 
     workers: int = 0
     capacity: str = "default"
-    future_s: float = 8.0
+    future_s: float = _MIN_FUTURE_S
     egos: int = 1
     split: str | None = None
     overwrite: bool = False
@@ -92,7 +94,7 @@ class Generation:
         """Check the options.
 
         Raises:
-            UsageError: The first wrong option.
+            UsageError: An option is invalid.
         """
         if self.workers < 0:
             raise UsageError(f"workers is {self.workers}", cure="use 0 or more")
@@ -100,9 +102,9 @@ class Generation:
             raise UsageError(
                 f"unknown capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
-        if not 8.0 <= self.future_s <= 60.0:
+        if not _MIN_FUTURE_S <= self.future_s <= _MAX_FUTURE_S:
             raise UsageError(f"future_s is {self.future_s:g}", cure="use 8 to 60 seconds")
-        _ = self.shares, self.sizes  # refuse wrong splits and numbers of egos
+        _ = self.shares, self.sizes  # refuse invalid splits and numbers of egos
         self.world.check()
 
     @property
@@ -176,7 +178,7 @@ class _Counts:
             self._events[draw.family][draw.scenario.tags[_EVENT]] += 1
 
     def families(self) -> dict[str, FamilyCount]:
-        """Counts sorted by family, families without a kept draw included."""
+        """Counts sorted by family, including families without a kept draw."""
         return {
             name: FamilyCount(
                 self._kept[name], dict(self._rejected[name]), self._unsuited[name], dict(self._events[name])
@@ -201,7 +203,7 @@ def generate(
         audit: Called in a thread of this process with batches of scenarios; its results are stored with them.
 
     Raises:
-        UsageError: Wrong arguments, ``out`` exists and is not to be overwritten, or a scenario has no clean expert.
+        UsageError: Invalid arguments, ``out`` exists and is not to be overwritten, or a scenario has no clean expert.
         DataError: The disk has too little space, or a worker died.
     """
     options = options or Generation()
@@ -362,12 +364,12 @@ def generate_benchmark(
         audit: See :func:`generate`.
 
     Raises:
-        UsageError: Wrong arguments, or one of the sets exists and is not to be overwritten.
+        UsageError: Invalid arguments, or one of the sets exists and is not to be overwritten.
         DataError: The disk has too little space, a set's name is a symbolic link, or a worker died.
     """
     options = options or Generation()
     options.check()
-    if options.world != WorldConfig(domain=options.world.domain) or options.future_s != 8.0:
+    if options.world != WorldConfig(domain=options.world.domain) or options.future_s != _MIN_FUTURE_S:
         raise UsageError(
             "the benchmark's future_s is 8, and its world is fixed but for its domain",
             cure="leave out other settings, or generate a set that is not the benchmark",

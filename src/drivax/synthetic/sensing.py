@@ -43,7 +43,7 @@ class SensorConfig:
     above_roof_m: float = 0.2
 
     def check(self) -> None:
-        """Raise a UsageError for the first wrong setting."""
+        """Raise a UsageError for the first invalid setting."""
         _check_numbers("sensor", self)
 
 
@@ -72,7 +72,7 @@ class NoiseConfig:
     speed_correlation: float = 0.0
 
     def check(self) -> None:
-        """Raise a UsageError for the first wrong setting."""
+        """Raise a UsageError for the first invalid setting."""
         _check_numbers("noise", self)
         for name, value in vars(self).items():
             if name.endswith("_correlation") and value >= 1.0:
@@ -102,7 +102,7 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
 def visible(
     box: _Boxes, height_m: _PerUser, valid: _Visible, blocks: Bool[np.ndarray, " user"], config: SensorConfig
 ) -> _Visible:
-    """Mask of users in the sensor's range whose centre or a corner is in free view; ego sees itself.
+    """Mask of users in the sensor's range with a clear line of sight to the centre or a corner; ego sees itself.
 
     A ray from the sensor to half the height of a user is blocked by every other box that it does not pass above.
 
@@ -185,7 +185,7 @@ def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> flo
 
 
 def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
-    """Add perception noise to tracks, ego's excepted.
+    """Add perception noise to all tracks but ego's.
 
     Errors are zero-mean AR(1) processes, clipped at three standard deviations. Below 2 m/s they shrink linearly, to a
     quarter at standstill; standing users keep speed 0. Sizes are exact.

@@ -50,7 +50,7 @@ _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: Candidate first steps of a critical recording: earliest, largest delay after the warm-up, stride.
 _EARLIEST_STEP, _MAX_DELAY_STEPS, _CRITICAL_STRIDE = 28, 16, 4
-#: Ego's first plan reacts to an event from this many steps before it on (:func:`expert.driver.drive_ego`).
+#: Ego's first plan may react to an event this many steps before it begins (:func:`expert.driver.drive_ego`).
 _LEAD_STEPS = 8
 #: Lights are recorded within the bounding rectangle of ego's log and this margin, m.
 _LIGHTS_M = 95.0
@@ -73,11 +73,11 @@ class WorldConfig:
         rare_rate: Share of scenarios in which a rare event is staged.
         critical_share: Share of the scenarios without an event in which ego must give way, if the roads allow it; the
             recording begins at a critical step (:mod:`events.conflict_start`), if there is one.
-        lane_change_share: Share of random routes with room for it on which ego plans a lane change; routes past a place
-            of an event or a conflict have none.
+        lane_change_share: Share of random routes with room for it on which ego plans a lane change; routes past a
+            destination for an event or a conflict have none.
         signal_timing: Shares of states of ego's next light after the warm-up: green, turning green, turning yellow.
-        scenarios_per_map: Number of consecutive indices whose scenarios share roads and a segment, those with an event
-            excepted; new roads are drawn after 12 rejected draws.
+        scenarios_per_map: Number of consecutive indices whose scenarios share roads and a segment, except those with an
+            event; new roads are drawn after 12 rejected draws.
         noise: Perception noise of the tracks of all users but ego.
         sensor: Ego's sensor.
     """
@@ -95,7 +95,7 @@ class WorldConfig:
         """Check the settings and return the domain.
 
         Raises:
-            UsageError: The first wrong setting.
+            UsageError: A setting is invalid.
         """
         if self.domain not in DOMAINS:
             raise UsageError(f"unknown domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
@@ -150,8 +150,8 @@ def generate_many(
     own roads, new ones for each attempt, on which the event can happen.
 
     Raises:
-        UsageError: A setting is wrong, there are too few steps, seed or index are negative, no roads suit the event, or
-            no draw gives a clean expert.
+        UsageError: A setting is invalid, there are too few steps, seed or index is negative, no roads suit the event,
+            or no draw gives a clean expert.
     """
     domain = config.check()
     if steps < STEPS:
@@ -173,8 +173,8 @@ def _generate(
         family, network = _draw_roads(config.domain, event, (seed, 3 if event else 1, *map_number))
         rng = np.random.default_rng([seed, 2, index, attempt])
         destinations = destinations_for(event, network, attempt > 0) if event else ()
-        draw = _Draw(network, destinations, event, severity, steps)
-        result = yield from _attempt(draw, domain, config, rng)
+        inputs = _AttemptInputs(network, destinations, event, severity, steps)
+        result = yield from _attempt(inputs, domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
             continue
@@ -217,7 +217,7 @@ def _draw_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Roa
 
 
 @dataclass(frozen=True)
-class _Draw:
+class _AttemptInputs:
     """Arguments of an attempt: roads, candidate destinations of ego, event (or none), severity, number of steps."""
 
     network: RoadNetwork
@@ -228,18 +228,18 @@ class _Draw:
 
 
 def _attempt(
-    draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator
+    inputs: _AttemptInputs, domain: Domain, config: WorldConfig, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
     """Return the recording of one draw, or the cause of its rejection."""
-    critical = not draw.event and rng.random() < config.critical_share
-    times = (np.arange(_WARM_UP + draw.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
+    critical = not inputs.event and rng.random() < config.critical_share
+    times = (np.arange(_WARM_UP + inputs.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
     shares = config.lane_change_share, config.signal_timing
-    roles = assign_roles(draw.network, domain, times, *shares, rng, draw.destinations, critical)
+    roles = assign_roles(inputs.network, domain, times, *shares, rng, inputs.destinations, critical)
     traffic = Traffic(roles, times)
-    if draw.event:
-        result = yield from _stage_event(draw, traffic, rng)
+    if inputs.event:
+        result = yield from _stage_event(inputs, traffic, rng)
     else:
-        result = yield from _drive_without_event(traffic, draw.steps, critical, rng)
+        result = yield from _drive_without_event(traffic, inputs.steps, critical, rng)
     return result if isinstance(result, str) else _add_perception(result, config, rng)
 
 
@@ -261,18 +261,18 @@ def _drive_without_event(
 
 
 def _stage_event(
-    draw: _Draw, traffic: Traffic, rng: np.random.Generator
+    inputs: _AttemptInputs, traffic: Traffic, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
     """Return a recording of the event without perception noise, or why none was staged or the last was rejected."""
     view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
-        staged = stage(draw.event, view, draw.severity_mps2, rng)
+        staged = stage(inputs.event, view, inputs.severity_mps2, rng)
         if staged is None:
             break
         aware_step = staged.first_step - _LEAD_STEPS
         motion, cause = yield from expert.drive_ego(traffic, staged.staging, _WARM_UP, aware_step)
         if not cause and endangers_ego(view, motion, staged):
-            return _to_recording(traffic.roles, motion, _WARM_UP, staged, draw.steps)
+            return _to_recording(traffic.roles, motion, _WARM_UP, staged, inputs.steps)
         cause = cause or _NO_THREAT
     return cause
 

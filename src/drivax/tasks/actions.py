@@ -33,6 +33,8 @@ _WHEELBASE = 0.6
 MOST_LEVELS, MOST_TRAJECTORY_STEPS = 255, 1000
 #: Tolerance of the bounds [-1, 1].
 _ROUNDING = 1e-4
+#: Tolerance of backward displacements, m.
+_BACKWARD_M = 1e-3
 #: Lower bound of lengths in divisors, m: empty slots have length 0.
 _LEAST_LENGTH_M = 1.0
 
@@ -279,7 +281,7 @@ class DeltaLocal:
 
     def exceeds_bounds(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
         """Return whether an action is outside the bounds, or moves backwards by more than a millimetre."""
-        return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
+        return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -_BACKWARD_M)
 
     def actuate(
         self, motion: Motion, action: Float[Array, " 3"], last: Float[Array, " 3"], length_m: Any

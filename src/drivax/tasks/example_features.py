@@ -30,7 +30,7 @@ _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
 #: Lane pieces: maximum distance, m; minimum cosine of the angle to ego; weight of the sine of the angle, m.
 _LANE_M, _LANE_COS, _M_PER_SINE = 2.5, 0.5, 4.0
 #: Half the width of the strip ahead that contains a leader, m; maximum of time gaps, s.
-_STRIPE_M, _LONGEST_S = 1.5, 10.0
+_HALF_STRIP_M, _LONGEST_S = 1.5, 10.0
 #: Look-ahead of a car-following driver, m.
 _FARTHEST_M = 90.0
 #: Lower bound of the speed in time gaps, m/s.
@@ -95,7 +95,7 @@ def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float
     now, view = frames(0), View.of(context)
     position = view.point(now.box[:, :2])
     others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
-    is_ahead = others & (position[:, 0] > 0) & (jnp.abs(position[:, 1]) < _STRIPE_M)
+    is_ahead = others & (position[:, 0] > 0) & (jnp.abs(position[:, 1]) < _HALF_STRIP_M)
     half_length = bank.length_m(context.index, context.slot) / 2
     direction = jnp.abs(view.vector(now.box[:, COS:LENGTH]))
     # Half extent of boxes along ego's heading.

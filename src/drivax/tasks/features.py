@@ -137,12 +137,12 @@ class Features:
     def __post_init__(self) -> None:
         for field in fields(self):
             selected, available = getattr(self, field.name), tuple(COLUMNS[field.name])
-            place = f"observation.features.{field.name}"
+            key = f"observation.features.{field.name}"
             for number, name in enumerate(selected):
                 if name not in available:
-                    raise UsageError(f"{place} has no {name!r}", cure=did_you_mean(name, available))
+                    raise UsageError(f"{key} has no {name!r}", cure=did_you_mean(name, available))
                 if name in selected[:number]:
-                    raise UsageError(f"{place} names {name!r} twice", cure="name it once")
+                    raise UsageError(f"{key} names {name!r} twice", cure="name it once")
             # In the order of COLUMNS, on which encoders and checkpoints rely.
             object.__setattr__(self, field.name, tuple(name for name in available if name in selected))
 

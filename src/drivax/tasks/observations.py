@@ -43,8 +43,8 @@ from drivax.tasks.perception import (
 MOST_ROAD_ROWS, MOST_ROWS = 8192, 512
 #: Block size of :func:`running_count`.
 _BLOCK = 8
-#: Stop lines that ego has passed by more than this, in the direction of their lane, are omitted, m; addition to the
-#: distance of lights off the route, which sorts them last, m.
+#: Distance behind ego, along their lane, beyond which stop lines are omitted, m; addition to the distance of lights off
+#: the route, which sorts them last, m.
 _BEHIND_M, _OFF_ROUTE_M = 5.0, 1e4
 #: Agent kinds in the order of the columns of ``type``, which are all 0 for ``AgentKind.STATIC``.
 _TYPES = (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST, AgentKind.OTHER)
@@ -356,7 +356,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, 
         return kernels.with_reference(native, partial(_road, config))(bank, context, view)
 
     def rotate(x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the components ahead and left, rounded differently than by :meth:`View.rotate`."""
+        """Return the components ahead and left, rounded differently from :meth:`View.rotate`."""
         return x * view.cos + y * view.sin, y * view.cos - x * view.sin
 
     x, y, layer = bank.road_at[context.index]

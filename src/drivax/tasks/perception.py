@@ -57,8 +57,8 @@ class Perception:
         for name in ("range_m", "dropout_m"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
-                place = f"observation.perception.{name}"
-                raise ValueError(f"{place} is {value}; use a positive number, or null for none")
+                key = f"observation.perception.{name}"
+                raise ValueError(f"{key} is {value}; use a positive number, or null for none")
         if not 0.0 <= self.noise_m < math.inf:
             raise ValueError(f"observation.perception.noise_m is {self.noise_m}; use 0 or a positive number")
 

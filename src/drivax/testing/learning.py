@@ -41,7 +41,7 @@ _BATCH = 6
 _BFLOAT16_TOLERANCE = 5e-2
 #: A small observation, because compilation takes most of the time of a check.
 _TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3), metrics="training")
-#: Iterations of the training for which a learner is built; the check runs three.
+#: Iterations of the training run for which a learner is built; the check runs three.
 _ITERATIONS = 4
 
 
@@ -159,7 +159,7 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
     Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
     are pure, repeat bit for bit from a stored state, change the parameters, and log finite numbers. The planner acts
     within [-1, 1]; its mode is deterministic. Use small sizes and no warm-up, because the check runs three iterations
-    of a training of four, and the first must learn.
+    of a training run of four, and the first must learn.
     """
     settings = instance(config)
     what = f"algorithm {type(settings).__name__}"

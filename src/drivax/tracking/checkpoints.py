@@ -250,7 +250,7 @@ def _check_types(about: Mapping[str, Any]) -> None:
 
 
 def _check_files(path: Path, checksums: Mapping[str, int], most: int) -> None:
-    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or no regular file.
+    """Raise DataError for the first file of a checkpoint that is missing, damaged, a link, or not a regular file.
 
     Files of more than ``most`` bytes are refused unread, because their checksums might take forever.
     """
@@ -364,7 +364,7 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
 def _silence_writers() -> Iterator[None]:
     """Only raise the first error of a write: Orbax and asyncio also log it, and TensorStore prints each array's.
 
-    After an error this lasts: their threads fail later, and their tasks are deleted at any time.
+    After an error, they stay silenced: their threads fail later, and their tasks are deleted at any time.
     """
     loggers, report_hook = [logging.getLogger(name) for name in ("absl", "asyncio")], sys.unraisablehook
 

@@ -21,7 +21,7 @@ class Progress:
         work: Name of the work ("converting").
         unit: Counted unit ("scenarios").
         total: Final count; None if unknown.
-        done: Count that earlier runs reached, which does not enter the rate.
+        done: Count that earlier runs reached, which does not count towards the rate.
         stream: Text file to write to; standard error by default, so that standard output contains only results.
         interval_s: Seconds between two lines if ``stream`` is not a terminal.
         clock: Returns the time in seconds.

@@ -94,8 +94,8 @@ class RunFolder:
     def check(path: Path, overwrite: bool, kind: str | None = None) -> None:
         """Check, before any work, that a run can be written to a folder.
 
-        With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), a recording only
-        by a recording, and other runs only by other runs, as far as both kinds are known.
+        With ``overwrite``, a run folder is replaced; a training run only by a training run (``kind``), recorded
+        episodes only by recorded episodes, and other runs only by other runs, as far as both kinds are known.
 
         Raises:
             UsageError: The folder exists and cannot be replaced.
@@ -255,7 +255,7 @@ def seed_folders(path: str | Path) -> list[Path]:
     """Return the run folders of a path: those of its seeds for a run with ``--seeds``, otherwise the path itself.
 
     Raises:
-        DataError: The run of several seeds has none.
+        DataError: The run of several seeds has no seed folder.
     """
     path = Path(path)
     if _kind(path) != "seeds":
@@ -377,9 +377,9 @@ def machine() -> dict[str, Any]:
 
 
 def kernels_difference(info: Mapping[str, Any]) -> str | None:
-    """Return which native kernels a run and this process use, given its ``run.json``; None if they are the same."""
-    machine = info.get("machine")
-    run_state = machine.get("kernels", "none") if isinstance(machine, dict) else "none"
+    """Return which native kernels a run (by its ``run.json``) and this process use; None if they are the same."""
+    run_machine = info.get("machine")
+    run_state = run_machine.get("kernels", "none") if isinstance(run_machine, dict) else "none"
     before, now = (
         "none" if str(state).startswith("none") else str(state) for state in (run_state, kernels.state())
     )

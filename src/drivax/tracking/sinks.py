@@ -144,7 +144,7 @@ def read_rows(file: str | Path) -> Iterator[dict[str, Any]]:
         try:
             row = json.loads(line)
             if not isinstance(row["step"], int):
-                raise ValueError("a step that is no integer")
+                raise ValueError("a step that is not an integer")
         except DAMAGE as error:
             if not line.endswith("\n"):  # the incomplete last row
                 return

@@ -126,7 +126,7 @@ def _sample(line: Float[Array, "point 3"], fractions: Float[Array, " sample"]) -
 
 
 def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "centre 3"]:
-    """Return the segment's centre line with heights from ``middle`` (some have z = 0); without one, ``middle``."""
+    """Return the segment's centre line with heights from ``middle`` (its own may be 0); without one, ``middle``."""
     if segment.get("centerline") is None:
         return middle
     centre = _points(segment, "centerline")

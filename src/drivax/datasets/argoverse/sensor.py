@@ -37,18 +37,18 @@ _VEHICLES = (
     EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
     "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
 )  # fmt: skip
-_PEOPLE = ("PEDESTRIAN", "OFFICIAL_SIGNALER", "STROLLER", "WHEELCHAIR")
-_CYCLES = ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER")
-_THINGS = (
+_PEDESTRIANS = ("PEDESTRIAN", "OFFICIAL_SIGNALER", "STROLLER", "WHEELCHAIR")
+_CYCLISTS = ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER")
+_STATIC_OBJECTS = (
     "BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "SIGN", "STOP_SIGN", "MESSAGE_BOARD_TRAILER",
     "MOBILE_PEDESTRIAN_CROSSING_SIGN", "TRAFFIC_LIGHT_TRAILER",
 )  # fmt: skip
 #: Kind by category; animals, and categories that later versions may add, are OTHER.
 _KINDS = {
     **dict.fromkeys(_VEHICLES, AgentKind.VEHICLE),
-    **dict.fromkeys(_PEOPLE, AgentKind.PEDESTRIAN),
-    **dict.fromkeys(_CYCLES, AgentKind.CYCLIST),
-    **dict.fromkeys(_THINGS, AgentKind.STATIC),
+    **dict.fromkeys(_PEDESTRIANS, AgentKind.PEDESTRIAN),
+    **dict.fromkeys(_CYCLISTS, AgentKind.CYCLIST),
+    **dict.fromkeys(_STATIC_OBJECTS, AgentKind.STATIC),
 }
 
 _SKIP = "skip this log, or download it again"
@@ -114,7 +114,7 @@ def decode(path: Path) -> Recording:
     """Return the recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and its map.
 
     Positions are in the city's frame, metres. Boxes are transformed from the car's frame by the pose of the same
-    timestamp, the ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
+    timestamp, the ego is moved from its rear axle to its box centre; velocities are finite differences of positions.
     """
     boxes = read_table(path, _BOX_COLUMNS)
     poses = read_table(path.with_name(POSES), _POSE_COLUMNS)
@@ -161,7 +161,7 @@ def _frame_times(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
 def _tracks(boxes: Table, poses: Table, times_ns: Int[Array, " step"]) -> tuple[Tracks, int]:
     """Return all tracks, ego in row 0 and valid at every step, and the number of repeated boxes.
 
-    Positions are in the city's frame. Of several boxes of a track at one time the last one counts.
+    Positions are in the city's frame. Of several boxes of a track at the same time, the last one counts.
     """
     pose = _poses(poses, times_ns)
     stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row

@@ -18,7 +18,7 @@ MOST_ROWS, MOST_BYTES = 1_000_000, 128 << 20
 #: Longest footer of a file, and longest header of a page or batch, bytes; those of Argoverse 2 have up to 5,000. Each
 #: value in one may take some thousand bytes of memory.
 _LONGEST_FOOTER, _LONGEST_HEADER = 1 << 18, 1 << 16
-#: Most pages or messages, which take time even if they are empty; files of Argoverse 2 have up to a hundred.
+#: Maximum number of pages or messages: even empty ones take time; files of Argoverse 2 have up to a hundred.
 _MOST_PARTS = 1 << 14
 #: Accepted encodings of parquet pages: all but DELTA_BYTE_ARRAY (7), which repeats the beginning of the previous text.
 _ENCODINGS = (0, 2, 3, 4, 5, 6, 8, 9)
@@ -86,11 +86,11 @@ def check_messages(source: Any) -> None:
     budget, position = _Budget(), _STREAM
     while left := source.size() - position:
         if left < 8:  # Arrow would take what is there as a length, and allocate it
-            raise ValueError("a message of odd length")
+            raise ValueError("a message of invalid length")
         source.seek(position)
         mark, length = struct.unpack("<II", source.read(8))
         if mark != _CONTINUES or length > _LONGEST_HEADER:
-            raise ValueError("a message of odd length")
+            raise ValueError("a message of invalid length")
         if not length:
             break
         budget.take_part(length)

@@ -35,8 +35,8 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: Most tracks to predict that precede all others; sort key of tracks that are not valid at the current step, from which
-#: their number of valid steps is subtracted.
+#: Maximum number of tracks to predict that precede all others; sort key of tracks that are not valid at the current
+#: step, from which their number of valid steps is subtracted.
 _FIRST, _ABSENT_RANK = 8, 1e9
 #: Spacing of map points, just under 1 m so that rounding makes no longer gap, at which readers cut polylines; and the
 #: factor by which it grows until the points fit.
@@ -73,8 +73,8 @@ def tf_example(
 
     Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
     current step: UTM coordinates would be rounded to half a metre. ``scenario/origin`` then holds that position as
-    text, which Waymax and V-Max skip. Where an id does not fit its type exactly (agents: float32, map: int32), running
-    numbers replace all ids of that kind.
+    text, which Waymax and V-Max skip. Where an id does not fit its type exactly (agents: float32, map: int32),
+    consecutive numbers replace all ids of that kind.
     """
     recording = restore(scenario)
     tracks, lost = _align_tracks(recording)
@@ -118,8 +118,8 @@ def _steps(recording: Recording) -> tuple[_Array, _Array]:
 def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     """Return the rows in the order of the file: ego, which V-Max reads from row 0, then the data set's order.
 
-    That is: of the tracks that are valid now up to 8 to predict by id, then the others by distance from ego; then those
-    that are not valid now, most valid steps first. Tracks that are not valid at any of the 91 steps are left out.
+    That is: first the tracks that are valid now (up to 8 to predict by id, then the others by distance from ego), then
+    those not valid now, most valid steps first. Tracks that are not valid at any of the 91 steps are left out.
     """
     now = tracks.valid[:, CURRENT_STEP]
     to_predict = [row for row in recording.to_predict if now[row] and row != recording.ego]
@@ -196,7 +196,7 @@ def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Ar
 
 
 def _file_ids(recording: Recording) -> dict[int, int]:
-    """Map ids of map features and lights' lanes to ids for the file: the same if all fit, else running numbers."""
+    """Map ids of map features and lights' lanes to ids for the file: the same if all fit, else consecutive numbers."""
     ids = [feature.feature_id for feature in recording.features]
     file_ids = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
     fit = all(0 <= number < _INT_ID_END for number in file_ids)

@@ -28,12 +28,12 @@ _Written = tuple[list[str], Counter[str]]
 
 @dataclass(frozen=True)
 class Export:
-    """What to export and how.
+    """Options of an export.
 
     Attributes:
         format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
-        filters: Conditions that all must hold (``scenario.select.selection``).
-        ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None: all.
+        filters: Conditions that must all hold (``scenario.select.selection``).
+        ids: File of scenario ids, one per line, or ``dataset<TAB>id``; None: all.
         limit: Write only the first N of the selected scenarios; None: all.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.

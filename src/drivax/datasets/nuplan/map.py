@@ -259,7 +259,7 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
 
 
 def _connectors(layers: Mapping[str, Layer], baselines: Mapping[int, int]) -> Iterator[tuple[int, Lane]]:
-    """Yield connectors by packed id: from the lane ``exit_lane_fid``, which one leaves, to ``entry_lane_fid``."""
+    """Yield connectors with packed ids; each leads from the lane ``exit_lane_fid`` to the lane ``entry_lane_fid``."""
     name = "gen_lane_connectors_scaled_width_polygons"
     sides = {
         as_integer(connector): (as_integer(left), as_integer(right))
@@ -396,7 +396,7 @@ def _transformer(source: int, target: int, file: Path) -> Any:
 
 
 def _line(shape: Any) -> Float64[np.ndarray, "point 3"] | None:
-    """Return points of a line, z = 0, without repeated ones; None for fewer than two points or a line in parts."""
+    """Return points of a line, z = 0, without repeated ones; None for fewer than two points or several parts."""
     shapely = import_extra("shapely")
     if shape is not None and shape.geom_type == "MultiLineString":
         shape = shapely.line_merge(shape)

@@ -65,10 +65,10 @@ EGO_TRACK_ID = 0
 _GAP_US = 120_000
 #: Longer scenes are read in pieces of this many steps, a multiple of the usual stride of windows.
 _LONGEST_PIECE = 400
-#: Largest plausible values: UTM coordinates, m/s, metres of a box, metres of ego between two steps.
+#: Largest plausible UTM coordinates (m), speeds (m/s), sizes of boxes (m), distances of ego between two steps (m).
 _FARTHEST_M, _FASTEST_MPS, _LONGEST_M, _LONGEST_STEP_M = 2e7, 300.0, 200.0, 20.0
-_LARGEST_YAW = 1e4
-#: Most entries of an array of tracks by steps; real scenes have up to a thousand tracks.
+_LARGEST_YAW_RAD = 1e4
+#: Maximum number of entries of an array of tracks by steps; real scenes have up to a thousand tracks.
 _MOST_CELLS = 2_000_000
 _CURE = "skip this record, or download the file again"
 _KINDS = {
@@ -82,7 +82,7 @@ _LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": Li
 
 @dataclass(frozen=True)
 class NuPlan:
-    """Reader of nuPlan logs: a recording per scene (several of a long one) at 10 Hz, all of a log in one segment."""
+    """Reader of nuPlan logs: one recording per scene (several if it is long) at 10 Hz; a log is one segment."""
 
     name: str = _NAME
     patterns: tuple[str, ...] = ("*_veh-*.db",)
@@ -162,7 +162,7 @@ class Piece:
         name: Token of the scene in hexadecimal digits (else ``no-scene``), with a number where it occurs again.
         scene: Token of the scene.
         sweeps: Rows of the time line, one per step of 0.1 s.
-        scene_sweeps: Rows of the scene or its part alone, first and one past the last (of 20 Hz perhaps one too many).
+        scene_sweeps: Rows of the scene or its part alone, first and one past the last (at 20 Hz perhaps one too many).
     """
 
     name: str
@@ -288,7 +288,7 @@ def agents(database: Database) -> _Agents:
 def tracks(log: Log, piece: Piece, agents_by_token: _Agents) -> tuple[Tracks, dict[str, int]]:
     """Return the tracks of a piece, ego in row 0, and counts of boxes without a track and of repeated boxes.
 
-    Of several boxes of a track in a sweep the last one counts.
+    Of several boxes of a track in a sweep, the last one counts.
     """
     steps = len(piece.sweeps)
     boxes, box_keys, lost = _boxes(log, piece, agents_by_token)
@@ -368,10 +368,10 @@ def _boxes(
     rows = _read_observations(log, piece, "lidar_box", columns)
     with_track = [row for row in rows if row[1] in agents_by_token]
     boxes = _numbers([row[2:] for row in with_track], 9, "lidar_box")
-    # Static things have no velocity, and the size of a few is unknown.
+    # Static objects have no velocity, and the size of a few is unknown.
     boxes[:, 4:9] = np.where(np.isnan(boxes[:, 4:9]), 0.0, boxes[:, 4:9])
     _check(boxes[:, 0:3], _FARTHEST_M, "the position of a box")
-    _check(boxes[:, 3], _LARGEST_YAW, "the yaw of a box")
+    _check(boxes[:, 3], _LARGEST_YAW_RAD, "the yaw of a box")
     _check(boxes[:, 4:7], _LONGEST_M, "the size of a box")
     _check(boxes[:, 7:9], _FASTEST_MPS, "the velocity of a box")
     boxes[:, 3] = wrap(boxes[:, 3])

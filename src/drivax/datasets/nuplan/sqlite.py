@@ -40,7 +40,7 @@ _ROWS_AT_ONCE = 8
 #: 0.1 per byte). It ends queries on damaged trees with cycles.
 _STEPS_PER_BYTE = 20
 _STEPS_AT_ONCE = 100_000
-#: Most parameters of a query; old builds of SQLite take 999.
+#: Maximum number of parameters of a query; old builds of SQLite take 999.
 _VALUES_AT_ONCE = 500
 _GEOGRAPHIC = 4326
 #: Bytes of the envelope by its code: none, xy, xyz, xym, xyzm.

@@ -59,7 +59,7 @@ class Box:
 
     @classmethod
     def around(cls, xy: Float[Array, "point 2"], margin_m: float) -> Box:
-        """Return the box of some points, widened on all sides."""
+        """Return the bounding box of some points, widened by ``margin_m`` on all sides."""
         return cls(xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m)
 
     def pieces(self, points: Float[Array, "point dim"]) -> Iterator[Float[Array, "part dim"]]:

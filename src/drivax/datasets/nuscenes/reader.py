@@ -61,7 +61,7 @@ _KINDS = (
     ("movable_object.", AgentKind.STATIC),
     ("static_object.", AgentKind.STATIC),
 )
-#: Sensor whose frames (20 Hz) give the ego's poses; frames of other sensors lie in between.
+#: Sensor whose frames (20 Hz) give the ego's poses; frames of other sensors lie between them.
 _POSE_SENSOR = "LIDAR_TOP"
 
 
@@ -239,8 +239,8 @@ class Tables:
         scenes: Rows of ``scene.json``.
         logs: Location and logfile of each log by token.
         sample_scene: Row of the scene of every sample; ``sample_time`` is its time in seconds.
-        poses: Scene row, time [s], x, y, heading of every lidar frame's pose.
-        annotations: Sample row, instance row, x, y, heading, length, width, height.
+        poses: Scene row, time [s], x, y [m], heading [rad] of every lidar frame's pose.
+        annotations: Sample row, instance row, x, y [m], heading [rad], length, width, height [m].
         kinds: Class of every instance.
         unknown_fields: Number of tables and fields of unknown names.
     """
@@ -290,7 +290,10 @@ class Tables:
     def observations(
         self, samples: Int64[Array, " sample"]
     ) -> tuple[list[Float64[Array, "_ 7"]], list[AgentKind]]:
-        """Return time [s], x, y, heading, length, width and height of each instance at some samples, and its class."""
+        """Return the observations of each instance at some samples, and its class.
+
+        Columns are time [s], x, y [m], heading [rad], length, width and height [m].
+        """
         annotations = self.annotations[np.isin(self.annotations[:, 0], samples)]
         times = self.sample_time[annotations[:, 0].astype(np.int64)]
         table = np.column_stack((times, annotations[:, 2:]))

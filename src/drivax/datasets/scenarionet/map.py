@@ -33,7 +33,7 @@ Array = np.ndarray[Any, Any]
 NEIGHBOUR_M = 8.0
 #: Points along a ring that are tested against the other rings; at some of them rings may touch.
 _PROBES = 5
-#: Most comparisons of points with points of rings or edges; maps that need more are refused.
+#: Maximum number of comparisons of points with points of rings or edges; maps that need more are refused.
 _MOST_COMPARISONS = 100_000_000
 #: Comparisons of points and segments at a time.
 _BLOCK = 500_000
@@ -52,7 +52,7 @@ _KINDS = {
     "LANE_BIKE_LANE": RoadKind.LANE_BIKE,
     "UNKNOWN_LINE": RoadKind.LINE_UNKNOWN,
     **{f"ROAD_{kind.name}": kind for kind in RoadKind if kind.name.startswith("LINE_")},
-    # The first forms of the files.
+    # The earliest version of the format.
     "BROKEN_SINGLE_YELLOW": RoadKind.LINE_BROKEN_SINGLE_YELLOW,
     "CROSS_WALK": RoadKind.CROSSWALK,
     "UNKNOWN": RoadKind.EDGE_UNKNOWN,
@@ -78,7 +78,7 @@ def orient_outlines(lines: Sequence[Array]) -> list[Array]:
     """Orient the outline of drivable space: exteriors anticlockwise, holes clockwise.
 
     Rings repeat their first point and do not cross, so a ring inside an even number of others is an exterior, else a
-    hole. A line that is no ring (a clipped outline) is reversed, because GEOS makes clockwise outlines of areas.
+    hole. A line that is not a ring (a clipped outline) is reversed, because GEOS makes clockwise outlines of areas.
     """
     are_rings = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
     rings = [points[:, :2] for points, is_ring in zip(lines, are_rings, strict=True) if is_ring]
@@ -175,7 +175,7 @@ class _Reading:
 def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
     """Read ``map_features``; ``around`` is a position (x, y) of ego, metres.
 
-    ``dataset``, the original one, decides which speed limits and which orientation of edges are used.
+    The original data set, ``dataset``, decides which speed limits and which orientation of edges are used.
     """
     bodies = {name: body for key, body in table.items() if (name := as_text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in bodies.values() for value in body.values())
@@ -240,7 +240,7 @@ def _feature(name: str, body: Mapping[Any, Any], reading: _Reading) -> MapFeatur
 def _points(name: str, kind: RoadKind, body: Mapping[Any, Any]) -> Array | None:
     """Return the points as the file has them; None without any.
 
-    The outlines of crosswalks and speed bumps are called ``polyline`` in the first form of the files.
+    The outlines of crosswalks and speed bumps are called ``polyline`` in the earliest version of the format.
     """
     keys = ("position",) if kind == RoadKind.STOP_SIGN else ("polyline",)
     keys = ("polygon", *keys) if kind in POLYGON_KINDS else keys

@@ -22,7 +22,7 @@ from drivax.errors import DataError
 Array = np.ndarray[Any, Any]
 
 SKIP = "skip this file, or generate it again"
-#: Most rows of a value, and most numbers of a map.
+#: Maximum number of rows of a value, and of numbers in a map.
 MOST_NUMBERS = 4_000_000
 _NUMBER = (int, float)
 #: Recorded scenarios have 0.6 to 10 MB.
@@ -35,7 +35,7 @@ _LARGEST_KEY, _MOST_PARTS = 1 << 60, 4
 _DAMAGED = "copy or generate the file again"
 _DISTRUST = "do not open this file with pickle: it could run anything"
 _TYPE_CODE = re.compile(r"[<>|=]?([biu]1|[iu][248]|f[248]|[SU]\d{1,4}|O8?)")
-#: Modules of Python 2 and of NumPy before 2.0 by their present name.
+#: Present names of modules of Python 2 and of NumPy before 2.0, by their old name.
 _MODULES = {"__builtin__": "builtins", "numpy.core.multiarray": "numpy._core.multiarray",
             "numpy.core.numeric": "numpy._core.numeric"}  # fmt: skip
 
@@ -159,7 +159,7 @@ class _Machine:
         try:
             self.stack.append(make(*arguments))
         except (TypeError, AttributeError) as error:
-            raise ValueError(f"odd arguments for {function.name}") from error
+            raise ValueError(f"invalid arguments for {function.name}") from error
 
     def _build(self, argument: Any) -> None:
         """BUILD: finish an array or array type with its state, on the stack and in the memo."""
@@ -237,7 +237,7 @@ def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     """Return bytes, which protocols up to 2 store as a text in Latin-1."""
     if not isinstance(text, str):
-        raise ValueError("bytes of an object that is no text")
+        raise ValueError("bytes of an object that is not text")
     return text.encode("latin1")
 
 
@@ -273,16 +273,16 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> _Unbuilt:
 def _array(content: Any, dtype: Any, shape: Any, order: Any = "C") -> Any:
     """Return a list of objects, or an array over bytes of the file: no shape can ask for more memory than it has."""
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or len(shape) > MOST_AXES:
-        raise ValueError("an array of odd shape or type")
+        raise ValueError("an array of invalid shape or type")
     if any(type(size) is not int or not 0 <= size <= MOST_BYTES for size in shape):
-        raise ValueError("an array of odd shape")
+        raise ValueError("an array of invalid shape")
     count = math.prod(shape)
     if dtype.kind == "O":
         if len(shape) != 1 or not isinstance(content, list) or len(content) != count:
-            raise ValueError("an array of objects with several axes, or of another length than it says")
+            raise ValueError("an array of objects with several axes, or whose length differs from its shape")
         return content
     if not isinstance(content, bytes | bytearray) or len(content) != count * dtype.itemsize:
-        raise ValueError("an array of another length than it says")
+        raise ValueError("an array whose length differs from its shape")
     if count == 0:
         return np.zeros(shape, dtype)
     # A damaged boolean may be neither 0 nor 1, which NumPy does not expect.
@@ -336,7 +336,7 @@ def mapping(parent: Any, name: str, what: str = "the file") -> Mapping[Any, Any]
 
 
 def as_text(value: Any) -> str | None:
-    """Return a text that can be written as UTF-8, also of an integer; None for anything else."""
+    """Return a string or an integer as text that can be written as UTF-8; None for anything else."""
     if not isinstance(value, bool) and isinstance(value, str | int):
         with contextlib.suppress(ValueError):  # a lone surrogate, or an integer of thousands of digits
             return str(value).encode().decode()
@@ -344,7 +344,7 @@ def as_text(value: Any) -> str | None:
 
 
 def as_int(value: Any) -> int | None:
-    """Return an integer of up to 18 digits, also from a text; None for a negative one and anything else."""
+    """Return a non-negative integer of up to 18 digits, also from a string; None for anything else."""
     text = as_text(value)
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else None
 
@@ -399,11 +399,11 @@ def _row(row: Any) -> Any:
         return row
     if isinstance(row, list | tuple) and len(row) <= 3 and all(isinstance(part, _NUMBER) for part in row):
         return row
-    raise ValueError("no row of numbers")
+    raise ValueError("not a row of numbers")
 
 
 class Names:
-    """Distinct integers for the names in a file: the names if all are distinct integers, else their positions.
+    """Distinct integers for the names in a file: the names themselves if they are such integers, else their positions.
 
     Args:
         names: All names, as texts.

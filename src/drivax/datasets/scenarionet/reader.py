@@ -1,7 +1,7 @@
 """Reader of ScenarioNet pickles: one recording per file, from WOMD, nuScenes, nuPlan, Argoverse, Lyft or MetaDrive.
 
-The dictionaries are those of MetaDrive's ``ScenarioDescription``. The reader undoes what their converters do to each
-data set as far as the file allows (docs/data/scenarionet.md).
+The dictionaries are those of MetaDrive's ``ScenarioDescription``. The reader undoes what ScenarioNet's converters do to
+each data set, as far as the file allows (docs/data/scenarionet.md).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _COLUMNS = {
     "heading": ((1,), 1e4),
     "velocity": ((2, 3), 1e3),
     **dict.fromkeys(("length", "width", "height"), ((1,), 1e3)),
-    "size": ((3,), 1e3),  # length, width, height in the first form of the files
+    "size": ((3,), 1e3),  # length, width, height in the earliest version of the format
     "radius": ((1,), 1e3),  # of round objects of MetaDrive, without length and width
     "valid": ((1,), np.inf),
 }
@@ -91,7 +91,7 @@ _PARTS = (b"tracks", b"metadata", b"map_features", b"dynamic_map_states")
 
 @dataclass(frozen=True)
 class ScenarioNet:
-    """Reader of ScenarioNet pickles without running them; one that names anything but data is refused."""
+    """Reader of ScenarioNet pickles, without running them; a pickle that names anything but data is refused."""
 
     name: str = _NAME
     patterns: tuple[str, ...] = ("sd_*.pkl", "[0-9]*.pkl")
@@ -153,7 +153,7 @@ def _length_of(head: bytes) -> int | None:
 def decode(tree: Any) -> Recording:
     """Return the recording in a ScenarioNet dictionary, in the map frame of the original data, metres, float64.
 
-    A shift of the origin is undone where the file tells it (:func:`_offset`); else the frame is the file's.
+    A shift of the origin is undone where the file states it (:func:`_offset`); else the frame is the file's.
     """
     metadata = mapping(tree, "metadata")
     table = {
@@ -192,7 +192,7 @@ def decode(tree: Any) -> Recording:
 
 
 def _offset(metadata: Mapping[Any, Any], table: Mapping[str, Any], dataset: str) -> Array:
-    """Return the position (x, y, 0) of the file's origin in the original map frame; zeros if the file does not tell it.
+    """Return the position (x, y, 0) of the file's origin in the original map frame; zeros if it is unknown.
 
     ScenarioNet notes the centre that it subtracts from all positions, MetaDrive the old origin in its new frame. In
     older nuScenes files the steps without an observation show the centre: their zeros were moved as well.
@@ -216,7 +216,7 @@ def _position(metadata: Mapping[Any, Any], name: str) -> Array:
 
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
-    """Return the id of the scenario, from the first of the three places where forms of the files keep it."""
+    """Return the id of the scenario, from the first of the three places where versions of the format store it."""
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
         if identity := as_text(value):
             return identity
@@ -230,7 +230,7 @@ def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
     # Early files name the data set in their version only.
     name = next((name for name in ("nuscenes", "nuplan") if version.startswith(name)), source.lower())
     name = _DATASETS.get(name, name)
-    # Longer names than 16 bytes cannot be stored (``scenario.recording.DATASET_BYTES``).
+    # Names longer than 16 bytes cannot be stored (``scenario.recording.DATASET_BYTES``).
     return name if name.isascii() and 0 < len(name) <= 16 and "\0" not in name else _NAME
 
 
@@ -299,7 +299,7 @@ def _series(state: Mapping[Any, Any], name: str, steps: int, what: str) -> Array
     if series is None:
         return None
     if count_rows(series) != steps:
-        raise DataError(f"{what} has {count_rows(series)} values of {name}, {steps} steps", cure=SKIP)
+        raise DataError(f"{what} has {count_rows(series)} values of {name} for {steps} steps", cure=SKIP)
     values = floats(series, f"{what}: {name}")
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or values.shape[1] not in _COLUMNS[name][0]:
@@ -350,7 +350,7 @@ def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
         return np.arange(steps) * DT_S
     times = floats(stamps, "timestamps")
     if times.shape != (steps,):
-        raise DataError(f"timestamps of shape {times.shape}, {steps} steps", cure=SKIP)
+        raise DataError(f"timestamps of shape {times.shape} for {steps} steps", cure=SKIP)
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise DataError("timestamps do not increase", cure=SKIP)
     return times
@@ -387,7 +387,7 @@ def _lights(
         lane = roads.names.get(light.get("lane", key))
         states = as_list(mapping(light, "state", what).get("object_state"))
         if len(states) != steps:
-            raise DataError(f"{what} has {len(states)} states, {steps} steps", cure=SKIP)
+            raise DataError(f"{what} has {len(states)} states for {steps} steps", cure=SKIP)
         if lane is None or lane not in starts:
             lost["lights_without_lane"] += 1
             continue
@@ -399,7 +399,7 @@ def _lights(
             stop_point[: stops.shape[1]] = stops[0]
         for step, name in enumerate(states):
             state = _state(name)
-            # The first form of the files fills all with zeros where nothing is observed.
+            # The earliest version of the format has zeros wherever nothing is observed.
             is_fill = state == LightState.UNKNOWN and len(points) == steps > 1 and not points[step].any()
             if name is None or is_fill:
                 continue
@@ -409,7 +409,7 @@ def _lights(
 
 
 def _stop_points(light: Mapping[Any, Any], steps: int, what: str) -> Array:
-    """Return stop points (x, y and maybe z): one, or in ``state`` of the first form of the files one per step."""
+    """Return stop points (x, y and maybe z): one, or in ``state`` of the earliest version one per step."""
     stops = light.get("stop_point", light["state"].get("stop_point"))
     points = np.zeros((0, 3)) if stops is None else np.atleast_2d(floats(stops, f"{what}: stop_point"))
     is_plausible = points.shape[1] in (2, 3) and (np.abs(points) < _FARTHEST_M).all()

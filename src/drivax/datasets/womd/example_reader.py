@@ -30,7 +30,7 @@ from drivax.scenario.schema import DT_S, LANE_KINDS, POLYGON_KINDS, Flag, LightS
 
 #: float32 holds every integer below this; larger ids may have been rounded.
 _EXACT = 2**24
-#: Larger median spacings of map points are those of v1.2 and later (1 m instead of 0.5 m), m.
+#: Median spacing of map points above which a file is of v1.2 or later (1 m instead of 0.5 m), m.
 _COARSE_M = 0.75
 _FLAVOUR = "tf.Examples in TFRecord"
 Array = np.ndarray[Any, Any]
@@ -57,7 +57,7 @@ class WomdExample(womd.TfRecordReader):
         notes = [*womd.notes_of(recording), f"no lane graph{limits}: lanes are chained by geometry"]
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append(
-                "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
+                "the list of map points is full, so the map is cut off; the Scenario protos hold all of it"
             )
         if "paths" in recording.lost:
             notes.append("path_samples are not used: routes are computed again")
@@ -75,9 +75,9 @@ class ScenarioMax(womd.TfRecordReader):
     def decode(self, payload: bytes) -> Recording:
         """Return the recording in a serialised tf.Example of ScenarioMax.
 
-        Rows that are never valid are padding. Missing times are 10 Hz; missing velocities (-1 throughout) are
-        differentiated from positions. Lights that are UNKNOWN throughout are dropped: the writer fills with UNKNOWN
-        what it does not know, for some sources also yellow.
+        Rows that are never valid are padding. Without times, steps are 0.1 s apart; missing velocities (-1 throughout)
+        are computed from positions. Lights that are UNKNOWN throughout are dropped: the writer stores what it does not
+        know as UNKNOWN, for some sources also yellow.
         """
         table = features_of(payload)
         all_rows = np.arange(table.numbers("state/id").size)
@@ -101,7 +101,7 @@ class ScenarioMax(womd.TfRecordReader):
             f"{limits} lanes have a speed limit; no lane graph: lanes are chained by geometry",
         ]
         if Flag.TRUNCATED_MAP in recording.flags:
-            notes.append("the list of map points is full, the map is cut off")
+            notes.append("the list of map points is full, so the map is cut off")
         if "paths" in recording.lost:
             notes.append(
                 "path_samples are not used (they were ranked by the log's future): routes are computed again"
@@ -184,8 +184,8 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
 def _timestamps(features: ExampleFeatures, rows: Array, valid: Array) -> Array:
     """Return the time of every step, seconds.
 
-    A step at which no valid state has a time is placed at 10 Hz from the nearest one before it that has a time, else
-    from the first after it; without any time the steps begin at 0.
+    A step at which no valid state has a time is extrapolated at 10 Hz from the last earlier step that has one, else
+    from the first later step; without any time the steps begin at 0.
     """
     micros = np.where(valid, features.over_time("timestamp_micros", rows), -1).max(axis=0, initial=-1)
     steps, known = np.arange(len(micros)), np.flatnonzero((micros >= 0) & np.isfinite(micros))

@@ -108,7 +108,7 @@ def parse(name: str, payload: bytes) -> Any | None:
 
 
 def unknown_fields(message: Any, payload: bytes) -> set[tuple[str, int]]:
-    """Drop the undeclared fields of a message and its parts; return their message and number, read from ``payload``."""
+    """Drop the undeclared fields of a message, nested ones too; return message and number of each in ``payload``."""
     size = message.ByteSize()
     message.DiscardUnknownFields()
     return set() if message.ByteSize() == size else set(_undeclared(message.FromString(payload)))

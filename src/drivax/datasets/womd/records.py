@@ -45,7 +45,7 @@ def format_of(payload: bytes) -> str | None:
 def scenariomax_signs(features: ExampleFeatures) -> int:
     """Count how many of ScenarioMax's three signs an example shows; WOMD's examples show none.
 
-    The signs: the prediction difficulty is missing; the ids of tracks that are valid at the current step are their
+    The signs: the prediction difficulty is missing; the ids of tracks that are valid at the current step equal their
     rows, and the ego is row 0; all times of the current step are negative.
     """
     ids_are_rows = has_no_times = False
@@ -130,7 +130,7 @@ def agent_kind(code: int) -> AgentKind:
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
-    """Return notes for users about a file with this first recording: length, windows or future, lights, frames."""
+    """Return notes for users about a file, from its first recording: length, windows, lights, spacing of frames."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
     if parsing.windows_of(steps) > 1:

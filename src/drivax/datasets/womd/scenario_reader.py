@@ -36,8 +36,8 @@ class WomdScenario(womd.TfRecordReader):
         """Return the recording in a serialised ``Scenario``.
 
         Positions stay in the proto's map frame, metres, float64. Headings are wrapped (files hold up to 10 rad),
-        invalid states are zeros (files keep a z there), speed limits are m/s (0 in the file is unknown). Dangling links
-        are kept.
+        invalid states are zeros (files keep a z there), speed limits are m/s (0 in the file means unknown). Dangling
+        links are kept.
         """
         message = parse("Scenario", payload)
         if message is None or not message.scenario_id:
@@ -93,7 +93,7 @@ def _unknown_fields(message: Any, payload: bytes) -> int:
 
 def _check(message: Any, steps: int) -> None:
     """Refuse a scenario whose counts, indices or ids contradict each other."""
-    if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
+    if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is not UTF-8
         raise DataError("scenario_id is not text", cure=SKIP)
     if steps == 0 or not message.tracks:
         raise DataError("the scenario has no steps or no tracks", cure=SKIP)
@@ -101,7 +101,7 @@ def _check(message: Any, steps: int) -> None:
         raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=SKIP)
     parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
-        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=SKIP)
+        raise DataError(f"{len(message.dynamic_map_states)} light steps for {steps} steps", cure=SKIP)
     ids = set()
     for track in message.tracks:
         if len(track.states) != steps:

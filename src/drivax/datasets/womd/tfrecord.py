@@ -1,4 +1,4 @@
-"""TFRecord files without TensorFlow: framing with both checksums tested.
+"""TFRecord files without TensorFlow: framing, with both checksums verified.
 
 A record is ``uint64 length | uint32 masked CRC of the length | payload | uint32 masked CRC of the payload``, all
 little-endian; the mask rotates a CRC-32C right by 15 bits and adds 0xA282EAD8 (TensorFlow, ``record_writer.h``).

@@ -20,7 +20,7 @@ from drivax.rl.equations import td_target
 
 @dataclass(frozen=True)
 class AwacConfig(AdvantageWeightedConfig):
-    """AWAC. The value that an advantage is relative to is Q of a sampled action, by the critics themselves."""
+    """AWAC. Advantages are relative to the critics' Q of a sampled action, instead of a value network."""
 
     kind: Literal["awac"] = "awac"
     inverse_temperature: float = 1.0

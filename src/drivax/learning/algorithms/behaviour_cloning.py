@@ -115,7 +115,7 @@ class Cloning:
     def _sums(
         self, policy: Distribution, action: Float[Array, "B D"], mask: Bool[Array, " B"]
     ) -> tuple[dict[str, Array], Float[Array, ""]]:
-        """Return the number of steps where ``mask`` holds, with sums of values to log over them, and of the loss."""
+        """Return sums over the steps where ``mask`` holds: their number and values to log, and the loss."""
         error = policy.mode() - action
         is_mse = self.loss == "mse"
         loss = jnp.mean(error**2, axis=-1) if is_mse else -policy.log_prob(policy.raw_action(action))
@@ -158,7 +158,7 @@ class BcConfig(Cloning):
         return self.batch * self.updates
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """Return the data, whose ``demonstrations`` are drawn, or experience: by weight, or of recorded episodes."""
+        """Return the data, to draw ``demonstrations`` from, or, with weights or recorded episodes, the experience."""
         if weights is None and not isinstance(data, RecordedEpisodes) and self.best == 1.0:
             return data
         # The loss masks clipped steps, and logs their share.
@@ -223,7 +223,7 @@ class Bc:
 
 
 def _mean(sums: dict[str, Array], loss: Array, steps: int) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Return the mean loss and values to log, given sums over the unmasked of all ``steps`` steps."""
+    """Return the mean loss and values to log, given sums over those of all ``steps`` steps where the mask holds."""
     share = 1.0 / jnp.maximum(sums["count"], 1.0)
     logs = {
         "imitation": loss * share,

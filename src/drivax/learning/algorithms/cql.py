@@ -46,8 +46,8 @@ class CqlConfig(OfflineConfig):
         penalty_rate: Learning rate of the multiplier.
         actions: Number of actions that the penalty samples from each distribution: uniform, and the current policy.
         next_actions: Also sample the penalty's actions from the policy at the next state.
-        backup_actions: Number of actions sampled at the next state; the highest value (of both critics) is backed
-            up. A single one has a lower value than the expert's action on average, an error that accumulates.
+        backup_actions: Number of actions sampled at the next state; the highest value (of both critics combined) is
+            backed up. A single one has a lower value than the expert's action on average, an error that accumulates.
         importance: Weight sampled actions by their inverse density; if false, add the logged action to the samples.
         penalty_temperature: Temperature of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss

@@ -1,7 +1,7 @@
 """Off-policy evaluation: the return of a policy, estimated from episodes of other policies.
 
 Fitted-Q evaluation needs no probabilities. Importance sampling and the doubly robust estimator also need those of the
-behaviour policy; for recorded drivers, a clone of all episodes stands in for it.
+behaviour policy; for recorded planners, a clone of all episodes stands in for it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class FittedQ:
     def fit(self, data: Experience, act: Act, statistics: Statistics = MappingProxyType({})) -> QFunction:
         """Return Q of a policy: ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))``, learned from logged steps.
 
-        Every call draws the same steps. ``statistics`` normalise the features, if the network does.
+        Every call draws the same steps. ``statistics`` are those of the features, for a network that normalises them.
         """
         network_key, key = jax.random.split(jax.random.key(0))
         actions = Actions(self.environment.action_size, self.environment.levels)
@@ -138,7 +138,7 @@ def estimate_return(
 
     Args:
         environment: Environment of the episodes.
-        data: Episodes, best of other seeds or scenarios than those that trained the policies and Q.
+        data: Episodes, preferably of seeds or scenarios that did not train the policies and Q.
         policy: The evaluated policy.
         behaviour: The policy of the episodes.
         q: Q of the evaluated policy (:meth:`FittedQ.fit`).
@@ -162,8 +162,8 @@ def estimate_return(
         action = expert.action[index]
         target, source = policy(observation), behaviour(observation)
         log_ratio = target.log_prob(target.raw_action(action)) - source.log_prob(source.raw_action(action))
-        most = math.log(MOST_RATIO)
-        ratio = jnp.where(expert.clipped[index], 1.0, jnp.exp(jnp.clip(log_ratio, -most, most)))
+        bound = math.log(MOST_RATIO)
+        ratio = jnp.where(expert.clipped[index], 1.0, jnp.exp(jnp.clip(log_ratio, -bound, bound)))
         keys = jax.random.split(jax.random.key(0), _SAMPLES)
         values = jax.vmap(lambda key: q(observation, target.action(target.sample(key))))(keys)
         return ratio, q(observation, action), values.mean(axis=0)

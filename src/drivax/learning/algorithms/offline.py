@@ -75,9 +75,9 @@ class OfflineConfig:
         batch: Steps per update.
         updates: Updates per iteration.
         gamma: Discount.
-        steps: Length of n-step returns, in decisions (Sutton 1988); those of logged actions, also where the policy
-            would act differently.
-        min_q_weight: Weight of the smaller critic in the value of both; that of the larger one is the rest (Fujimoto et
+        steps: Length of n-step returns, in decisions (Sutton 1988). They are returns of the logged actions, even where
+            the policy would act differently.
+        min_q_weight: Weight of the smaller of the two critics' values; the larger has the remaining weight (Fujimoto et
             al. 2019, arXiv 1812.02900, eq. 13). It applies to targets, advantages and validation. 1 is clipped double
             Q-learning; 0.5, the mean, underestimates less where actions are many and short.
         tau: Polyak averaging rate of target networks.
@@ -353,7 +353,7 @@ class Offline(OffPolicy[Config]):
         rows, last = jnp.arange(len(expert.usable)), expert.usable.shape[1] - 1
         final = jnp.minimum(last - jnp.argmax(expert.usable[:, ::-1], axis=1) + 1, last)
         key = jax.random.key(0)
-        drawn, uniform = (sample_steps(which, key, (_SAMPLES,)) for which in (data.critic, data.uniform))
+        drawn, uniform = (sample_steps(sampler, key, (_SAMPLES,)) for sampler in (data.critic, data.uniform))
         # In one call, because tracing an observation takes long.
         index = jax.tree.map(lambda *sets: jnp.concatenate(sets), drawn, uniform, (rows, final))
         observation = environment.observe_recorded(data.data, index)

@@ -20,14 +20,14 @@ from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.program import device_count, is_largest, sum_over_devices
 
-#: Most samples per chunk and CPU device, so that intermediate results fit the second-level cache.
+#: Largest number of samples per chunk and CPU device, so that intermediate results fit the second-level cache.
 _CHUNK = 64
 
 
 def chunk_size(batch: int) -> int:
     """Return the number of samples whose gradient is computed at a time: on GPUs the whole batch.
 
-    On CPUs it is the largest divisor of the batch with 17 to 64 samples per device, or without one the whole batch.
+    On CPUs it is the largest divisor of the batch with 17 to 64 samples per device; if there is none, the whole batch.
     """
     devices = device_count()
     sizes = range(_CHUNK * devices, _CHUNK * devices // 4, -devices)

@@ -71,13 +71,14 @@ class PpoConfig:
         clip: Clipping range of the probability ratio around 1.
         value_coefficient, entropy_coefficient: Weights in the loss.
         target_kl: Largest KL divergence from the policy that sampled the rollout. A minibatch above it is skipped, with
-            all later ones of the iteration; the learning rate does not decay in them. None: no limit.
+            all later ones of the iteration; skipped ones do not decay the learning rate. None: no limit.
         gradient_norm: Maximum global norm of gradients (None: no clipping), separately for policy and value unless they
             share an encoder.
         average: Decay per iteration of an exponential moving average of the parameters, which is validated and
             exported in place of the newest ones; 0: no average.
-        constraints: Upper limits by penalty of the reward: of its mean sum per episode without its weight, which for a
-            failure that ends the episode is the share of episodes. Lagrange multipliers replace the weights.
+        constraints: Upper limits of costs, by penalty of the reward. A cost is the mean sum of the penalty per episode,
+            divided by its weight; that of a failure that ends the episode is the share of episodes that it ends.
+            Lagrange multipliers replace the weights.
         multiplier_rate: Step size of the multipliers per iteration.
     """
 
@@ -130,8 +131,8 @@ class PpoConfig:
 class PpoState:
     """State of a run: networks, optimiser, environments, key, iteration, and multipliers of constraints.
 
-    ``parameters`` are those of the planner: with ``average``, the moving average of ``trained``, which is None without.
-    ``past`` are those of the older copy in environments of ``environment.PastPolicy``, else None.
+    ``parameters`` are those of the planner: with ``average``, the moving average of ``trained``, which is None without
+    ``average``. ``past`` are the parameters of the older copy of ``environment.PastPolicy``; None if there is none.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters",)
@@ -359,7 +360,7 @@ class Ppo:
 
 
 def _group_size(time: int, minibatches: int) -> int:
-    """Return the number of environments whose steps of a rollout can be divided among minibatches."""
+    """Return the smallest number of environments whose steps of a rollout can be divided equally among minibatches."""
     return minibatches // math.gcd(time, minibatches)
 
 
@@ -375,9 +376,9 @@ def minibatch_order(
 ) -> Int[Array, "minibatch chunk sample"]:
     """Draw the minibatches of an epoch: indices of a flattened rollout of the shape ``[time, environment]``.
 
-    Every minibatch has equally many steps of each environment, or of each group of environments where it cannot.
-    Devices that divide the environments find an equal share of each chunk among their own. The minibatches do not
-    depend on the number of devices, the order of their samples does.
+    Every minibatch has the same number of steps of each environment, or if that is impossible, of each group of
+    environments. Devices that divide the environments find an equal share of each chunk among their own. The number of
+    devices does not change the minibatches, only the order of their samples.
     """
     (time, environments), members = shape, _group_size(shape[0], minibatches)
     groups, count = environments // members, time * members
@@ -407,8 +408,8 @@ def _read_shares(
     environments = batch["log_prob"].shape[1]
 
     def read(share: dict[str, Any], order: Array) -> dict[str, Any]:
-        own = environments // devices
-        return _read(share, order // environments * own + order % own)
+        own_environments = environments // devices
+        return _read(share, order // environments * own_environments + order % own_environments)
 
     return map_over_devices(read, batch, order, in_axes=(1, 2), out_axis=2)
 
@@ -455,7 +456,7 @@ class Constraints:
         """Return constraints in an environment.
 
         Raises:
-            UsageError: The environment's reward has no penalty of a name with a constant weight.
+            UsageError: A name is not that of a penalty with a constant weight in the environment's reward.
         """
         weights = getattr(environment, "penalties", {})
         for name in limits:

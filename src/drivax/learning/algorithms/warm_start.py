@@ -28,7 +28,7 @@ class WarmStart:
     """Settings of pretraining, and of the imitation loss during reinforcement learning.
 
     Attributes:
-        iterations: Iterations of behaviour cloning; each counts as many steps as one that collects rollouts.
+        iterations: Iterations of behaviour cloning; each counts for as many steps as one that collects rollouts.
         cloning: Settings of behaviour cloning.
         settle: Iterations after pretraining in which only values or critics are learned, SAC's warm-up included.
         weight: Weight of the imitation loss during reinforcement learning; 0: none.

@@ -24,8 +24,8 @@ from drivax.scenario.schema import DT_S, AgentKind, LightState
 from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.controller import TrackingConfig
 
-#: Centre of gravity ahead of the rear axle, as a share of the length (nuPlan's vehicle: 1.67 m of 5.176 m).
-_GRAVITY = 1.67 / 5.176
+#: Distance of the centre of gravity from the rear axle, as a share of the length (nuPlan's vehicle: 1.67 m of 5.176 m).
+_COG_SHARE = 1.67 / 5.176
 
 
 class TrackedObjectType(enum.Enum):
@@ -116,7 +116,7 @@ class VehicleParameters(HalfExtents):
     @property
     def cog_position_from_rear_axle(self) -> float:
         """Distance of the centre of gravity from the rear axle."""
-        return _GRAVITY * self.length
+        return _COG_SHARE * self.length
 
 
 @dataclass(frozen=True)

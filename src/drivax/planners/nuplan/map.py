@@ -112,14 +112,14 @@ class NuPlanLane(_Edge):
 
     _interface = "Lane"
 
-    def __init__(self, map_api: MapApi, row: int, points: Points) -> None:
+    def __init__(self, map_api: MapApi, lane_index: int, points: Points) -> None:
         scenario = map_api.scenario
-        self.row, width = row, float(scenario.lane_width[row])
+        self.lane_index, width = lane_index, float(scenario.lane_width[lane_index])
         self.half_width_m = (width if width > 0 else DEFAULT_LANE_WIDTH_M) / 2
-        limit = float(scenario.lane_limit[row])
+        limit = float(scenario.lane_limit[lane_index])
         self.speed_limit_mps = limit if limit > 0 else None
-        name = str(int(scenario.lane_id[row]))
-        super().__init__(map_api, name, bool(scenario.lane_interpolating[row]))
+        name = str(int(scenario.lane_id[lane_index]))
+        super().__init__(map_api, name, bool(scenario.lane_interpolating[lane_index]))
         self.baseline_path = Polyline(name, points)
 
     def _boundary(self, side: int) -> Polyline:
@@ -140,17 +140,18 @@ class NuPlanLane(_Edge):
     @property
     def incoming_edges(self) -> list[NuPlanLane]:
         """Lanes that lead into this lane."""
-        return self._map.lanes_of(self._map.scenario.lane_predecessor[self.row])
+        return self._map.lanes_of(self._map.scenario.lane_predecessor[self.lane_index])
 
     @property
     def outgoing_edges(self) -> list[NuPlanLane]:
         """Lanes that this lane leads into."""
-        return self._map.lanes_of(self._map.scenario.lane_successor[self.row])
+        return self._map.lanes_of(self._map.scenario.lane_successor[self.lane_index])
 
     @property
     def adjacent_edges(self) -> tuple[NuPlanLane | None, NuPlanLane | None]:
         """The neighbours of the same direction, on the left and on the right; None without one."""
-        left, right = self._map.scenario.lane_left[self.row], self._map.scenario.lane_right[self.row]
+        scenario = self._map.scenario
+        left, right = scenario.lane_left[self.lane_index], scenario.lane_right[self.lane_index]
         return self._map.lanes.get(int(left)), self._map.lanes.get(int(right))
 
     @property
@@ -166,9 +167,9 @@ class NuPlanLane(_Edge):
     @property
     def index(self) -> int:
         """Number of lanes to the left, from neighbour to neighbour."""
-        visited, lane = {self.row}, self
-        while (lane := lane.adjacent_edges[0]) is not None and lane.row not in visited:
-            visited.add(lane.row)
+        visited, lane = {self.lane_index}, self
+        while (lane := lane.adjacent_edges[0]) is not None and lane.lane_index not in visited:
+            visited.add(lane.lane_index)
         return len(visited) - 1
 
     def is_left_of(self, other: NuPlanLane) -> bool:
@@ -181,7 +182,7 @@ class NuPlanLane(_Edge):
 
     def get_roadblock_id(self) -> str:
         """Return the id of the roadblock."""
-        return self._map.block_of[self.row]
+        return self._map.block_of[self.lane_index]
 
     def is_same_roadblock(self, other: NuPlanLane) -> bool:
         """Return whether another lane is in the same roadblock."""
@@ -189,7 +190,7 @@ class NuPlanLane(_Edge):
 
     def has_traffic_lights(self) -> bool:
         """Return whether a traffic light controls the lane."""
-        return int(self._map.scenario.lane_light[self.row]) >= 0
+        return int(self._map.scenario.lane_light[self.lane_index]) >= 0
 
     @cached_property
     def polygon(self) -> Any:
@@ -278,15 +279,15 @@ class MapApi(DevkitObject):
         origin = np.asarray(scenario.origin, np.float64)[:2]
         is_connector = scenario.lane_interpolating
         self.lanes = {
-            row: (NuPlanLaneConnector if is_connector[row] else NuPlanLane)(self, row, points + origin)
-            for row, points in enumerate(lines)
+            index: (NuPlanLaneConnector if is_connector[index] else NuPlanLane)(self, index, points + origin)
+            for index, points in enumerate(lines)
             if len(points)
         }
         first_lanes = roadblocks(scenario)
-        self.block_of = {row: str(int(scenario.lane_id[first_lanes[row]])) for row in self.lanes}
+        self.block_of = {index: str(int(scenario.lane_id[first_lanes[index]])) for index in self.lanes}
         lanes_by_block: dict[str, list[NuPlanLane]] = {}
-        for row, lane in self.lanes.items():
-            lanes_by_block.setdefault(self.block_of[row], []).append(lane)
+        for index, lane in self.lanes.items():
+            lanes_by_block.setdefault(self.block_of[index], []).append(lane)
         self.blocks = {
             name: (NuPlanRoadBlockConnector if lanes[0].is_connector else NuPlanRoadBlock)(self, name, lanes)
             for name, lanes in lanes_by_block.items()
@@ -297,9 +298,9 @@ class MapApi(DevkitObject):
         """Name of the place, or of the data set."""
         return self.scenario.tags.get("location", self.scenario.text("dataset"))
 
-    def lanes_of(self, rows: Iterable[Any]) -> list[NuPlanLane]:
-        """Return the lanes at rows of the lane graph, without lanes that have no centre line."""
-        return [self.lanes[int(row)] for row in rows if int(row) in self.lanes]
+    def lanes_of(self, indices: Iterable[Any]) -> list[NuPlanLane]:
+        """Return the lanes at indices of the lane graph, without lanes that have no centre line."""
+        return [self.lanes[int(index)] for index in indices if int(index) in self.lanes]
 
     def get_available_map_objects(self) -> list[SemanticMapLayer]:
         """Return the layers that are not empty."""

@@ -230,8 +230,9 @@ class View:
             PlannerError: The scenario has no route on lanes.
         """
         scenario, count = self.scenario, int(self.scenario.route_points[0])
-        rows = dict.fromkeys(int(row) for row in scenario.route_lane[0, :count] if int(row) in self.map.lanes)
-        blocks = [self.map.block_of[row] for row in rows]
+        indices = map(int, scenario.route_lane[0, :count])
+        lanes = dict.fromkeys(index for index in indices if index in self.map.lanes)
+        blocks = [self.map.block_of[index] for index in lanes]
         route = [name for k, name in enumerate(blocks) if k == 0 or name != blocks[k - 1]]
         if not route:
             raise PlannerError(f"scenario {scenario.text('scenario_id')} has no route")
@@ -334,7 +335,7 @@ class View:
         now = nuplan.TimePoint.of_step(step).time_s
         if times[0] > now + _LATE_S or times[-1] <= now:
             raise PlannerError(
-                f"the trajectory from {times[0]:g} to {times[-1]:g} s does not go on from now, {now:g} s"
+                f"the trajectory from {times[0]:g} to {times[-1]:g} s does not continue from now, {now:g} s"
             )
         if (np.diff(times) <= 0).any():
             raise PlannerError("the times of the trajectory do not increase")

@@ -55,7 +55,7 @@ class DevkitObject:
     """Base of classes that pass ``isinstance`` for a class of the devkit: ``__class__`` is that class, if imported."""
 
     def devkit_names(self) -> tuple[str, ...]:
-        """Return names of the devkit's classes, the first choice first."""
+        """Return names of the devkit's classes, in order of preference."""
         return (type(self).__name__,)
 
     @property
@@ -87,7 +87,7 @@ class Point2D(DevkitObject):
 
 @dataclass(frozen=True)
 class StateVector2D(Point2D):
-    """A vector along and across the car's heading, or of an object in the source's frame."""
+    """A vector: of ego along and across its heading, of other objects in the source's frame."""
 
     def magnitude(self) -> float:
         """Length of the vector."""

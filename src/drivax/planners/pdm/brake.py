@@ -25,8 +25,8 @@ from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, Motion, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical, Route, Trajectory
 
-#: Number of agents to consider, those nearest to the path, and their largest distance from ego, m.
-_OTHERS, _RADIUS_M = 24, 50.0
+#: Maximum number of agents to consider (those nearest to the path), and their maximum distance from ego, m.
+_MAX_AGENTS, _RADIUS_M = 24, 50.0
 #: Stride of the forecast motions that form the path.
 _STRIDE = 5
 #: Factor on the speed of the plan that brakes a car in the action space ``trajectory``, as published.
@@ -81,7 +81,7 @@ def stop(
     """Return the action that brakes straight ahead; for the space ``route``, an action of :class:`Physical`.
 
     In the action space ``trajectory``, the plan has a constant speed, as published: ``1.1 (v + a)`` m/s if ego drives
-    faster than ``slow_mps``, else ``a``. A negative speed leads backwards; the car, which cannot reverse, then stops.
+    faster than ``slow_mps``, else ``a``. A plan of negative speed leads backwards; the car, unable to reverse, stops.
     """
     if not isinstance(actions, Trajectory):
         return actions.action(motion, acceleration, jnp.zeros(()), length_m)
@@ -95,8 +95,8 @@ def stop(
 class EmergencyBrake:
     """Wrap a planner: brake if its action leads to an at-fault collision.
 
-    The forecast holds the action constant, in the space ``route`` its curvature; in the space ``trajectory``, it
-    follows the plan exactly. In ``direct_state``, where an action is a single motion, ego stays at it. Other agents
+    The forecast holds the action constant (in the space ``route``, its curvature); in the space ``trajectory``, it
+    follows the plan exactly. In ``direct_state``, where an action is a single motion, ego stays there. Other agents
     keep their velocities; agents that already touch ego are ignored.
 
     Attributes:
@@ -138,7 +138,7 @@ class EmergencyBrake:
         steered_action = space.steer(bank, context, action) if space else action
         path = self._forecast(motion, steered_action, context.action, box[LENGTH])
         is_touching = overlaps(frame, context.slot)
-        others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _OTHERS, _RADIUS_M)
+        others = Forecast.of(frame, context.slot, is_touching, path[::_STRIDE, :2], _MAX_AGENTS, _RADIUS_M)
         # The lanes at the present pose stand for those along the path.
         is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
         fault_s = jnp.min(Contacts.along(path, box[LENGTH : WIDTH + 1], others).fault_times(is_unlawful))

@@ -89,7 +89,7 @@ class Contacts:
 
     @classmethod
     def along(cls, motion: Float[Array, "T 4"], size: Vector, others: Forecast) -> Contacts:
-        """Find the first overlap with each agent; ``simulator.contact.classify_contacts`` decides its fault."""
+        """Find the first overlap with each agent, and whose fault it is (``simulator.contact.classify_contacts``)."""
         steps = jnp.arange(motion.shape[0])
         is_touching = overlapping(motion, size, others)
         first = jnp.min(jnp.where(is_touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)

@@ -54,10 +54,10 @@ class Ground:
 def ground_at(
     bank: ScenarioBank, row: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
-    """Return the position of ego's box at a hypothetical pose, on ground of height ``z``, relative to lanes and road.
+    """Return the position of ego's box at a hypothetical pose, relative to lanes and road.
 
-    ``row`` is that of the route. If it is not on lanes, or beyond its end (not ``on_route``), only wrong-way driving is
-    astray.
+    ``z`` is the height of the ground (m), and ``row`` the row of the route. If the route is not on lanes, or if ego is
+    beyond its end (not ``on_route``), only wrong-way driving is astray.
     """
     index, points = bank.scenario_of(row), corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z, row=row)
@@ -71,7 +71,7 @@ def ground_along(
     bank: ScenarioBank, row: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], needs_lanes: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
-    """Return :func:`ground_at` along N motions from one pose.
+    """Return :func:`ground_at` along N motions that start at the same pose.
 
     Every ``every``-th step (a divisor of T - 1) is looked up; the steps between use the next look-up. A step that does
     not need lanes may count as being in a single lane.

@@ -43,9 +43,9 @@ PUBLISHED_DRIVER = IdmParameters(1.0, 1.5, 1.5, 3.0, exponent=10.0, max_braking_
 _PATH_STRIDE = 5
 #: Points of a line, 1 m apart: what a car on a motorway passes in 4 s, and more ahead of it.
 _POINTS = 160
-#: Length of the boxes that form a corridor, and stride of the route points on which agents are projected, m.
+#: Length of the boxes that form a corridor, and stride of the route points onto which agents are projected, m.
 _PIECE_M, _STRIDE = 4, 2
-#: Curvature at a point is measured between the points this far before and after it.
+#: Curvature at a point is measured between the points this many metres before and after it.
 _REACH = 2
 #: Gap of a free road, m.
 _FREE_M = 1e4
@@ -205,16 +205,16 @@ def unroll_idm(
     """Simulate IDM along every line, from ego's speed to each desired speed (m/s), by Euler steps of 0.1 s.
 
     ``updates`` has the steps at which the leader is updated, and stops after the last step of the simulation. The
-    leader is, of the agents whose box reaches into the corridor of ego's width and whose centre is ahead, the one
-    nearest to ego's box. Its gap shrinks by ego's motion until the next update. ``stop_m`` is the distance from ego's
-    front to the nearest stop line that requires a stop, infinite for none.
+    leader is the agent nearest to ego's box among those whose box reaches into the corridor of ego's width and whose
+    centre is ahead. The gap shrinks by ego's motion until the next update. ``stop_m`` is the distance from ego's front
+    to the nearest stop line that requires a stop, infinite for none.
     """
-    count = lines.points.shape[0], desired.shape[0]
+    shape = lines.points.shape[0], desired.shape[0]
     boxes = others.at(jnp.arange(0, updates.stop, updates.step) * DT_S)
     is_inside = _on_corridor(lines.corridors(size[1]), boxes) & others.valid
     distances = lines.route_distances(boxes[..., :2])
     stop_along_m = stop_m + size[0] / 2
-    length, width = (jnp.full(count, extent) for extent in size)
+    length, width = (jnp.full(shape, extent) for extent in size)
 
     def follow_leader(state: tuple[Array, Array], forecast: tuple[Array, ...]) -> Any:
         """Find the leader of each proposal, and follow it until the next update."""
@@ -241,13 +241,13 @@ def unroll_idm(
             states.append((arc_m, speed))
         return (arc_m, speed), jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
 
-    start = jnp.zeros(count), jnp.full(count, speed)
+    start = jnp.zeros(shape), jnp.full(shape, speed)
     forecasts = (boxes, distances, jnp.moveaxis(is_inside, 1, 0))
     _, states = jax.lax.scan(follow_leader, start, forecasts)
 
     def join_steps(first: Array, rest: Array) -> Array:
         """Return the values at all steps along the last axis."""
-        rest = jnp.moveaxis(rest.reshape(-1, *count), 0, -1)
+        rest = jnp.moveaxis(rest.reshape(-1, *shape), 0, -1)
         return jnp.concatenate([first[..., None], rest], axis=-1)
 
     return Proposals(*(join_steps(first, rest) for first, rest in zip(start, states, strict=True)))
@@ -291,7 +291,7 @@ class PdmPlanner:
     replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
-        """Return a carry without touched agents; acceleration and steering from the last half second."""
+        """Return a carry without touched agents, with the acceleration and steering of the last half second."""
         context = state.context
         length_m = jnp.maximum(bank.length_m(context.index, context.slot), 1.0)
         actuators = recent_actuators(context.history, length_m, self.config.tracking)

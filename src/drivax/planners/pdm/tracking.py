@@ -1,9 +1,9 @@
 """Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
 The tracker is that of ``simulator.controller``. The car moves as in the simulator, so the first step of a tracked
-proposal equals the executed one if the action space can express it: by ``simulator.dynamics.bicycle``, along the speeds
-and curvatures of a proposal, or, in the action space ``trajectory``, about its rear axle, along speeds and curvatures
-that are fitted to the plan.
+proposal equals the executed one if the action space can express it. The car moves by ``simulator.dynamics.bicycle`` and
+tracks the speeds and curvatures of the proposal; in the action space ``trajectory``, it turns about its rear axle and
+tracks speeds and curvatures that are fitted to the plan.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def step_car(
 ) -> Car:  # fmt: skip
     """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error.
 
-    ``about_axle`` selects the car of the action space ``trajectory``, which turns by the present steering angle.
+    The command has an ``acceleration`` (m/s2) and a steering ``rate`` (rad/s). ``about_axle`` selects the car of the
+    action space ``trajectory``, which turns by the present steering angle.
     """
     gains = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
     acceleration = car.acceleration + gains[0] * (acceleration - car.acceleration)

@@ -417,7 +417,7 @@ def write_tables(
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, the set is not the evaluated one, or a file
             in ``out`` is a symbolic link.
-        UsageError: A file exists, no run is an evaluation, or no run has one of the metrics.
+        UsageError: A file exists without ``overwrite``, no run is an evaluation, or no run has one of the metrics.
     """
     texts = {}
     for table in _tables(read_evaluations(runs), data, metrics):

@@ -62,8 +62,8 @@ def write_videos(
     Raises:
         DataError: A run folder or the scenario set is missing or damaged, the set is not the evaluated one, or a file
             in ``out`` is a symbolic link.
-        UsageError: A file exists, ``which`` or the theme is invalid, the scenario has no episode, or a package is not
-            installed.
+        UsageError: A file exists without ``overwrite``, ``which`` or the theme is invalid, the scenario has no episode,
+            or a package is not installed.
     """
     evaluations = read_evaluations(runs)
     groups = _select_episodes(evaluations, which)

@@ -52,6 +52,8 @@ BEYOND_M, SIDE_BY_SIDE_M, MERGE_M = 0.3, 2.0, 100.0
 _FAR = 1e9
 #: Points in the window of a projection on a route, and those behind the last known arc length.
 _WINDOW, _WINDOW_BEHIND = 40, 6
+#: Largest distance ahead of that arc length at which a projection lies in the window, m.
+_WINDOW_AHEAD_M = 33.0
 
 
 def left_of_edges(
@@ -243,7 +245,7 @@ def _xla_lanes(
 def _native_lanes(
     bank: ScenarioBank, index: Integer, box: bindings.Box, routed: bool | Bool[Array, ""], row: Any
 ) -> LaneHits:
-    """Return :func:`around_lanes` by the native kernel."""
+    """Return the result of :func:`around_lanes`, computed by the native kernel."""
     lanes = bindings.query_lanes(
         _lane_grid(bank), bank.map_box, jnp.asarray(index, jnp.int32), box,
         jnp.asarray(bank.ego_number(row), jnp.int32), jnp.asarray(routed), _LANE_RULES,
@@ -355,7 +357,7 @@ def _native_offroad_distance(
     bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "4 2"],
     points_near_lane: Bool[Array, "4"], z: Scalar,
 ) -> Float[Array, "4"]:  # fmt: skip
-    """Return :func:`offroad_distance` by the native kernel."""
+    """Return the result of :func:`offroad_distance`, computed by the native kernel."""
     return bindings.query_edges(
         _edge_grid(bank), bank.grid_side, jnp.asarray(index, jnp.int32), centre, points, points_near_lane, z,
         _EDGE_RULES,
@@ -425,7 +427,7 @@ class RouteHit:
 
 
 def project_on_route(
-    bank: ScenarioBank, row: Integer, xy: Vector, near_m: Scalar, ahead_m: float | Scalar = 33.0
+    bank: ScenarioBank, row: Integer, xy: Vector, near_m: Scalar, ahead_m: float | Scalar = _WINDOW_AHEAD_M
 ) -> RouteHit:
     """Project a point on the route of a row, from 6 m behind to ``ahead_m`` ahead of its last known arc length.
 
@@ -437,7 +439,7 @@ def project_on_route(
 
 def project_on_path(
     routes: Float[Array, "M R 7"], points: Int[Array, " M"], row: Integer, xy: Vector, near_m: Scalar,
-    ahead_m: float | Scalar = 33.0,
+    ahead_m: float | Scalar = _WINDOW_AHEAD_M,
 ) -> RouteHit:  # fmt: skip
     """Project a point as :func:`project_on_route`, on a row of M paths (:class:`RouteColumn`).
 

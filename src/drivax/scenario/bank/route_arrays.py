@@ -96,7 +96,7 @@ def _stop_arcs(
     records: Sequence[_Record], ego: int, lane: Int[np.ndarray, "n light"],
     middle: Float[np.ndarray, "n light 2"],
 ) -> Float[np.ndarray, "n light"]:  # fmt: skip
-    """Return the arc length along an ego's route of the stop lines of its lanes, ``NEVER_M`` for other lanes."""
+    """Return arc lengths (m) along an ego's route of the stop lines on its lanes; ``NEVER_M`` for all others."""
     arcs = np.full(lane.shape, NEVER_M)
     count, route_lane = (of_ego(records, f"route_{name}", ego, 0) for name in ("points", "lane"))
     on_route = np.zeros((len(records), 2 + max(int(lane.max()), int(route_lane.max()))), bool)

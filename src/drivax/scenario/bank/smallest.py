@@ -1,7 +1,8 @@
 """``argmin`` as a single reduction that vectorises on CPUs.
 
-The low bits of every float hold its index. Two reductions, for the minimum and for the index that equals it, are wrong
-under XLA: it may compute the values again for the second one with other rounding, and then none equals the minimum.
+The low bits of every float hold its index. Two reductions, for the minimum and for the index of the value that equals
+it, are wrong under XLA: it may compute the values again for the second one with other rounding, and then none equals
+the minimum.
 """
 
 from __future__ import annotations

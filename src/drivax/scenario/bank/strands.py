@@ -36,11 +36,11 @@ _SLACK_M = 1.0
 
 
 def lane_strands(records: Sequence[Array]) -> Float32[np.ndarray, "n lane 6"]:
-    """Return the tables :class:`StrandColumn` of scenarios, a row per stored lane.
+    """Return the strand tables of scenarios (:class:`StrandColumn`), a row per stored lane.
 
-    A strand is named by its last lane, or by the highest lane of a ring. It merges if its last lane leads onto another
-    strand at a small angle (a ramp, two lanes that join), or ends next to a lane that continues (a lane drop). Turns
-    that join a lane at a junction do not merge.
+    The index of a strand is that of its last lane, or the highest of a ring. A strand merges if its last lane leads
+    onto another strand at a small angle (a ramp, two lanes that join), or ends next to a lane that continues (a lane
+    drop). Turns that join a lane at a junction do not merge.
     """
     lanes = _Lanes.of(records)
     tables = np.full((*lanes.mask.shape, 6), -1.0, np.float32)
@@ -61,7 +61,7 @@ def _strand_rows(records: Sequence[Array], lanes: _Lanes) -> Float[Array, "lane 
     # values are masked.
     continuation = np.where((next_lane >= 0) & (previous_lane[next_lane] == lane), next_lane, -1)
     strand, last = _strands(continuation)
-    # A lane whose successor continues another lane (its rival) merges onto that strand if both come from one direction.
+    # A lane whose successor continues another lane (its rival) merges onto that strand if their earlier headings agree.
     rival = np.where((next_lane >= 0) & (continuation < 0), previous_lane[next_lane], -1)
     merges = (rival >= 0) & (np.abs(wrap(courses.before - courses.before[rival])) <= _MERGING_RAD)
     onto = np.where(merges, strand[next_lane], -1)
@@ -115,7 +115,7 @@ class _Lanes:
         return np.where(link >= 0, link + first, -1)
 
     def index(self, lane: Int[Array, " lane"]) -> Int[Array, " lane"]:
-        """Turn indices in the sequence into indices in the scenario: entry i is for lane i's scenario; -1 for none."""
+        """Convert sequence indices to indices in a scenario, for entry i that of lane i; -1 for none."""
         return np.where(lane >= 0, lane - self.first[self.scenario], -1)
 
 
@@ -149,7 +149,7 @@ class _Courses:
         return cls(begin, end, wrap(after - begin) / stretch, wrap(end - before) / stretch, before, stop)
 
     def turn(self, lane: Int[Array, "*n"], onto: Int[Array, "*n"]) -> Float[Array, "*n"]:
-        """Turn and change of curvature from a lane onto another, rad over 20 m."""
+        """Turn from a lane onto another plus the change of curvature over 20 m, rad."""
         turn = np.abs(wrap(self.begin[onto] - self.end[lane]))
         return turn + _BEND_M * np.abs(self.early[onto] - self.late[lane])
 
@@ -203,7 +203,7 @@ class _Segments:
 
 
 def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
-    """Link of each lane with the smallest turn, the first if several are equal to 0.01 rad or unknown; -1 for none."""
+    """Link of each lane with the smallest turn, the first of several within 0.01 rad or all unknown; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN_TURN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
 
@@ -232,7 +232,7 @@ def _is_map_known(
 def corridor_lanes(
     records: Sequence[Array], route: Int[np.ndarray, "n point"], count: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, "n lane"]:
-    """Mask of lanes of a route and of their same-direction neighbours (at any distance sideways).
+    """Mask of lanes of a route and of their same-direction neighbours, however many lanes away.
 
     ``route`` holds the lane of each of ``count`` points of the route, -1 for none.
     """

@@ -317,22 +317,23 @@ def _select_lanes(
     These are the lanes with a segment in the crop, whose features ``feature`` holds. Lanes of routes come first, then
     those for cars, then others, the nearest to ``path`` first.
     """
-    rows = np.flatnonzero(np.isin(graph.feature, feature))
+    lanes = np.flatnonzero(np.isin(graph.feature, feature))
     distance = np.full(graph.count, np.inf)
     np.minimum.at(distance, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
     not_for_cars, off_route = ~among(graph.kind, CAR_LANE_KINDS), ~np.isin(np.arange(graph.count), on_route)
-    order = rows[np.lexsort((distance[rows], not_for_cars[rows], off_route[rows]))]
-    return np.sort(order[:most]), max(len(rows) - most, 0)
+    order = lanes[np.lexsort((distance[lanes], not_for_cars[lanes], off_route[lanes]))]
+    return np.sort(order[:most]), max(len(lanes) - most, 0)
 
 
 def _select_polylines(
     roads: RoadLines, grid: GridSegments, path: Float[Array, "step 2"], most: int
 ) -> tuple[Int[Array, " polyline"], int]:
     """Return the nearest polylines with a stored segment, and the number that did not fit."""
-    rows = np.unique(grid.segments.polyline)
+    polylines = np.unique(grid.segments.polyline)
     distance = np.full(roads.lines.count, np.inf)
     np.minimum.at(distance, grid.segments.polyline, path_distance(grid.segments.middle, path))
-    return np.sort(rows[np.argsort(distance[rows], kind="stable")[:most]]), max(len(rows) - most, 0)
+    nearest = polylines[np.argsort(distance[polylines], kind="stable")[:most]]
+    return np.sort(nearest), max(len(polylines) - most, 0)
 
 
 def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteSet:

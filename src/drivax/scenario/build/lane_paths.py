@@ -114,7 +114,7 @@ class LaneSearch:
         """
         complete: dict[tuple[int, ...], LanePath] = {}
         serial = count()  # orders paths of equal cost: the earlier first
-        heap = [(self._urgency(lane_path), next(serial), lane_path) for lane_path in self.starts]
+        heap = [(self._priority(lane_path), next(serial), lane_path) for lane_path in self.starts]
         heapq.heapify(heap)
         for _ in range(MOST_EXPANSIONS):
             if not heap or len(complete) >= most:
@@ -124,7 +124,7 @@ class LaneSearch:
             if not self.goes_on(children):
                 complete.setdefault(self._signature(lane_path), lane_path)
             for child in children:
-                heapq.heappush(heap, (self._urgency(child), next(serial), child))
+                heapq.heappush(heap, (self._priority(child), next(serial), child))
         return list(complete.values())
 
     def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[LanePath]:
@@ -172,7 +172,7 @@ class LaneSearch:
         """Distance from the ego to the end of a path, metres."""
         return lane_path.ahead + float(self.graph.lines.length[lane_path.lanes[-1]])
 
-    def _urgency(self, lane_path: LanePath) -> float:
+    def _priority(self, lane_path: LanePath) -> float:
         """Sort key of a path in the search: its cost and a tenth of its missing length, the smallest first."""
         return lane_path.penalty + EAGERNESS * max(self.need_m - self.reach(lane_path), 0.0)
 

@@ -167,8 +167,8 @@ def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str
 
 def end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
     """Return the headings at the first and at the last point of every lane."""
-    row = np.arange(lines.count)
-    return lines.heading(row, np.zeros(lines.count), END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
+    lane, begin = np.arange(lines.count), np.zeros(lines.count)
+    return lines.heading(lane, begin, END_SPAN_M), lines.heading(lane, lines.length, END_SPAN_M)
 
 
 def _source_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list[tuple[int, int]]:
@@ -185,13 +185,13 @@ def _geometric_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) ->
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
     bike = kind == RoadKind.LANE_BIKE
     pairs: list[tuple[int, int]] = []
-    for row in range(0, lines.count, _CHUNK):  # maps of thousands of lanes would need gigabytes at once
-        part = slice(row, row + _CHUNK)
+    for offset in range(0, lines.count, _CHUNK):  # maps of thousands of lanes would need gigabytes at once
+        part = slice(offset, offset + _CHUNK)
         gap = np.hypot(*np.moveaxis((last[part, None] - first[None])[..., :2], -1, 0))
         level = np.abs(last[part, None, 2] - first[None, :, 2]) < LEVEL_M
         bend = np.abs(wrap(end[part, None] - begin[None]))
         fits = (gap <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[part, None] == bike[None])
-        pairs += [(int(i) + row, int(j)) for i, j in np.argwhere(fits) if i + row != j]
+        pairs += [(int(i) + offset, int(j)) for i, j in np.argwhere(fits) if i + offset != j]
     return pairs
 
 
@@ -260,16 +260,16 @@ def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tupl
     return interior, distance, position * length[b][:, None] - arc
 
 
-def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
+def select(graph: LaneGraph, lanes: Int[Array, " selection"]) -> LaneGraph:
     """Return the graph of these lanes with new dense indices and at most four links per lane and direction.
 
     Links to other lanes are not counted: they lead out of the crop, or to lanes that are counted as not fitting.
     """
     new_index = np.full(graph.count + 1, -1)  # the last entry is that of -1
-    new_index[rows] = np.arange(len(rows))
-    lines = [graph.lines.line(i) for i in rows]
+    new_index[lanes] = np.arange(len(lanes))
+    lines = [graph.lines.line(i) for i in lanes]
     successor, predecessor = (
-        _compact(new_index[links[rows]]) for links in (graph.successor, graph.predecessor)
+        _compact(new_index[links[lanes]]) for links in (graph.successor, graph.predecessor)
     )
     per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
     return replace(
@@ -278,9 +278,9 @@ def select(graph: LaneGraph, rows: Int[Array, " selection"]) -> LaneGraph:
         successor=successor[:, :LINKS],
         predecessor=predecessor[:, :LINKS],
         dropped_links=int((successor[:, LINKS:] >= 0).sum() + (predecessor[:, LINKS:] >= 0).sum()),
-        left=new_index[graph.left[rows]],
-        right=new_index[graph.right[rows]],
-        **{name: getattr(graph, name)[rows] for name in per_lane},
+        left=new_index[graph.left[lanes]],
+        right=new_index[graph.right[lanes]],
+        **{name: getattr(graph, name)[lanes] for name in per_lane},
     )
 
 
@@ -454,8 +454,8 @@ def _arc_at(
 ) -> Float[Array, " light"]:
     """Arc length on each lane of the point nearest to its stop point."""
     result = np.zeros(len(lane))
-    for i, (row, point) in enumerate(zip(lane, xy, strict=True)):
-        line, arc = graph.lines.line(row)[:, :2], graph.lines.arc[graph.lines.start[row] :]
+    for i, (lane_index, point) in enumerate(zip(lane, xy, strict=True)):
+        line, arc = graph.lines.line(lane_index)[:, :2], graph.lines.arc[graph.lines.start[lane_index] :]
         distance, along = point_to_segment(point, line[:-1], line[1:])
         best = distance.argmin()
         result[i] = arc[best] + along[best] * (arc[best + 1] - arc[best])
@@ -465,7 +465,8 @@ def _arc_at(
 def _heading_near(lane_segments: LaneSegments, stop: Float[Array, "3"]) -> float:
     """Heading of the nearest lane segment on the level of a stop point, NaN without one in reach.
 
-    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level: it may have the height of the lamp.
+    If the lanes differ by at most :data:`LEVEL_M` in height, all are on its level: the stop point may be at the
+    height of the lamp.
     """
     a, b = lane_segments.segments.a, lane_segments.segments.b
     if len(a) == 0:

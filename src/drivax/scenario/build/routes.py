@@ -54,7 +54,7 @@ TURN_RAD = np.deg2rad(30.0)
 CHANGE_WEIGHT, TURN_WEIGHT, LENGTH_WEIGHT, CURVATURE_WEIGHT = -0.3, -0.2, 0.1, -0.1
 #: Distance between the points of a route.
 SPACING_M = 1.0
-#: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
+#: Candidates reach this far ahead, or farther if the present speed carries farther in ``AHEAD_S``.
 AHEAD_M, AHEAD_S = 200.0, 12.0
 #: Routes begin this far behind the driven path and go on this far past the goal, straight on where the map ends.
 BEHIND_M, PAST_GOAL_M = 20.0, 50.0
@@ -206,9 +206,9 @@ def published_paths(search: LaneSearch) -> list[LanePath]:
 
 
 def score(search: LaneSearch, lane_path: LanePath) -> float:
-    """-0.3 lane changes - 0.2 turns + 0.1 length - 0.1 curvature.
+    """Return the published score: -0.3 lane changes - 0.2 turns + 0.1 length - 0.1 curvature.
 
-    Lane changes and turns (lanes whose heading changes by more than 30 degrees from end to end) are numbers, the length
+    Lane changes and turns (lanes whose heading changes by more than 30 degrees from end to end) are counted, the length
     ahead of the ego is in metres, and curvature is the heading change of all lanes from end to end per metre of that
     length, rad/m. With these units a metre of length outweighs most of the rest, as published.
     """

@@ -30,7 +30,7 @@ Array = np.ndarray[Any, Any]
 LONGEST_M = 3.99
 #: Tolerance of simplification, and the weight of heights in it: 20 cm count as 5 cm in the plane.
 TOLERANCE_M, Z_WEIGHT = 0.05, 0.25
-#: Largest gap between the first and last point of a closed ring, and its fewest points, the first twice.
+#: Largest gap between the ends of a closed ring, and its least number of points, the first counted twice.
 CLOSED_M, _RING_POINTS = 0.05, 4
 #: Shorter polylines are dropped.
 _LEAST_LENGTH_M = 1e-3

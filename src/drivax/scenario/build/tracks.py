@@ -37,7 +37,7 @@ DEFAULT_SIZES = {
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
 #: Smaller and larger measurements of a size are ignored.
 LEAST_SIZE_M, MOST_SIZE_M = 1e-3, 100.0
-#: Sort keys, larger than all distances: of tracks that are never valid with the ego, and the lead of preferred ones.
+#: Sort key of tracks never valid together with the ego, and bonus of preferred tracks; larger than all distances.
 _UNRELATED_M, _PREFERENCE_M = 1e6, 1e7
 
 

@@ -25,9 +25,9 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.select.tags import TAGS
 from drivax.seal import check_seal
 
-#: Most missing names in an error message.
+#: Largest number of missing names in an error message.
 _MOST_NAMES = 3
-#: Most lines of a file of names; each takes 200 bytes of memory.
+#: Largest number of lines in a file of names; each takes 200 bytes of memory.
 _MOST_LINES = 4_000_000
 _NAME_FILE = "give a file with one scenario id per line"
 _Kind = Literal["number", "truth", "word"]
@@ -40,7 +40,7 @@ _NAMES = ("dataset", "segment", "scenario_id")
 #: Tags that take any words of the source; several words are joined by ``|``.
 _OPEN_TAGS = ("place", "location", "scenario_types", "source_format", "domain", "family", "event")
 _MAP_FEATURES = ("lane", "road_line", "road_edge", "crosswalk", "speed_bump", "stop_sign", "driveway")
-#: Counts of the source before capping, by their path in a manifest entry.
+#: Path of each count in a manifest entry: counts of the source before capping, and stored segments.
 _COUNTS: Mapping[str, tuple[str, ...]] = {
     "agents": ("source", "tracks_valid_now"),
     **{name: ("source", name) for name in ("steps", "tracks", "tracks_valid_now", "map_points", "lights")},
@@ -131,22 +131,22 @@ class Filter:
         """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison."""
         match = _FILTER.fullmatch(text)
         if match is None or match[3].startswith("="):
-            raise _refusal(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
+            raise _filter_error(text, "is not a filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
         name, sign, words = match[1], match[2], tuple(word.strip() for word in match[3].split("|"))
         quantity = _find_quantity(text, name)
         if not all(words):
-            raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
+            raise _filter_error(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
         if sign in _COMPARISONS and quantity.kind != "number":
-            raise _refusal(text, f"{name} cannot be compared by {sign}", "use = or !=")
+            raise _filter_error(text, f"{name} cannot be compared by {sign}", "use = or !=")
         if sign in _COMPARISONS and len(words) > 1:
-            raise _refusal(text, f"a list cannot be compared by {sign}", f"give one number after {sign}")
+            raise _filter_error(text, f"a list cannot be compared by {sign}", f"give one number after {sign}")
         if name == "flag":
             words = tuple(word.upper() for word in words)
         values = tuple(_value(text, name, quantity, word) for word in words)
         if len({isinstance(value, str) for value in values}) > 1:
-            raise _refusal(text, "mixes words and numbers", "write two filters or ask for one of them")
+            raise _filter_error(text, "mixes words and numbers", "write two filters or ask for one of them")
         if sign in _COMPARISONS and isinstance(values[0], str):
-            raise _refusal(text, f"{values[0]!r} is not a number", f"give a number after {sign}")
+            raise _filter_error(text, f"{values[0]!r} is not a number", f"give a number after {sign}")
         return cls(text, name, sign, values)
 
     def matches(self, entry: Mapping[str, Any]) -> bool:
@@ -199,7 +199,10 @@ class Selection:
     def unknown(self, entries: Iterable[Mapping[str, Any]]) -> dict[str, int]:
         """Return the nonzero numbers of scenarios without the value of a filter, by filter."""
         all_entries = list(entries)
-        counts = {rule.text: sum(rule.find(entry) is None for entry in all_entries) for rule in self.filters}
+        counts = {
+            condition.text: sum(condition.find(entry) is None for entry in all_entries)
+            for condition in self.filters
+        }
         return {text: count for text, count in counts.items() if count}
 
 
@@ -250,7 +253,7 @@ def select_scenarios(
     by_name = _rows_by_name(data, names) if names else None
     rows = [row for row in selection.rows(data.entries) if by_name is None or row in by_name]
     if not rows:
-        raise _nothing_left(data, selection)
+        raise _empty_error(data, selection)
     return rows[:limit]
 
 
@@ -266,7 +269,7 @@ def read_names(file: Path) -> list[_Name]:
         raise DataError(f"has more than {_MOST_LINES:,} lines", file=file, cure=_NAME_FILE)
     # Not splitlines(): ids may contain other line breaks of Unicode.
     lines = content.split("\n")
-    return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
+    return [_Name(text, file, number) for number, line in enumerate(lines, start=1) if (text := line.strip())]
 
 
 def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
@@ -281,7 +284,7 @@ def _rows_by_name(data: Listing, names: Sequence[str | Path]) -> set[int]:
         requests += [_Name(str(name))] if is_id else read_names(Path(name))
     missing = [name for name in requests if name.text not in rows]
     if missing:
-        raise _missing(data, missing)
+        raise _missing_error(data, missing)
     return set[int]().union(*(rows[name.text] for name in requests))
 
 
@@ -294,7 +297,7 @@ def _exists(path: str) -> bool:
         raise
 
 
-def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
+def _missing_error(data: Listing, missing: Sequence[_Name]) -> DataError:
     """Return the error for one or more names that are not in the set; it lists the first three."""
     first, others = missing[0], missing[1:]
     scenario_id = first.text.rpartition("\t")[2]
@@ -316,7 +319,7 @@ def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
     return DataError(problem, file=first.file, cure=cure)
 
 
-def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
+def _empty_error(data: Listing, selection: Selection) -> DrivaxError:
     """Return the error for an empty selection; it names the first ``=`` filter that no scenario satisfies, if any."""
     for condition in selection.filters:
         if condition.operator == "=" and not any(condition.matches(entry) for entry in data.entries):
@@ -338,23 +341,25 @@ def _find_quantity(text: str, name: str) -> Quantity:
     by_end = {full.rpartition(".")[2]: full for full in known} | {full: full for full in known}
     guess = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
     cure = f"did you mean {by_end[guess[0]]!r}?" if guess else f"write tag.{name} for a tag of your own"
-    raise _refusal(text, f"unknown quantity {name!r}", cure)
+    raise _filter_error(text, f"unknown quantity {name!r}", cure)
 
 
 def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float | bool:
     """Parse a word of a filter as a value of its quantity."""
     if quantity.kind == "truth":
         if word.lower() not in _TRUTHS:
-            raise _refusal(text, f"{word!r} is neither true nor false", f"write {name}=true or {name}=false")
+            raise _filter_error(
+                text, f"{word!r} is neither true nor false", f"write {name}=true or {name}=false"
+            )
         return _TRUTHS[word.lower()]
     if quantity.kind == "number":
         with contextlib.suppress(ValueError):
             if math.isfinite(number := float(word)):
                 return number
         if word not in quantity.words:
-            raise _refusal(text, f"{word!r} is not a number", f"write, for example, {name}>=10")
+            raise _filter_error(text, f"{word!r} is not a number", f"write, for example, {name}>=10")
     if quantity.words and word not in quantity.words:
-        raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
+        raise _filter_error(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
     return word
 
 
@@ -363,5 +368,5 @@ def _refuse_text(items: Sequence[Any], what: str) -> None:
         raise UsageError(f"{what} are the text {items!r}", cure=f"give a list: [{items!r}]")
 
 
-def _refusal(text: str, problem: str, cure: str) -> UsageError:
+def _filter_error(text: str, problem: str, cure: str) -> UsageError:
     return UsageError(f"filter {text!r}: {problem}", cure=cure)

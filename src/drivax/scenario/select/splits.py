@@ -60,8 +60,8 @@ class HoldOut:
     """Recordings of a training set that are held out for validation.
 
     Attributes:
-        recordings: Their data sets and segments; empty if the set is a single recording.
-        training: Indices of all other scenarios.
+        recordings: Data sets and segments of the recordings; empty if the set is a single recording.
+        training: Indices of the scenarios of all other recordings.
         validation: Indices of at most :data:`MOST_HELD_OUT` scenarios of the recordings, evenly spaced.
     """
 

@@ -204,8 +204,8 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
     offset = final_xy - logs.xy[agent, _last_key(key)[:, -1]]
     # The last pose shapes the path, too, unless it is behind, by the jitter of a standing car.
     is_ahead = offset[:, 0] * np.cos(final_heading) + offset[:, 1] * np.sin(final_heading) > _LAST_POSE_M
-    points = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
-    extension = logs.extension[:, :points]
+    point_count = max(1, min(int(EXTENSION_M / _EXTENSION_STEP_M), logs.extension.shape[1]))
+    extension = logs.extension[:, :point_count]
     xy = np.concatenate([logs.xy, final_xy[:, None], extension], axis=1)
     # The tangent at a point of the extension is the sum of the pieces before and after it.
     tangent = np.diff(np.concatenate([final_xy[:, None], extension, extension[:, -1:]], axis=1), axis=1)
@@ -214,7 +214,7 @@ def _lines(bank: ScenarioBank, logs: _Logs) -> tuple[Polylines, Float[np.ndarray
     heading = np.concatenate([logs.heading, final_heading[:, None], heading], axis=1)
     height = _heights(bank, logs, extension, end)
     height = np.concatenate([logs.z, logs.z[agent, end][:, None], height], axis=1)
-    mask = np.concatenate([key, is_ahead[:, None], np.ones((count, points), bool)], axis=1)
+    mask = np.concatenate([key, is_ahead[:, None], np.ones((count, point_count), bool)], axis=1)
     flat = np.concatenate([xy, height[..., None], heading[..., None]], axis=-1)[mask]
     # Unwrapped over all agents at once: a line is continuous at any initial heading.
     flat[:, 3] = np.unwrap(flat[:, 3]) if len(flat) else flat[:, 3]
@@ -309,7 +309,7 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, row_count: i
         candidates = np.argwhere(is_near)
         step, agent, other = candidates.T
         step, agent, other = candidates[overlap(agent_boxes[step, agent], boxes[step, other])].T
-        # Overlaps are sorted by step and agent: the rank of one is its distance from the first of its agent and step.
+        # Overlaps are sorted by step and agent: the rank of each is its offset from the first of its agent and step.
         key = step * len(agents) + agent
         rank = np.arange(len(key)) - np.searchsorted(key, key)
         is_first = rank < OVERLAPS

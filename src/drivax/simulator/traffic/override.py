@@ -20,9 +20,9 @@ from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_ban
 from drivax.simulator.traffic.log import LogTraffic, agent_rows, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 
-#: Cure of a bank without overrides.
+#: Cure for a bank without overrides.
 _CURE = "use override.with_override"
-#: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
+#: Function from motion, action and length (m) to the next motion, such as ``Task.motion``.
 Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"]]
 
 

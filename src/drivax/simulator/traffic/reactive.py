@@ -1,4 +1,7 @@
-"""Reactive traffic (``idm``): vehicles follow their logged paths by the Intelligent Driver Model; models by name."""
+"""Reactive traffic (``idm``): vehicles follow their logged paths by the Intelligent Driver Model (IDM).
+
+:data:`TRAFFIC` holds all traffic models by name.
+"""
 
 from __future__ import annotations
 
@@ -100,8 +103,8 @@ class IdmTraffic:
         age = PAST - 1 - min(back, PAST - 1)
         (pose, profile), speed = path_poses(paths, context.index, state.arc[age]), state.speed[age, :, None]
         direction, valid = pose[:, 2:], state.there[age, :, None].astype(jnp.float32)
-        columns = [pose[:, :2], profile[:, PROFILE_Z, None], direction, direction * speed, valid]
-        rows = jnp.concatenate(columns, axis=-1)
+        values = [pose[:, :2], profile[:, PROFILE_Z, None], direction, direction * speed, valid]
+        rows = jnp.concatenate(values, axis=-1)
         slot = paths.slot[context.index].astype(jnp.int32)
         reacts = (state.phase != REPLAYS) & (step > state.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(rows, mode="drop")
@@ -143,11 +146,11 @@ class IdmTraffic:
         if len(self.drivers) == 1:
             return self.drivers[0][1]
         driver_index = self._driver_index(bank, index, slot)
-        columns = {
+        parameters = {
             field.name: jnp.asarray([getattr(driver, field.name) for _, driver in self.drivers])[driver_index]
             for field in fields(IdmParameters)
         }
-        return IdmParameters(**columns)
+        return IdmParameters(**parameters)
 
 
 def _movers(

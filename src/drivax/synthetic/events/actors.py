@@ -18,10 +18,12 @@ from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 Times = Float64[np.ndarray, " time"]
 Size = tuple[float, float, float]
 CAR_M = (4.6, 1.85, 1.55)
+#: Speed below which an actor keeps its heading, m/s.
+_MOVING_MPS = 0.3
 
 
 def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: Times) -> tuple[Times, Times]:
-    """Return distance and speed of a change between constant speeds from time 0 on (negative distances before)."""
+    """Return distance (m) and speed (m/s) of a change of speed that begins at time 0; distances before are negative."""
     duration_s = abs(last_mps - first_mps) / rate_mps2
     acceleration = math.copysign(rate_mps2, last_mps - first_mps)
     elapsed_s = np.clip(times_s, 0.0, duration_s)
@@ -31,7 +33,7 @@ def speed_change(first_mps: float, last_mps: float, rate_mps2: float, times_s: T
 
 
 def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
-    """Return the time to cover a distance from rest: constant acceleration, then constant speed."""
+    """Return the time to cover a distance from rest, s: constant acceleration, then constant speed."""
     ramp_m = speed_mps**2 / (2 * gain_mps2)
     if distance_m <= ramp_m:
         return math.sqrt(2 * max(distance_m, 0.0) / gain_mps2)
@@ -76,7 +78,7 @@ def scripted_motion(
     """
     velocity = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    is_moving = speed > 0.3
+    is_moving = speed > _MOVING_MPS
     if is_moving.any():
         angle = np.arctan2(velocity[:, 1], velocity[:, 0])
         index = np.maximum.accumulate(np.where(is_moving, np.arange(len(xy)), -1))
@@ -94,14 +96,14 @@ def along_curve(curve: Curve, distance_m: Times, kind: AgentKind, size_m: Size) 
 
 
 def user_trajectory(motion: Motion, row: int) -> ScriptedUser:
-    """Return the trajectory of a user of the traffic."""
+    """Return the trajectory of one user of a motion."""
     length, width, height = map(float, motion.size_m[row])
     trajectory = motion.xy[row], motion.heading[row], motion.speed[row], motion.valid[row].copy()
     return ScriptedUser(AgentKind(int(motion.kind[row])), (length, width, height), *trajectory)
 
 
 def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> ScriptedUser:
-    """Return the trajectory of a vehicle of the traffic that brakes from a step on to a halt on its path."""
+    """Return the trajectory of a vehicle in traffic that starts braking at ``step`` and comes to a halt on its path."""
     user = user_trajectory(motion, row)
     arc = Curve(user.xy, user.heading).arc_m
     times = DT_S * (np.arange(len(arc)) - step)

@@ -1,9 +1,9 @@
 """Severity of an adversary: the deceleration that avoids it, and the time to collision without braking.
 
 Ego stays on its path. At each time T the adversary blocks the path from some station on; with d the distance to that
-station and v ego's speed, the constant deceleration that keeps ego before it at T is
+station and v ego's speed, the constant deceleration that keeps ego short of the station at T is
 
-    a = 2 (v T - d) / T^2   where ego still moves at T (d >= v T / 2),   a = v^2 / (2 d)   where it is at rest,
+    a = 2 (v T - d) / T^2   where ego still moves at T (d >= v T / 2),   a = v^2 / (2 d)   where ego is at rest,
 
 and the required deceleration is the largest over all T.
 """
@@ -30,9 +30,11 @@ from drivax.synthetic.traffic.roles import Motion, ScriptedUser
 _PROPOSED_TTC_S, _SIMULATED_TTC_S, _BOX_MARGIN_M = 1.0, 0.8, 0.3
 #: Relative change of ego's speed below which it counts as constant.
 _STEADY_SHARE = 0.12
+#: Horizon of the time to collision, s.
+_TTC_HORIZON_S = 5.0
 #: Least distance from ego at which an actor may appear during the recording, m.
 _APPEARANCE_M = 40.0
-#: Longitudinal and lateral distance of a new actor from other agents, m: of a vehicle, and of another actor.
+#: Longitudinal and lateral distance of a new actor from other agents, m: for a vehicle, and for other kinds of actors.
 _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
 #: Distance of centres below which parallel vehicles are in the way of a new actor, m.
 _SAME_LANE_M = 6.5
@@ -117,20 +119,23 @@ def required_on_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) 
 def least_ttc(
     view: EgoView, actor: ScriptedUser, ego: tuple[float, float, float], first_step: int, from_step: int
 ) -> float:
-    """Return the least time to collision with an actor ahead from ``from_step`` on, s (at most 5).
+    """Return the minimum time to collision (TTC) with an actor ahead of ego from ``from_step`` on, s (at most 5).
 
-    ``ego`` is its station, lateral offset and speed at ``first_step``; offset and speed stay constant.
+    ``ego`` holds ego's station, lateral offset and speed at ``first_step``; offset and speed stay constant.
     """
     station, left, speed = ego
     steps = np.arange(max(from_step, first_step), view.last_step + 1)
     xy, heading = view.track.pose(station + speed * DT_S * (steps - first_step), left)
     ego_box, other = boxes(xy, heading, view.ego_size_m[:2] - _BOX_MARGIN_M), actor_boxes(actor)[steps]
     direction = ego_box[:, 2:4]
-    ttc_s = time_to_overlap(ego_box, speed * direction, other, actor.speed[steps, None] * other[:, 2:4], 5.0)
+    ttc_s = time_to_overlap(
+        ego_box, speed * direction, other, actor.speed[steps, None] * other[:, 2:4], _TTC_HORIZON_S
+    )
     ttc_s = np.where(overlap(ego_box, other), 0.0, ttc_s)
     # Braking does not avoid actors from behind.
     is_ahead = np.sum((other[:, :2] - xy) * direction, axis=-1) > -view.ego_size_m[0] / 2
-    return float(np.min(np.where(is_ahead & actor.valid[steps], ttc_s, 5.0), initial=5.0))
+    is_relevant = is_ahead & actor.valid[steps]
+    return float(np.min(np.where(is_relevant, ttc_s, _TTC_HORIZON_S), initial=_TTC_HORIZON_S))
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
@@ -163,7 +168,7 @@ def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
 def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
     """Return the rows of vehicles that are in the way of a new actor at any step up to ``until``.
 
-    Lanes do not count: the vehicles are near it and have about its heading.
+    Lanes play no role: a vehicle counts if it is near the actor and has about the same heading.
     """
     motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
@@ -174,7 +179,7 @@ def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[in
 
 
 def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
-    """Return the rows of vehicles that would collide with an actor across their path."""
+    """Return the rows of vehicles that would collide with an actor that crosses their path."""
     motion, last = view.motion, view.last_step
     rows, steps = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     steps = steps[steps <= last]
@@ -191,7 +196,7 @@ def vehicles_that_cross(view: EgoView, extra: ScriptedUser) -> tuple[int, ...]:
 def enter_when_clear(
     view: EgoView, extra: ScriptedUser, until: int, removed: tuple[int, ...]
 ) -> ScriptedUser | None:
-    """Delay the appearance of a new actor until it has no collision ahead up to step ``until``.
+    """Delay the appearance of a new actor until it collides with no agent ahead of it up to step ``until``.
 
     Agents behind it react to it, so only agents ahead of it and pedestrians count. The rows ``removed`` do not take
     part.

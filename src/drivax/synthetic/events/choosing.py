@@ -37,7 +37,7 @@ SCRIPTS: dict[EventKind, EventScript] = {
     EventKind.REVERSING_CAR: ReversingCar(),
     EventKind.TAILGATER: LeadBrakes(tailgater=True),
 }
-#: Proposals per event, the first of them with the requested severity, and proposals per further severity.
+#: Proposals per event, number of these with the requested severity, and proposals per further severity.
 _DRAWS, _AS_REQUESTED, _PER_SEVERITY = 40, 20, 5
 #: Exponent of the uniform variable in the draw of a severity: values below 1 favour hard events.
 _HARD_EXPONENT = 0.7
@@ -77,7 +77,7 @@ def draw_severity(rng: np.random.Generator) -> float:
 def stage(
     kind: EventKind, view: EgoView, severity_mps2: float, rng: np.random.Generator
 ) -> StagedEvent | None:
-    """Stage an event of a kind in a scenario without it, or return None if no proposal passes.
+    """Stage an event in the scenario of ``view``, or return None if no proposal passes the checks.
 
     Other severities are drawn if the requested one cannot be staged.
     """
@@ -87,7 +87,7 @@ def stage(
         proposal = SCRIPTS[kind].propose(view, severity_mps2, rng)
         if proposal is None:
             continue
-        result = _check(proposal.view or view, proposal)
+        result = _accept_proposal(proposal.view or view, proposal)
         if result is not None:
             required_mps2, staging = result
             actor = len(view.motion.kind) if proposal.vehicle is None else proposal.vehicle
@@ -96,7 +96,7 @@ def stage(
     return None
 
 
-def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
+def _accept_proposal(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
     """Return the deceleration that a proposal requires of ego, and its staging, or None if it fails a check."""
     begin, adversary = proposal.first_step, proposal.adversary
     required_mps2 = severity(view, adversary, begin + NOTICED)

@@ -68,7 +68,7 @@ def critical_steps(
     extent = others.extent.take(step, axis=2)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
         gap, leader_speed = _leader(others, extent, step, position, size_m)
-        # IDM keeps its least gap to the shifted line, and so the driver's distance to the real one.
+        # IDM stops ``min_gap_m`` before the shifted line, that is, ``_STOP_SHORT_M`` before the real one.
         line = _stop_line_m(network, path, colour[step], position + size_m[0] / 2)
         line = line + _DRIVER.min_gap_m - _STOP_SHORT_M
         target_mps = fastest[np.minimum((position / path.step_m).astype(int), len(fastest) - 1)]

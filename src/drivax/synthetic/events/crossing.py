@@ -127,18 +127,18 @@ class CrossTraffic(EventScript):
         if schedule is None:
             return None
         entry, adversary, required_mps2 = schedule
-        # The label ends 1 s after the entry, which may be before the actor reaches ego's path. If it blocks the path
-        # 0.8 s after the entry, the label lasts until it leaves (if it does before the recording's end).
+        # The label ends 1 s after the entry, which may be before the actor reaches ego's path. If the actor blocks the
+        # path 0.8 s after the entry, the label lasts until the actor leaves it (if before the recording's end).
         is_clear = ~np.isfinite(first_blocked_station(view, adversary, entry))
         exit_step = int(np.argmax(is_clear[8:])) + 8 + entry
-        # A queue at its light would block the actor: up to 0.5 s after the entry, no vehicle is in its way.
+        # Remove the queue at the actor's light: up to 0.5 s after the entry, no vehicle may block the actor.
         removed = vehicles_in_lane(view, adversary, entry + 5)
         last = min(max(exit_step, entry + 10), view.last_step)
         staging = Staging(extras=(adversary,), removed=removed)
         return Proposal(staging, required_mps2, adversary, entry - lead, last)
 
     def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
-        """Connectors that cross a straight one and have to wait for its traffic; none for a bent one."""
+        """Return the connectors that cross this one and must give way to it; none if it is bent."""
         lane = network.lanes[connector]
         if not _is_straight(lane):
             return []
@@ -146,7 +146,7 @@ class CrossTraffic(EventScript):
         return [other for other in others if self._crosses(lane, network.lanes[other], connector)]
 
     def _crosses(self, lane: Lane, other: Lane, index: int) -> bool:
-        """Whether another lane is the connector of an actor that crosses ego's connector ``lane`` (``index``)."""
+        """Whether an actor on the connector ``other`` would cross ego's connector ``lane`` (``index``)."""
         if not other.predecessors or not other.connector:
             return False
         alignment = math.cos(float(other.curve.heading[0] - lane.curve.heading[0]))

@@ -34,7 +34,7 @@ class Destination:
     Attributes:
         along_m: Distance along the lane, low and high.
         when_s: Time of ego's arrival at free speed after the warm-up, low and high.
-        alone: Whether ego's route must be empty ahead of it, up to the end of the lane after that of the place.
+        alone: Whether ego's route must be empty ahead of ego, up to the end of the lane after ``lane``.
         followed: Whether a vehicle must be behind ego.
     """
 

@@ -15,7 +15,8 @@ from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M, Curve, interpolate
 from drivax.synthetic.traffic.roles import Motion, Roles
 
-#: Earliest and latest start of an event, and step before which its actor blocks ego's path, from the recording's first.
+#: Earliest and latest first step of an event, and step before which its actor must block ego's path, counted from the
+#: recording's first step.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
 #: Steps from an event's first one until the actor's behaviour is visible, and the time, s.
 NOTICED = 4
@@ -24,6 +25,8 @@ NOTICED_S = NOTICED * DT_S
 _BEYOND_M = 160.0
 #: Least speed of ego at the beginning of an event, m/s.
 SLOWEST_MPS = 4.0
+#: Lowest and highest acceleration of ego behind an added leader, m/s2.
+_MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2 = -6.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Track:
     def project(
         self, xy: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Stations and lateral offsets (left positive) of points."""
+        """Stations and lateral offsets (left positive) of points, m."""
         x, y = (np.subtract.outer(xy[:, axis], self.xy[:, axis]) for axis in (0, 1))
         index = np.argmin(x**2 + y**2, axis=1)
         nearest = np.arange(len(xy)), index
@@ -124,7 +127,7 @@ class EgoView:
         return self.motion.size_m[0]
 
     def at_step(self, step: int) -> tuple[float, float]:
-        """Station and speed of ego at a step."""
+        """Station, m, and speed, m/s, of ego at a step."""
         return float(self.track.at[step]), float(self.motion.speed[0, step])
 
     def draw_step(self, rng: np.random.Generator) -> int | None:
@@ -220,7 +223,7 @@ class EgoView:
         return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
 
     def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
-        """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""
+        """Stations of all vehicles at a step, m, and whether they drive on ego's path (False for ego itself)."""
         count = self.motion.vehicles
         station, lateral = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
@@ -241,9 +244,10 @@ class EgoView:
             v = speeds[t : t + 1]
             gap = rear_m[t : t + 1] - stations[t] - self.ego_size_m[0] / 2
             a = idm_acceleration(v, fastest, gap, leader_speed[t : t + 1], idm)
-            after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
+            acceleration = np.clip(a[0], _MIN_ACCELERATION_MPS2, _MAX_ACCELERATION_MPS2)
+            after = max(0.0, float(v[0] + acceleration * DT_S))
             distance = (float(v[0]) + after) / 2 * DT_S
-            # Ego never overtakes its motion without the leader, since bends, lights and other agents still hold it.
+            # Ego never gets ahead of its motion without the leader: bends, lights and other agents still hold it back.
             stations[t + 1] = min(stations[t] + distance, at[t + 1])
             if stations[t + 1] == at[t + 1]:
                 after = min(after, (stations[t + 1] - stations[t]) / DT_S)

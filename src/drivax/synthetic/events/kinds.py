@@ -44,9 +44,9 @@ class StagedEvent:
         actors: Rows of the actors in the simulated motion, whose last rows are the staging's extras.
         first_step, last_step: Steps of the misbehaviour, both included. That of cross traffic usually ends 1 s after it
             enters the junction, even before the conflict.
-        severity_mps2: Constant deceleration with which ego just avoids the actor if it brakes 0.4 s after the first
-            step, when the actor's behaviour is visible, and until then drives as without the event (but reacts to an
-            added leader before it brakes).
+        severity_mps2: Constant deceleration with which ego just avoids the actor if ego starts braking 0.4 s after the
+            first step, when the actor's behaviour is visible, and until then drives as without the event (except that
+            it reacts to an added leader before the leader brakes).
     """
 
     kind: EventKind

@@ -25,7 +25,7 @@ _LEADER_MPS = 3.0
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
 #: Acceleration of a new leader that drives on, m/s2.
 _RESUMING_MPS2 = 1.5
-#: Time that a leader stands after ego would have reached it at constant speed, s.
+#: Time from when ego would have reached a leader at constant speed until the leader drives on, s.
 _HOLD_S = 1.5
 #: Largest distance of a vehicle behind ego that becomes a tailgater, m.
 _FOLLOWER_M = 60.0
@@ -36,7 +36,7 @@ _EVERY_M = 8.0
 
 
 def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
-    """Return the deceleration that a leader braking to a halt requires of ego from the same moment on.
+    """Return the deceleration that a leader braking to a halt requires of ego from the same moment on, m/s2.
 
     Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
     the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
@@ -50,7 +50,7 @@ def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, brakin
 def draw_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires.
+    """Draw the leader's deceleration, and the severity uniformly from the range that hard braking requires, m/s2.
 
     The deceleration follows from the formula for a leader that stops before ego; a close and slow one requires more.
     Return None if that range hardly overlaps ``SEVERITY_MPS2``, or the leader would have to stop at once.
@@ -67,7 +67,7 @@ def draw_braking(
 def cut_in_gap(
     ego_mps: float, actor_mps: float, last_mps: float, braking_mps2: float, severity_mps2: float
 ) -> float | None:
-    """Return the bumper-to-bumper gap at which an actor that slows ahead requires this deceleration of ego.
+    """Return the bumper-to-bumper gap at which an actor that slows ahead requires this deceleration of ego, m.
 
     In a frame that moves at the actor's final speed v_f ego loses u = v - v_f within the gap and the actor's own
     distance: u^2 / (2 a) = g + w^2 / (2 b) with w = v_a - v_f; None where ego would reach v_f first.
@@ -160,8 +160,8 @@ def _propose_leader(
 ) -> Proposal | None:  # fmt: skip
     """Propose a new leader at ego's speed that brakes to a halt.
 
-    ``headway_s`` is its time gap to ego as it drives without the event. With the staging ``departure`` it drives on
-    later; with None it stays where it stopped.
+    ``headway_s`` is the leader's time gap to ego's motion without the event. With the staging ``departure`` the leader
+    drives on later; with None it stays where it stopped.
 
     Returns:
         The proposal; None near junctions, if :func:`draw_braking` returns None, or if the leader would drive on only

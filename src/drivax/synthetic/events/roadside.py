@@ -56,7 +56,7 @@ def _entry(
 def _crossing_actor(
     view: EgoView, station: float, left_m: Times, kind: AgentKind, size: Size
 ) -> ScriptedUser:
-    """Build an actor that moves at a right angle to ego's path at a station; an actor that never moves faces it."""
+    """Build an actor that moves at a right angle to ego's path at a station; one that never moves faces the path."""
     xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
     return scripted_motion(xy, toward, kind, size, np.ones(view.steps, bool))
@@ -172,7 +172,7 @@ class LaneBlocked(EventScript):
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
-        pace_mps, deviation = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
+        pace_mps, deviation_m = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         clearance_m = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
@@ -181,7 +181,7 @@ class LaneBlocked(EventScript):
         half = (view.ego_size_m[1] + _OBJECT_M[1]) / 2
         if not offset < 9.0 or not view.plain_road(station):
             return None
-        profile = _entry(view, step, offset - deviation, pace_mps, (_ROLLING_MPS2, 3.0))
+        profile = _entry(view, step, offset - deviation_m, pace_mps, (_ROLLING_MPS2, 3.0))
         if profile is None or travel_s(offset - half, pace_mps, _ROLLING_MPS2) > arrival_s - 0.05:
             return None
         left = side * (offset - profile[0])

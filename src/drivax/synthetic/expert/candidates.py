@@ -22,7 +22,7 @@ from drivax.synthetic.traffic.roles import Drivers
 
 #: Distance between the samples of a candidate, m.
 SPACING_M = 0.5
-#: Largest lateral acceleration and yaw rate of a plan: nuPlan's comfort limits with a reserve.
+#: Largest lateral acceleration, m/s2, and yaw rate, rad/s, of a plan: nuPlan's comfort limits with a reserve.
 _LATERAL_MPS2, _YAW_RATE_RPS = 4.2, 0.8
 #: Distance over which ego returns to its path, m.
 _RETURN_M = 30.0

@@ -17,6 +17,8 @@ from drivax.synthetic.traffic.simulation import Run, Traffic
 
 #: Hardest braking of an accepted expert, m/s2: just within nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
+#: Position of ego's planned lane change on the old lane, and its length, low and high, m.
+_CHANGE_BEGIN_M, _CHANGE_LENGTH_M = (1.0, 12.0), (52.0, 64.0)
 #: Causes that no plan can fix, and a cause that a plan rarely fixes unless an event is staged.
 _UNFIXABLE, _HARDLY_MOVES = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
@@ -56,12 +58,12 @@ def expert_lanes(
         return lanes, None
     section = int(rng.choice(sections))
     neighbour = int(rng.choice(_neighbours(network, lanes[section])))
-    change = LaneChange(section, float(rng.uniform(1.0, 12.0)), float(rng.uniform(52.0, 64.0)))
+    change = LaneChange(section, float(rng.uniform(*_CHANGE_BEGIN_M)), float(rng.uniform(*_CHANGE_LENGTH_M)))
     return (*lanes[: section + 1], *random_lanes(network, neighbour, rng)), change
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Return the adjacent lanes of a street's section (70 to 100 m long, no connector); of other lanes none."""
+    """Return the adjacent lanes of a street's section (70 to 100 m long, no connector); none for other lanes."""
     current = network.lanes[lane]
     if current.connector or not 70.0 < current.length_m < 100.0:
         return []

@@ -345,8 +345,8 @@ def _shift(
         user_conflicts = conflicts.hard & (conflicts.user == user)
         index = int(conflicts.point[user_conflicts].min())
         if user not in passed_users and begin < index * SPACING_M < end + 20.0:
-            hit_user = _Hit(user, int(conflicts.step[user_conflicts].min()), index)
-            extent = _extent(state, candidate, hit_user, side)
+            user_hit = _Hit(user, int(conflicts.step[user_conflicts].min()), index)
+            extent = _extent(state, candidate, user_hit, side)
             end, lateral = max(end, extent.end), max(lateral, extent.lateral)
             passed_users.add(user)
     lateral = lateral + half_width_m + gap_m

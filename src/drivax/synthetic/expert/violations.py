@@ -76,7 +76,7 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
 def find_violation(
     roles: Roles, motion: Motion, times_s: _Series, first_step: int, staging: Staging, hardest_mps2: float
 ) -> Violation:
-    """Return the first violation of a motion from a given step on, in the order of the checks below.
+    """Return the first violation of a motion from a given step on, in the order of the checks.
 
     Ego may drive against traffic in scenarios with a staged event or with parked cars, which it may have to pass.
     ``times_s`` are on the clock of the lights; ``hardest_mps2`` is the hardest accepted braking of ego.
@@ -308,14 +308,14 @@ def smoother(count: int, window: int, order: int, derivative: int = 0) -> Float6
 def quantities(heading: _Series, speed: _Series) -> dict[str, Float64[np.ndarray, " step"]]:
     """Return the smoothed quantities of :data:`LIMITS` at each step but the first."""
     relative_heading = wrap(np.diff(heading))
-    along, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * relative_heading / DT_S
+    longitudinal, lateral = np.diff(speed) / DT_S, (speed[1:] + speed[:-1]) / 2 * relative_heading / DT_S
     course = np.cumsum(relative_heading)
     slope = {"window": 15, "order": 2, "derivative": 1}
     return {
-        "longitudinal_mps2": _savgol_filter(along, 8, 2),
+        "longitudinal_mps2": _savgol_filter(longitudinal, 8, 2),
         "lateral_mps2": _savgol_filter(lateral, 8, 2),
-        "jerk_mps3": _savgol_filter(along, **slope),
-        "jerk_magnitude_mps3": _savgol_filter(np.hypot(along, lateral), **slope),
+        "jerk_mps3": _savgol_filter(longitudinal, **slope),
+        "jerk_magnitude_mps3": _savgol_filter(np.hypot(longitudinal, lateral), **slope),
         "yaw_rate_rps": _savgol_filter(course, **slope),
         "yaw_acceleration_rps2": _savgol_filter(course, 15, 3, 2),
     }

@@ -133,10 +133,10 @@ def gradient(
     if (steps == steps[0]).all():
         result[1:-1] = (values[2:] - values[:-2]) / (2.0 * steps[0])
     else:
-        both = before + after
-        result[1:-1] = -after / (before * both) * values[:-2]
+        width = before + after
+        result[1:-1] = -after / (before * width) * values[:-2]
         result[1:-1] += (after - before) / (before * after) * values[1:-1]
-        result[1:-1] += before / (after * both) * values[2:]
+        result[1:-1] += before / (after * width) * values[2:]
     result[0], result[-1] = change[0] / steps[0], change[-1] / steps[-1]
     return result
 

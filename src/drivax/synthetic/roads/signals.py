@@ -114,7 +114,7 @@ class SignalPlan:
 
 
 def yellow_time_s(limit_mps: float) -> float:
-    """Duration of yellow: 1 s of reaction and half the time of a stop from the limit at 3.05 m/s2; at least 3 s.
+    """Duration of yellow, s: 1 s of reaction and half the time of a stop from the limit at 3.05 m/s2; at least 3 s.
 
     Kinematic formula ``t + v / (2 a)`` of the Institute of Transportation Engineers (Guidelines for Determining
     Traffic Signal Change and Clearance Intervals, 2020) on level ground.

@@ -1,5 +1,5 @@
 """Road users of the built-in world.
 
 ``role_assignment`` draws who takes part, ``placement`` where vehicles start, and ``simulation`` moves them;
-``lane_changes`` decides on lane changes, whose paths ``lateral`` makes.
+``lane_changes`` decides on lane changes, whose paths ``lateral`` builds.
 """

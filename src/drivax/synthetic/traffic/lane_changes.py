@@ -2,8 +2,8 @@
 
 MOBIL: Kesting, Treiber and Helbing, "General lane-changing model MOBIL for car-following models", Transportation
 Research Record 1999 (2007). A change is made when it is safe for the new follower, ``a_n' > -b_safe``, and when
-``a' - a + p (a_n' - a_n + a_o' - a_o) > threshold``, with the own acceleration a, those of the new and the old
-follower a_n and a_o, a dash for after the change, and the politeness p. Here it must also be safe for the vehicle
+``a' - a + p (a_n' - a_n + a_o' - a_o) > threshold``, with the vehicle's acceleration a, those of the new and the old
+follower a_n and a_o, a prime for after the change, and the politeness p. Here it must also be safe for the vehicle
 itself (``a' > -b_safe``), with minimum gaps on the new lane.
 """
 
@@ -23,7 +23,7 @@ from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
-#: MOBIL: threshold and safe braking, m/s2; the latter rises to the urgent one towards the end of the own lane.
+#: MOBIL: threshold and safe braking, m/s2; the latter rises to the urgent one towards the end of the old lane.
 _THRESHOLD_MPS2 = 0.25
 _SAFE_BRAKING_MPS2, _URGENT_BRAKING_MPS2 = 2.5, 4.5
 #: Distance and time from the end of a lane at which a change becomes mandatory, m and s.
@@ -39,6 +39,8 @@ _FROM_JUNCTION_M, _TO_JUNCTION_M = 12.0, 25.0
 _HALF_OBSTACLE_M, _OBSTACLE_BEHIND_M = 2.4, 3.0
 #: Half the width of a car that an obstacle may block, m.
 _HALF_CAR_M = 0.95
+#: Least distance between changes into one chain, m, and gain by which mandatory changes precede others, m/s2.
+_ENTRY_SPACING_M, _MANDATORY_GAIN_MPS2 = 40.0, 100.0
 #: Largest braking to open a gap for others, m/s2.
 MAKE_ROOM_MPS2 = 1.8
 
@@ -174,7 +176,7 @@ NO_GAP_PAIRS = GapPairs(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 @dataclass(frozen=True)
 class VehicleState:
-    """State of all vehicles, with the highest speed and the preferred acceleration on the own path.
+    """State of all vehicles, with the highest speed and the preferred acceleration on the present path.
 
     ``free`` is a mask of vehicles that may change lanes: neither ego nor vehicles in or just after a manoeuvre.
     """
@@ -195,8 +197,8 @@ class _Options:
         target, limit_mps: The new lane and the preferred speed on it.
         length_m: Length of the manoeuvre.
         possible, mandatory: Whether the lanes allow the change, and whether the vehicle must change.
-        remaining_m: Distance to the end of the own chain.
-        new, own: Positions on the new and on the own chain.
+        remaining_m: Distance to the end of the present chain.
+        new, own: Positions on the new and on the present chain.
     """
 
     vehicles: _Indices
@@ -359,13 +361,15 @@ class LaneChanges:
         changes: dict[int, Change] = {}
         entries: list[tuple[int, float]] = []  # chain and position of the changes so far
         order = sorted(
-            (-float(gain[k]) - 100.0 * bool(options.mandatory[k]), int(options.vehicles[k]), k)
+            (-float(gain[k]) - _MANDATORY_GAIN_MPS2 * bool(options.mandatory[k]), int(options.vehicles[k]), k)
             for k in np.flatnonzero(accepted)
         )
         for _, row, k in order:
             target, position = int(options.target[k]), float(now.at_m[row])
             chain = int(self.chains.chain[target])
-            is_taken = any(chain == other and abs(position - entry_m) < 40.0 for other, entry_m in entries)
+            is_taken = any(
+                chain == other and abs(position - entry_m) < _ENTRY_SPACING_M for other, entry_m in entries
+            )
             if row not in changes and not is_taken:
                 entries.append((chain, position))
                 changes[row] = Change(row, target, float(options.length_m[k]))

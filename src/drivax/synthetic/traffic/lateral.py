@@ -29,7 +29,7 @@ _ADJACENT_M = 60.0
 _EDGE_M, _PASS_MPS = 0.2, 6.0
 #: Gap to the first obstacle at the end of the way out, and to the last one at the beginning of the way back, m.
 _GAP_BEFORE_M, _GAP_BEHIND_M = 0.3, 0.5
-#: Length of the way out (less where there is no room) and back: the larger of a multiple of the steepest possible one
+#: Length of the way out (less where there is no room) and back: the larger of a multiple of the shortest possible one
 #: and a travel time, s.
 _OUT_FACTOR, _BACK_FACTOR, _OUT_S, _BACK_S = 2.0, 1.6, 2.4, 2.0
 #: Least length of the path after a detour, m.

@@ -169,7 +169,7 @@ class StaticObstacles:
         return bool(is_blocking.any())
 
     def gap(self, front_m: PerVehicle) -> PerVehicle:
-        """Distance from the front bumper to the next obstacle in the corridor, above -1 m (infinite: none)."""
+        """Distance from the front bumper to the next obstacle in the corridor, more than -1 m (infinite: none)."""
         gap = self.near_m - front_m[:, None]
         return np.where(gap > -1.0, gap, np.inf).min(axis=1)
 
@@ -178,10 +178,10 @@ def nearest_obstacles(
     tables: PathTables, vehicles: Boxes, at_m: PerVehicle, active: VehicleMask, others: Boxes,
     by_world: Int64[np.ndarray, "world most"],
 ) -> tuple[PerVehicle, PerVehicle]:  # fmt: skip
-    """Return the gap from each front bumper to the nearest obstacle in the path's corridor, and its speed along it.
+    """Return the gap from each front bumper to the nearest obstacle in the path's corridor, and the obstacle's speed.
 
-    Without an obstacle the gap is infinite and the speed 0, which is also the speed of oncoming obstacles. ``others``
-    are pedestrians and moving scripted users; ``by_world`` has their indices, padded with -1.
+    The speed is that along the path, 0 for oncoming obstacles. Without an obstacle it is 0 and the gap infinite.
+    ``others`` are pedestrians and moving scripted users; ``by_world`` has their indices, padded with -1.
     """
     count, users = len(vehicles), vehicles.concatenate(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)

@@ -105,7 +105,8 @@ class PathTables:
         table: x, y, heading and highest speed at each sample.
         step_m, last, length_m: Distance between samples, index of the last one, and its position.
         lane, lane_m: Lanes occupied at each sample (-1: none), and positions on them.
-        begin, scale, from_m, until_m: Fields of the span of each lane of the own world (``begin`` is nan without one).
+        begin, scale, from_m, until_m: Fields of the span of each lane of the vehicle's world (``begin`` is nan without
+            one).
         column: Offset from a lane to its index in these arrays, flattened.
         connector, connector_begin, connector_end: Connectors in order of travel (-1: none), and path positions.
         crossing, crossing_m: Marked crossings in order of travel (-1: none), and positions of their near side.

@@ -24,6 +24,8 @@ _MIN_FROM_ENDS_M = 15.0
 #: Smallest distance between centres of vehicles placed on a lane (except from ego to the leader of ``leader_share``):
 #: a vehicle's length and a gap, m, and a time gap, s.
 _LENGTH_M, _GAP_M, _GAP_S = 10.0, 5.0, 0.9
+#: Least distance of placed vehicles from the ends of lanes, m.
+_LANE_END_M = 6.0
 #: Free gaps on busy lanes relative to those elsewhere.
 _BUSY_GAP_SHARE = 0.4
 #: Speed limit above which no cyclists start, except on bicycle lanes, m/s; cyclists' distance from the right side, m.
@@ -171,7 +173,7 @@ def place_vehicles(
     vehicles: _Places = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
-        if ahead < network.lanes[ego_lane].length_m - 6.0:
+        if ahead < network.lanes[ego_lane].length_m - _LANE_END_M:
             vehicles.append((ego_lane, ahead))
     for index, lane in enumerate(network.lanes):
         if lane.connector:
@@ -180,8 +182,8 @@ def place_vehicles(
         occupied = [along for other, along in vehicles if other == index]
         occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY_GAP_SHARE if index in network.busy or index in busy else 1.0)
-        position = rng.uniform(6.0, 6.0 + mean)
-        while position < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
+        position = rng.uniform(_LANE_END_M, _LANE_END_M + mean)
+        while position < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else _LANE_END_M):
             if all(abs(position - other) > minimum for other in occupied):
                 vehicles.append((index, float(position)))
                 occupied.append(float(position))
@@ -243,7 +245,7 @@ def _is_blocked(
 
 
 def _drop_close_followers(network: RoadNetwork, vehicles: _Places, ego: _Place) -> _Places:
-    """Drop vehicles too close to the next one across a lane's end: behind the next lane's first, or ahead of ego."""
+    """Drop vehicles too close across the end of a lane: to the first one on the next lane, or to ego behind them."""
     remaining = []
     first: dict[int, float] = {}
     last: dict[int, float] = {}

@@ -1,8 +1,8 @@
 """Right of way at connectors: lights, signs, priority, and room to leave.
 
-A driver requests a connector shortly before it would have to brake for its stop line. Until the rear bumper has left
-the zone in which two connectors conflict, the other one is granted only to drivers that cannot stop any more. A light
-that closes takes back a grant.
+A driver requests a connector shortly before it would have to brake for its stop line. Until the rear bumper of a
+vehicle has left the zone in which its connector conflicts with another one, the other one is granted only to drivers
+that cannot stop any more. A closing light revokes a grant.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.path_arrays import PathTables, PerVehicle, VehicleMask, VehicleRows, Worlds
 from drivax.synthetic.traffic.roles import Drivers
 
-#: Braking with which a driver can still stop when it requests a connector, m/s2, and reserves of time and distance.
+#: Braking with which a driver can still stop when it requests a connector, m/s2, and reserves of time (s) and
+#: distance (m).
 _REQUEST_MPS2, _REQUEST_S, _REQUEST_M = 2.0, 0.7, 3.5
 #: Required braking below which drivers do not brake for blockers that clear in time, m/s2; blockers' top speed, m/s.
 _WAITING_MPS2, _TURNING_MPS = 3.4, 7.0
@@ -57,7 +58,7 @@ class TrafficState:
 
     Attributes:
         colour, to_red: Colour of each lane's light, and time until a yellow one turns red, s.
-        front_m, rear_m: Positions of both bumpers on the own paths.
+        front_m, rear_m: Positions of the front and rear bumpers along the vehicles' paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         committed: Number of connectors that each planned vehicle (by row) enters without yielding.
     """
@@ -80,7 +81,7 @@ class TrafficState:
 def conflict_zones(
     network: RoadNetwork,
 ) -> tuple[Float64[np.ndarray, "lane lane"], Float64[np.ndarray, "lane lane"]]:
-    """Find the stretch of each connector that conflicts with each other one: begin and end, m (nan: no conflict).
+    """Find the stretch of each connector that conflicts with each of the others: begin and end, m (nan: none).
 
     Connectors that leave the same lane do not conflict: vehicles on them follow each other.
     """

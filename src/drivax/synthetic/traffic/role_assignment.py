@@ -99,8 +99,8 @@ def assign_roles(
         domain: Density and composition of traffic.
         times_s: Times of all steps; the warm-up of traffic ends at time 0.
         lane_change_share: Share of random routes with room for it on which ego plans a lane change.
-        timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination it is green
-            on arrival.
+        timing: Shares of the states of ego's next light at time 0; on a route past an ``alone`` destination the light
+            is green on arrival.
         rng: Source of randomness.
         destinations: Candidate places for ego to pass; if the draws of routes past them fail, its route is random.
         critical: Whether ego must give way to dense traffic, if the roads allow it; ``destinations`` are ignored.

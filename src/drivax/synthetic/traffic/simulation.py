@@ -200,7 +200,7 @@ def simulate(runs: Sequence[Run]) -> list[Motion]:
 def run_all(tasks: Iterable[Generator[Run, Motion, _T]]) -> Iterator[_T]:
     """Run tasks and yield their results in order.
 
-    Each task yields runs and receives their motion. Up to 16 runs of different tasks are simulated together.
+    Each task yields runs and receives their motion. Up to 8 runs of different tasks are simulated together.
     """
     remaining = iter(enumerate(tasks))
     results: dict[int, _T] = {}
@@ -493,7 +493,7 @@ class _Simulation:
         self, t: int, preferred: PerVehicle, fastest: PerVehicle, active: VehicleMask
     ) -> None:
         """Start lane changes and detours of vehicles that may decide now."""
-        # Paths of finished worlds stay.
+        # Vehicles of finished worlds keep their paths.
         may_decide = (self._position_m > self._busy_m) & (self._rest_until <= t) & active & (t < self._steps)
         for row, override in self._overrides:
             may_decide[row] &= t < override.first_step
@@ -555,14 +555,16 @@ class _Simulation:
     ) -> None:
         """Start a detour around an obstacle ahead, if there is one; ``is_large`` is a mask of large halted users."""
         world, worlds = int(self._worlds.world[row]), self._worlds
-        own_users, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= _HALTED_MPS
+        is_in_world, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= _HALTED_MPS
         is_other = (self._position_m > 0.0) & ~is_stuck & (worlds.world == world)
         is_other[row] = False
         standing = self._obstacles.boxes[world].concatenate(
             self._vehicles.select(is_stuck & (worlds.world == world))
         )
-        standing = standing.concatenate(self._moving_users.select(is_large & own_users))
-        moving = self._vehicles.select(is_other).concatenate(self._moving_users.select(own_users & is_moving))
+        standing = standing.concatenate(self._moving_users.select(is_large & is_in_world))
+        moving = self._vehicles.select(is_other).concatenate(
+            self._moving_users.select(is_in_world & is_moving)
+        )
         position, speed = float(self._position_m[row]), float(self._speed[row])
         size = 2 * float(self._half_m[row]), float(self._width_m[row])
         request = detour_request(self._tables, row, position, speed, size)

@@ -121,7 +121,7 @@ class Approach:
 
 @dataclass(frozen=True)
 class Move:
-    """A connector lane, the numbers of the approaches from which (``arm``) and ``to`` which it leads, and its turn."""
+    """A connector lane, the numbers of the approaches from (``arm``) and to (``to``) which it leads, and its turn."""
 
     lane: int
     arm: int
@@ -349,7 +349,7 @@ def finish_sites(
 
 
 def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: Place) -> tuple[Curve, Place]:
-    """Return the edge from one end of the map to the next, and that end.
+    """Return the edge from one arm that leads off the map to the next such arm, and that arm.
 
     The edge leads inwards on the left of an arm, round the corners, and outwards on the right of another arm.
     """

@@ -2,7 +2,7 @@
 
 Lights serve left turns in a phase of their own (protected, with arrows), together with oncoming traffic that has right
 of way (permissive), or serve one approach after the other (split phases). Other conflicting movements are never green
-at the same time. Ego starts 12 to 85 m before a stop line, and at most 6 s at the speed limit.
+at the same time. Ego starts 12 to 85 m before a stop line, at most 6 s of travel at the speed limit.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ class UnprotectedLeft:
 
 
 @dataclass(frozen=True)
-class _Plot:
+class _JunctionOutline:
     """A junction before its lanes are added; arm 0 leads to the other junction."""
 
     kind: str
@@ -298,7 +298,7 @@ class _Plot:
         """Beginning of the road to the other junction, looking outwards."""
         return self.arms[0].base.ahead(self.mouths[0] + self.arms[0].street.stop_line_m)
 
-    def move_to(self, gate: Pose) -> _Plot:
+    def move_to(self, gate: Pose) -> _JunctionOutline:
         """Move the junction so that its gate is at a pose."""
         angle = gate.heading - self.gate.heading
         cos, sin = math.cos(angle), math.sin(angle)
@@ -343,10 +343,10 @@ class Corridor:
         """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
-        plot = self._draw_plot(rng, style, main)
-        first = plot.move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
+        outline = self._draw_outline(rng, style, main)
+        first = outline.move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._draw_middle(rng, first.gate)
-        second = self._draw_plot(rng, style, main).move_to(middle.end.turned())
+        second = self._draw_outline(rng, style, main).move_to(middle.end.turned())
         draft = Draft()
         sites = self._add_sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
@@ -354,14 +354,16 @@ class Corridor:
         plans = [self._set_right_of_way(rng, draft, *pair) for pair in pairs]
         start_lanes = [
             lane
-            for plot, site in pairs
+            for outline, site in pairs
             for i, approach in enumerate(site.approaches[1:], 1)
-            for lane in approach.inward * (_MAIN_WEIGHT if i in plot.main else 1)
+            for lane in approach.inward * (_MAIN_WEIGHT if i in outline.main else 1)
         ]
         travel = (float(middle.arc_m[-1]) + first.mouths[0] + second.mouths[0]) / (_PLATOON * main.limit_mps)
         return draft.network(self.name, starts(draft, start_lanes), self._combine_signals(rng, plans, travel))
 
-    def _draw_plot(self, rng: np.random.Generator, style: RoadStyle, main: CrossSection) -> _Plot:
+    def _draw_outline(
+        self, rng: np.random.Generator, style: RoadStyle, main: CrossSection
+    ) -> _JunctionOutline:
         """Draw the kind and the arms of a junction."""
         kind = list(_KINDS)[rng.choice(len(_KINDS), p=list(_KINDS.values()))]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
@@ -374,7 +376,7 @@ class Corridor:
             del streets[missing_arm], headings[missing_arm]
         arms = self.geometry.arms(rng, headings, streets)
         left_only = kind == _LIGHTS and main.inward > 1 and bool(rng.random() < self.left_lane_share)
-        return _Plot(kind, arms, self.geometry.mouths(rng, arms), left_only)
+        return _JunctionOutline(kind, arms, self.geometry.mouths(rng, arms), left_only)
 
     def _draw_middle(self, rng: np.random.Generator, gate: Pose) -> Curve:
         """Draw the middle line between the junctions: bent, with straight ends."""
@@ -387,10 +389,14 @@ class Corridor:
         return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _add_sites(
-        self, rng: np.random.Generator, draft: Draft, plots: tuple[_Plot, _Plot], middle: Curve
+        self,
+        rng: np.random.Generator,
+        draft: Draft,
+        outlines: tuple[_JunctionOutline, _JunctionOutline],
+        middle: Curve,
     ) -> list[Site]:
         """Add the shared road, then the other arms and the connectors of both junctions."""
-        near, far = plots
+        near, far = outlines
         side = join_curves(
             straight(near.arms[0].base.ahead(near.mouths[0]), near.arms[0].street.stop_line_m),
             middle,
@@ -402,23 +408,23 @@ class Corridor:
             Approach(far.arms[0], far.mouths[0], middle.reversed(), side.reversed(), outward, inward),
         )
         sites = []
-        for plot, first in zip(plots, shared, strict=True):
+        for outline, first in zip(outlines, shared, strict=True):
             approaches = [first]
-            for i in range(1, len(plot.arms)):
-                reach = self.geometry.reach if i in plot.main else self.side_reach
-                approaches.append(open_approach(rng, draft, plot.arms[i], plot.mouths[i], reach))
-            left_only = [plot.left_only and i in plot.main for i in range(len(plot.arms))]
+            for i in range(1, len(outline.arms)):
+                reach = self.geometry.reach if i in outline.main else self.side_reach
+                approaches.append(open_approach(rng, draft, outline.arms[i], outline.mouths[i], reach))
+            left_only = [outline.left_only and i in outline.main for i in range(len(outline.arms))]
             sites.append(connect(draft, Site(tuple(approaches)), left_only))
         return sites
 
     def _set_right_of_way(
-        self, rng: np.random.Generator, draft: Draft, plot: _Plot, site: Site
+        self, rng: np.random.Generator, draft: Draft, outline: _JunctionOutline, site: Site
     ) -> SignalPlan | None:
         """Set the signals or the stop signs of a junction; return its signal plan, if it has one."""
-        if plot.kind != _LIGHTS:
-            set_priorities(draft, site, plot.main, Control.STOP)
+        if outline.kind != _LIGHTS:
+            set_priorities(draft, site, outline.main, Control.STOP)
             return None
-        protected = plot.left_only and bool(rng.random() < self.protected_share)
+        protected = outline.left_only and bool(rng.random() < self.protected_share)
         lefts = [LeftTurns(protected, permissive=True), LeftTurns(protected=False, permissive=True)]
         return set_lights(rng, draft, site, lefts, self.green_s)
 

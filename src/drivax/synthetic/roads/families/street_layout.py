@@ -19,6 +19,8 @@ CROSSWALK_M = 3.2
 _KERB_M = 0.4
 #: Least distance of a bay's middle from a crossing's axis, m.
 _BAY_CLEAR_M = 8.0
+#: Length of bays and of gaps for driveways, low and high, m, and probability of such a gap.
+_BAY_M, _DRIVEWAY_M, _DRIVEWAY_SHARE = (5.8, 6.6), (4.0, 9.0), 0.08
 
 
 @dataclass(frozen=True)
@@ -150,12 +152,12 @@ class Street:
 
     def _link_neighbours(self, strip: Strip) -> None:
         """Link a strip with the one to its right as seen along the middle line."""
-        index = strip.place - 1 or -1
-        right = next((s for s in self.strips if s.place == index and s.forward == strip.forward), None)
-        if right is None or (self.median_m and index * strip.place < 0):
+        place = strip.place - 1 or -1
+        right = next((s for s in self.strips if s.place == place and s.forward == strip.forward), None)
+        if right is None or (self.median_m and place * strip.place < 0):
             return
         for k in range(max(strip.first, right.first), min(strip.last, right.last)):
-            pair = self.lanes[strip.place, k], self.lanes[index, k]
+            pair = self.lanes[strip.place, k], self.lanes[place, k]
             self.draft.link_neighbours(*(pair if strip.forward else pair[::-1]))
 
     def _add_fork(self, strip: Strip) -> None:
@@ -217,7 +219,7 @@ class Street:
         """Add a crossing at a sample of the middle line, with a crosswalk where it is marked."""
         current, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
         section = self._section(at)
-        lanes = tuple(self._on_lane(index, k, at) for index, k in self.lanes if k == section)
+        lanes = tuple(self._on_lane(place, k, at) for place, k in self.lanes if k == section)
         axis = points(current.aside(right), current.aside(left))
         self.draft.crossings.append(Crossing(axis, CROSSWALK_M, lanes, marked))
         if marked:
@@ -245,12 +247,12 @@ class Street:
                 continue
             outer = max(places, key=abs) if places else -side
             lateral = side * (self.median_m / 2 + len(places) * self.width_m + row_m / 2)
-            position, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(5.8, 6.6))
+            position, pitch = margin_m + float(rng.uniform(0.0, 8.0)), float(rng.uniform(*_BAY_M))
             # In bends the inner row is shorter than the middle line.
             stretch = 1.0 - lateral * np.gradient(self.middle.heading, STEP_M)
             while position + 1.5 * pitch < end_m:
-                if rng.random() < 0.08:
-                    position += float(rng.uniform(4.0, 9.0))
+                if rng.random() < _DRIVEWAY_SHARE:
+                    position += float(rng.uniform(*_DRIVEWAY_M))
                     continue
                 room = pitch / float(stretch[round((position + pitch / 2) / STEP_M)])
                 self._add_bay(outer, lateral, position + room / 2, pitch)

@@ -17,6 +17,8 @@ from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 #: Limits below which curved and straight roads may have bays, and streets crossings away from junctions, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
 _CROSSWALK_LAYOUTS: Layouts = ((1, 1, 0.45), (2, 2, 0.25), (2, 1, 0.1), (2, 0, 0.1), (1, 0, 0.1))
+#: Width of a parking row, low and high, m.
+_ROW_M = (2.1, 2.4)
 #: Length over which a ramp's curvature rises and falls, m.
 _EASING_M = 40.0
 #: Drivable width left of a ramp's lane, m.
@@ -44,7 +46,7 @@ class CurvedRoad(StreetFamily):
         middle = self.draw_middle(rng, style.curvature)
         limit = float(rng.choice(style.limits_mps))
         parking = limit < _PARKING_LIMIT_MPS and rng.random() < style.parking_share
-        row_m = float(rng.uniform(2.1, 2.4)) if parking else 0.0
+        row_m = float(rng.uniform(*_ROW_M)) if parking else 0.0
         street = Street(
             middle=middle,
             cuts=self.cuts,
@@ -139,7 +141,7 @@ class MidblockCrosswalk(StreetFamily):
         """Draw a street with sidewalks on both sides and one or two crossings."""
         ahead, back = draw_layout(rng, _CROSSWALK_LAYOUTS)
         middle = self.draw_middle(rng, style.curvature)
-        row_m = float(rng.uniform(2.1, 2.4)) if rng.random() < style.parking_share else 0.0
+        row_m = float(rng.uniform(*_ROW_M)) if rng.random() < style.parking_share else 0.0
         limits = [v for v in style.limits_mps if v < _CROSSING_LIMIT_MPS] or [min(style.limits_mps)]
         street = Street(
             middle=middle,
@@ -178,7 +180,7 @@ class ParkedStreet(StreetFamily):
     name: str = "parked_street"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draw a narrow street with one of the two lowest limits of the style, of which repeated ones count twice."""
+        """Draw a narrow street with one of the two lowest limits of the style; a repeated limit counts twice."""
         one_way = rng.random() < self.one_way_share
         middle = self.draw_middle(rng, style.curvature)
         row_m = float(rng.uniform(*self.row_m))
