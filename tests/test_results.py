@@ -264,13 +264,15 @@ def test_curation_and_planners_share_the_test_set(stored):
     assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
 
 
-def test_kinematic_finds_the_events_that_force_a_reaction(stored):
+def test_kinematic_finds_the_events_that_force_a_reaction(stored, repository):
     """The target is 0.80, on scenarios that neither set its weights nor were looked at before."""
     found = stored("curation")
     tests = found["methods"]["kinematic"]["events"]["forced"], found["checks"]["fresh"]
     assert all(one["auc_interval"][0] > 0.8 for one in tests)
     control = found["methods"]["random_matched"]["events"]["forced"]["auc_interval"]
     assert control[0] < 0.5 < control[1]
+    auc = f"the probability is {found['methods']['kinematic']['events']['forced']['auc']:.3f}"
+    assert auc in (repository / "docs" / "guide" / "critical-scenarios.md").read_text()
 
 
 def test_members_disagree_where_they_err(stored):

@@ -1,6 +1,7 @@
 """Compare off-policy estimates of policies with their true returns, which only a simulator gives.
 
-python -m experiments.learning.off_policy --data BENCHMARK --runs RUNS
+python -m experiments.learning.off_policy estimate --data BENCHMARK --runs RUNS
+python -m experiments.learning.off_policy table    (write the stored results to the page)
 
 RUNS is the folder of `experiments.learning.mixtures`, with its trained policies. Episodes of the mixture `mixed` in 256
 scenarios of the split `validation` are the data of the estimates. Each policy acts by its mode with Gaussian noise (a
@@ -10,6 +11,7 @@ kernel), and so does the behaviour policy, a clone of these episodes: determinis
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from functools import partial
@@ -35,8 +37,9 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.tracking.run_folder import RunFolder, versions
-from experiments.learning.mixtures import ALGORITHMS_OF, SEEDS, is_trained
-from experiments.repository import RESULTS
+from experiments.learning.mixtures import ALGORITHMS_OF, PAGE, SEEDS, is_trained
+from experiments.learning.tables import table
+from experiments.repository import RESULTS, fill_places
 
 RESULT = RESULTS / "off_policy.json"
 SCENARIOS, UPDATES, GAMMA = 256, 2000, 0.97
@@ -102,39 +105,71 @@ def estimates(
     return {name: float(value) for name, value in jax.device_get(run(data)).items()}
 
 
-def main() -> None:
-    """Estimate the returns of all policies, and store them with their rank correlations."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--runs", type=Path, required=True)
-    args = parser.parse_args()
-    environment, data, config = prepare(args.data, args.runs)
+def compute_results(data_path: Path, runs: Path) -> dict[str, Any]:
+    """Return the estimates and true returns of all policies, and the rank correlation of each estimator."""
+    environment, data, config = prepare(data_path, runs)
     bank = data.data.bank
-    behaviour = action_of(args.runs / "mixed" / "bc" / "seed-0", bank)
+    behaviour = action_of(runs / "mixed" / "bc" / "seed-0", bank)
     rows = {}
     for mixture, names in ALGORITHMS_OF.items():
         for name in names:
             for seed in range(SEEDS):
-                run = args.runs / mixture / name / f"seed-{seed}"
+                run = runs / mixture / name / f"seed-{seed}"
                 if not is_trained(run):
                     continue
                 row = estimates(environment, data, config, action_of(run, bank), behaviour)
                 rows[f"{mixture}/{name}/seed-{seed}"] = row
                 print(run, row, flush=True)
     columns = {key: np.array([row[key] for row in rows.values()]) for key in (*ESTIMATORS, "return")}
-    runs = np.array([name.rpartition("/")[0] for name in rows])  # seeds of a run are a cluster
+    clusters = np.array([name.rpartition("/")[0] for name in rows])  # seeds of one algorithm are dependent
     correlations = {
         name: {
             "rank_correlation": rank_correlation(columns[name], columns["return"]),
-            "interval": list(correlation_interval(columns[name], columns["return"], runs, 2000)),
+            "interval": list(correlation_interval(columns[name], columns["return"], clusters, 2000)),
         }
         for name in ESTIMATORS
     }
-    command = "python -m experiments.learning.off_policy --data BENCHMARK --runs RUNS"
-    content = {"command": command, "policies": rows, "correlations": correlations, "versions": versions()}
-    write_json(RESULT, content)
+    command = "python -m experiments.learning.off_policy estimate --data BENCHMARK --runs RUNS"
+    return {"command": command, "policies": rows, "correlations": correlations, "versions": versions()}
+
+
+def page_tables(results: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the tables of the page: the estimators' rank correlations, and all estimates."""
+    correlations = [
+        [
+            name.replace("_", " "),
+            "{:+.2f} [{:+.2f}, {:+.2f}]".format(own["rank_correlation"], *own["interval"]),
+        ]
+        for name, own in results["correlations"].items()
+    ]
+    columns = ("return", *ESTIMATORS, "effective")
+    policies = [
+        [name, *(f"{row[column]:.2f}" for column in columns)] for name, row in results["policies"].items()
+    ]
+    headings = ["policy", *(column.replace("_", " ") for column in columns)]
+    return {
+        "correlations": table(["estimator", "rank correlation with the true return"], correlations),
+        "policies": table(headings, policies),
+    }
+
+
+def main() -> None:
+    """Estimate the returns of all policies, and store them with their rank correlations."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("table")
+    estimating = commands.add_parser("estimate")
+    estimating.add_argument("--data", type=Path, required=True)
+    estimating.add_argument("--runs", type=Path, required=True)
+    args = parser.parse_args()
+    if args.command == "estimate":
+        write_json(RESULT, compute_results(args.data, args.runs))
+    else:
+        PAGE.write_text(
+            fill_places(PAGE.read_text(), "off_policy.py", page_tables(json.loads(RESULT.read_text())))
+        )
 
 
 if __name__ == "__main__":

@@ -94,7 +94,7 @@ def residuals(recording: Recording) -> dict[str, list[Array]]:
 
 
 def summary(pieces: list[Array]) -> dict[str, float]:
-    """Return median and 90th percentile of residual deviations, their median autocorrelation, and the fitted noise."""
+    """Return median and 90th percentile of residual deviations, the median autocorrelation, and the fitted noise."""
     # Medians over runs are robust to a few tracks with swapped identities.
     deviation = float(np.median([np.std(piece) for piece in pieces]))
     lag = float(np.median([np.mean(p[1:] * p[:-1]) / max(np.mean(p * p), 1e-12) for p in pieces]))

@@ -163,7 +163,7 @@ def _generation(result: Result) -> list[tuple[str, str]]:
     for name, generation in result["generation"].items():
         for family, count in generation["families"].items():
             causes = ", ".join(f"{k} {v}" for k, v in sorted(count["causes"].items()))
-            rejections = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without occasion"
+            rejections = f"{count['rejection_rate']:.3f} ({causes}); {count['unsuited']} without the event"
             pairs.append((f"{name}: {family} rejected", rejections))
     return pairs
 

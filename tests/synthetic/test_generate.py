@@ -304,7 +304,7 @@ def test_summary_matches_counts_by_hand(tmp_path):
     assert text.splitlines() == [
         f"{tmp_path}: 40 scenarios in 4.0 s (10.0/s)",
         "  curved_road      30 kept,  6.25% of draws rejected (ego_collides 2)",
-        "  x                10 kept,  0.00% of draws rejected; 1,200 without the event",
+        "  x                10 kept,  0.00% of draws rejected; 1,200 draws without the event",
     ]
 
 

@@ -113,7 +113,7 @@ def summary(result: GeneratedSet) -> str:
         causes = ", ".join(f"{cause} {times}" for cause, times in sorted(family.rejected.items()))
         line = f"  {name:<{width}}  {family.kept:>6,} kept, {family.rejection_rate:6.2%} of draws rejected"
         line += f" ({causes})" if causes else ""
-        lines.append(line + (f"; {family.unsuited:,} without the event" if family.unsuited else ""))
+        lines.append(line + (f"; {family.unsuited:,} draws without the event" if family.unsuited else ""))
     return "\n".join((*lines, *coverage(result.families)))
 
 

@@ -128,7 +128,8 @@ class ClaimResult:
         claim: The claim.
         effect: The effect to test against 0: the difference; for a claim with a margin, the difference shifted by it;
             for a claimed size, the log ratio minus its claimed value. None if fewer than two recordings define the
-            metric, nothing varies (with a margin), or a claimed size has no ratio (a mean is not positive).
+            metric, progress cannot be made equal, nothing varies (with a margin), or a claimed size has no ratio (a
+            mean is not positive).
         difference: Arm minus reference; None if fewer than two recordings define the metric.
         change: Relative change and its interval; None if undefined.
         adjusted_p: P-value adjusted within the group (Holm).

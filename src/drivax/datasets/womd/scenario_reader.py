@@ -105,7 +105,7 @@ def _check(message: Any, steps: int) -> None:
     ids = set()
     for track in message.tracks:
         if len(track.states) != steps:
-            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=SKIP)
+            raise DataError(f"track {track.id} has {len(track.states)} states for {steps} steps", cure=SKIP)
         if track.id in ids:
             raise DataError(f"two tracks have the id {track.id}", cure=SKIP)
         ids.add(track.id)

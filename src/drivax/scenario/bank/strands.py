@@ -203,7 +203,7 @@ class _Segments:
 
 
 def _straightest_link(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
-    """Link of each lane with the smallest turn, the first of several within 0.01 rad or all unknown; -1 for none."""
+    """Link of each lane with the smallest turn (to 0.01 rad), the first of equal or unknown ones; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN_TURN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
 

@@ -138,7 +138,7 @@ class CrossTraffic(EventScript):
         return Proposal(staging, required_mps2, adversary, entry - lead, last)
 
     def _lower_priority_conflicts(self, network: RoadNetwork, connector: int) -> list[int]:
-        """Return the connectors that cross this one and must give way to it; none if it is bent."""
+        """Return the connectors that cross this one and must wait for its traffic; none if it is bent."""
         lane = network.lanes[connector]
         if not _is_straight(lane):
             return []

@@ -39,7 +39,7 @@ _FROM_JUNCTION_M, _TO_JUNCTION_M = 12.0, 25.0
 _HALF_OBSTACLE_M, _OBSTACLE_BEHIND_M = 2.4, 3.0
 #: Half the width of a car that an obstacle may block, m.
 _HALF_CAR_M = 0.95
-#: Least distance between changes into one chain, m, and gain by which mandatory changes precede others, m/s2.
+#: Least distance between simultaneous changes into one chain, m, and gain by which mandatory ones precede others, m/s2.
 _ENTRY_SPACING_M, _MANDATORY_GAIN_MPS2 = 40.0, 100.0
 #: Largest braking to open a gap for others, m/s2.
 MAKE_ROOM_MPS2 = 1.8
