@@ -45,8 +45,13 @@ from experiments.repository import DOCS, RESULTS, STATE, fetch, fill_places
 #: Pages of the studies.
 PAGES = {
     name: DOCS / "results" / f"{page}.md"
-    for name, page in (("longtail", "longtail"), ("longtail2_screening", "longtail2"))
+    for name, page in (
+        ("longtail", "longtail"),
+        ("longtail2_screening", "longtail2"),
+        ("longtail2", "longtail2"),
+    )
 }
+POWER = RESULTS / "longtail2_power.json"
 #: Metric of the power, seeds of the screening, and numbers of claims that are adjusted together.
 PRIMARY, SCREENING_SEEDS, CLAIMS = "at_fault_collision", 2, (1, 6)
 #: Stored files of a run or evaluation.
@@ -147,7 +152,7 @@ def power(folder: Path) -> None:
         "command": "python -m experiments.longtail power --out STUDY", "metric": PRIMARY, "claims": CLAIMS,
         "arms": len(effects), "rows": rows, "versions": versions(),
     }  # fmt: skip
-    write_json(result_file("longtail2_power"), content)
+    write_json(POWER, content)
 
 
 def stored_study(name: str, folder: Path) -> Study:
@@ -179,6 +184,20 @@ def fill_page(page: str, name: str, results: dict[str, Any]) -> str:
         for part, content in tables.items()
     }
     return fill_places(page, "longtail.py", lines)
+
+
+def power_table(results: dict[str, Any]) -> list[str]:
+    """Return the table of smallest detectable differences: a row per study size, a column per number of claims."""
+    headings = [
+        "seeds",
+        "events",
+        *(f"of {claims} claims" if claims > 1 else "one claim" for claims in results["claims"]),
+    ]
+    rows = [
+        [str(row["seeds"]), f"{row['events']:,}", *(f"{value:.3f}" for value in row["detectable"])]
+        for row in results["rows"]
+    ]
+    return table(headings, rows)
 
 
 def _pack(folders: list[Path], study: Path, out: Path) -> None:
@@ -222,7 +241,10 @@ def main() -> None:
         power(args.out)
     elif args.what == "table":
         page, results = PAGES[args.name], json.loads(result_file(args.name).read_text())
-        page.write_text(fill_page(page.read_text(), args.name, results))
+        text = fill_page(page.read_text(), args.name, results)
+        if POWER.is_file():
+            text = fill_places(text, "longtail.py", {"power": power_table(json.loads(POWER.read_text()))})
+        page.write_text(text)
     else:
         {"keep": keep, "restore": restore, "finish": finish}[args.what](args.name, args.out)
 

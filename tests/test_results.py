@@ -286,13 +286,20 @@ def found(script):
     return json.loads(script("longtail").result_file("longtail").read_text())
 
 
-def test_longtail_page_shows_stored_results(script, found):
+@pytest.mark.parametrize("name", ["longtail", "longtail2_screening"])
+def test_longtail_pages_show_stored_results(script, stored, name):
     longtail = script("longtail")
-    text = longtail.PAGES["longtail"].read_text()
-    assert "<!-- longtail.py: longtail rates rare -->" in text
-    assert longtail.fill_page(text, "longtail", found) == text, (
-        "run python -m experiments.longtail table longtail, and read what the page says about it"
+    text = longtail.PAGES[name].read_text()
+    assert f"<!-- longtail.py: {name} rates rare -->" in text
+    assert longtail.fill_page(text, name, stored(name)) == text, (
+        f"run python -m experiments.longtail table {name}, and read what the page says about it"
     )
+
+
+def test_longtail2_page_shows_the_power(script, stored):
+    longtail = script("longtail")
+    shown = "\n".join(longtail.power_table(stored("longtail2_power")))
+    assert f"<!-- longtail.py: power -->\n\n{shown}\n" in longtail.PAGES["longtail2"].read_text()
 
 
 def test_longtail_rates_follow_from_collision_counts(found):

@@ -235,6 +235,16 @@ def test_screening_has_every_algorithm_with_every_sampler():
     }  # fmt: skip
 
 
+def test_second_stage_has_six_claims_about_arms_of_the_screening():
+    """Presets, methods and scales are those of the screening; at events claims are at equal progress."""
+    second, screening = load_study("longtail2"), load_study("longtail2_screening")
+    assert len(second.claims) == 6 and {claim.group for claim in second.claims} == {"claims"}
+    assert all(claim.at_equal_progress == (claim.rows == "rare") for claim in second.claims)
+    assert second.claims[0].metric == "at_fault_collision" and second.claims[-1].margin == 0.02
+    screened = [replace(arm, weights=None) for arm in screening.arms.values()]
+    assert all(replace(arm, weights=None) in screened for arm in second.arms.values())
+
+
 def test_rates_by_kind_and_severity_of_events(data):
     kinds = {
         "cut_in": np.array([True, True, False, False]),
