@@ -206,7 +206,7 @@ def test_importance_of_features_to_a_trained_policy(sets, inspect):
         (["ONE", "--trust-code", "own"], "--trust-code needs --observations", 2),
         (["ONE", "ONE", "--observations"], "one set", 2),
         (["ONE", "--observations", "--planner", "nobody"], "unknown planner 'nobody'", 2),
-        (["ONE", "--json", "--html", "x.html"], "exclude", 2),
+        (["ONE", "--json", "--html", "x.html"], "mutually exclusive", 2),
         (["gone"], "gone", 1),
     ],
 )

@@ -97,6 +97,7 @@ def test_divergence_of_a_member_is_named():
         _check_finite(64, diverged, logs, finite.at[2].set(False))
 
 
+@pytest.mark.slow
 def test_saved_ensemble_scores_as_the_trained_one_and_other_sets(data, ensemble, tmp_path, capsys):
     out = tmp_path / "members"
     save_ensemble(ensemble, out)

@@ -571,6 +571,7 @@ def test_killed_at_given_moments_and_resumed_to_the_same_bytes(
     assert leftovers(tmp_path) == ["program.py", "said", "set", "src", "whole"]
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_to_the_same_bytes(thirty, tmp_path, program):
     assert program(thirty, tmp_path / "whole").wait(60) == 0
     moments = random.Random(time.time_ns())

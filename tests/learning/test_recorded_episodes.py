@@ -82,8 +82,9 @@ def simulate(planner, bank, traffic, task=TASK):
     return jax.tree.map(lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1), steps)
 
 
-@pytest.mark.parametrize("traffic", ["log", pytest.param("idm", marks=pytest.mark.slow)])
-def test_drives_equal_those_in_the_simulator_of_the_training(data, tmp_path, traffic):
+@pytest.mark.slow
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_episodes_equal_those_in_the_simulator_of_the_training(data, tmp_path, traffic):
     """The evaluation measured other facts and did not end at failures; rewards and ends are those of the training."""
     run = record(ConstantVelocity(), data, tmp_path / "run", traffic)
     environment, episodes = episodes_of(data, run, traffic=traffic)
@@ -186,7 +187,7 @@ def test_route_actions_steer_as_recorded(data, tmp_path):
         episodes_of(data, run, task=replace(TASK, actions=Published()))
 
 
-def test_weights_of_scenarios_apply_to_their_drives(data, tmp_path):
+def test_weights_of_scenarios_apply_to_their_episodes(data, tmp_path):
     runs = [record(planner, data, tmp_path / planner.name) for planner in (IdmPlanner(), ConstantVelocity())]
     environment, episodes = episodes_of(data, *runs)
     np.testing.assert_array_equal(episodes.steps.scenario, [0, 1, 2, 0, 1, 2])
@@ -267,6 +268,7 @@ def test_noise_has_its_deviation_and_correlation(data):
         add_noise(Expert(), 0.1)
 
 
+@pytest.mark.slow
 def test_command_records_and_training_learns_from_it(data, tmp_path, capsys):
     out, settings_file = tmp_path / "episodes", tmp_path / "tiny.yaml"
     settings_file.write_text(json.dumps(TINY))
