@@ -105,7 +105,9 @@ def rows(td_error=(1.0, 0.5, 0.3, 0.2), q_error=0.2, q_rank=0.8, entropy=-2.0, f
 def test_unhealthy_critics_are_named(change, words):
     assert critic_problems(rows(), -2.0) == []
     (problem,) = critic_problems(rows(**change), -2.0)
-    assert problem.startswith(words)
+    assert problem.startswith(words) and "imitates" not in problem
+    (problem,) = critic_problems(rows(**change), -2.0, needs_failures=True)
+    assert problem.endswith("; the policy only imitates") == ("failures" in change)
 
 
 def test_runs_without_returns_are_not_checked():

@@ -89,18 +89,21 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
     return jax.lax.scan(step, final_value, columns, reverse=True)[1].T
 
 
-def critic_problems(rows: Sequence[Mapping[str, float]], entropy: float | None = None) -> list[str] | None:
+def critic_problems(
+    rows: Sequence[Mapping[str, float]], entropy: float | None = None, needs_failures: bool = False
+) -> list[str] | None:
     """Return what is wrong with the critics of a run, given its rows of ``metrics.jsonl`` up to the loaded policy.
 
     None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
-    None for a policy without one.
+    None for a policy without one; ``needs_failures`` is the setting of the algorithm.
     """
     problems, errors, ranks = [], _column(rows, "validation/q_error"), _column(rows, "validation/q_rank")
     if not len(errors) or not len(ranks):
         return None
     failures = _column(rows, "sampler/failures")
     if len(failures) and not failures[-1] >= LEAST_FAILURES:
-        problems.append(f"{failures[-1]:.1%} of the episodes fail, too few to learn what failures cost")
+        problem = f"{failures[-1]:.1%} of the episodes fail, too few to learn what failures cost"
+        problems.append(f"{problem}; the policy only imitates" if needs_failures else problem)
     td_error = _column(rows, "loss/critic")
     before, last = (td_error[len(td_error) * k // 4 : len(td_error) * (k + 1) // 4] for k in (2, 3))
     if len(before) and not last.mean() <= MOST_TD_RISE * before.mean():

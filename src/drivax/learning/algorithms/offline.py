@@ -314,7 +314,7 @@ class Offline(OffPolicy[Config]):
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
         """Return what is wrong with the critics of a finished run, given the rows of its log; None if not checked."""
-        return critic_problems(rows, getattr(self, "target_entropy", None))
+        return critic_problems(rows, getattr(self, "target_entropy", None), self.config.needs_failures)
 
     def q_value(
         self, critic: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
