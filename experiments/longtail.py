@@ -44,12 +44,8 @@ from experiments.repository import DOCS, RESULTS, STATE, fetch, fill_places
 
 #: Pages of the studies.
 PAGES = {
-    name: DOCS / "results" / f"{page}.md"
-    for name, page in (
-        ("longtail", "longtail"),
-        ("longtail2_screening", "longtail2"),
-        ("longtail2", "longtail2"),
-    )
+    name: DOCS / "results" / f"{name.removesuffix('_screening')}.md"
+    for name in ("longtail", "longtail2_screening", "longtail2")
 }
 POWER = RESULTS / "longtail2_power.json"
 #: Metric of the power, seeds of the screening, and numbers of claims that are adjusted together.
@@ -183,6 +179,7 @@ def fill_page(page: str, name: str, results: dict[str, Any]) -> str:
         )
         for part, content in tables.items()
     }
+    lines["power"] = power_table(json.loads(POWER.read_text()))
     return fill_places(page, "longtail.py", lines)
 
 
@@ -241,10 +238,7 @@ def main() -> None:
         power(args.out)
     elif args.what == "table":
         page, results = PAGES[args.name], json.loads(result_file(args.name).read_text())
-        text = fill_page(page.read_text(), args.name, results)
-        if POWER.is_file():
-            text = fill_places(text, "longtail.py", {"power": power_table(json.loads(POWER.read_text()))})
-        page.write_text(text)
+        page.write_text(fill_page(page.read_text(), args.name, results))
     else:
         {"keep": keep, "restore": restore, "finish": finish}[args.what](args.name, args.out)
 

@@ -296,10 +296,42 @@ def test_longtail_pages_show_stored_results(script, stored, name):
     )
 
 
-def test_longtail2_page_shows_the_power(script, stored):
-    longtail = script("longtail")
-    shown = "\n".join(longtail.power_table(stored("longtail2_power")))
-    assert f"<!-- longtail.py: power -->\n\n{shown}\n" in longtail.PAGES["longtail2"].read_text()
+def test_longtail2_text_quotes_the_screening(script, stored):
+    """Ranges and means of the findings, and the sizes for which the power was computed."""
+    found, page = stored("longtail2_screening"), script("longtail").PAGES["longtail2"].read_text()
+    text = " ".join(page.split())
+    assert "<!-- longtail.py: power -->" in page and "| 8 | 4,504 |" in page
+
+    def errors(*algorithms):
+        seeds = [seed for arm, own in found["critics"].items() if arm.startswith(algorithms) for seed in own]
+        return [float(error) for error in re.findall(r"Q is off by (\d+\.\d+)", json.dumps(seeds))]
+
+    def at_fault(stratum, *algorithms):
+        arms = (arm for arm in found["draws"] if arm.startswith(algorithms))
+        return [found["rates"][arm][stratum]["at_fault_collision"]["mean"] for arm in arms]
+
+    assert "off by {:.2f} to {:.2f} standard".format(*_ends(errors("td3_bc"))) in text
+    assert "CQL+BC are off by {:.2f} to {:.2f}".format(*_ends(errors("cql"))) in text
+    best, others = at_fault("common", "td3_bc", "filtered_bc"), at_fault("common", "cql")
+    assert "are between {:.3f} and {:.3f}".format(*_ends(best)) in text
+    assert "CQL+BC between {:.3f} and {:.3f}".format(*_ends(others)) in text
+    arms = (
+        "td3_bc_heuristic",
+        "td3_bc_heuristic_scenario",
+        "td3_bc",
+        "td3_bc_random",
+        "td3_bc_random_scenario",
+    )
+    rare = {
+        arm: f"{rates['rare']['at_fault_collision']['mean']:.3f}" for arm, rates in found["rates"].items()
+    }
+    sentence = "{} by step and {} by scenario, against {} with uniform sampling, and {} and {} with"
+    assert sentence.format(*(rare[arm] for arm in arms)) in text
+    assert all(seeds == [None, None] or all(seeds) for seeds in found["critics"].values())
+
+
+def _ends(values):
+    return min(values), max(values)
 
 
 def test_longtail_rates_follow_from_collision_counts(found):

@@ -450,6 +450,22 @@ def test_policy_without_guidance_does_not_depend_on_critics(config, batch, polic
     assert jnp.abs(slope(changed, jnp.ones(COUNT)) - slope(trained, jnp.ones(COUNT))).max() > 1e-3
 
 
+def test_temperature_stays_without_guidance(batch, policy_batch):
+    """Nothing would bring the entropy to its target."""
+    learner, trained, target = build_learner(replace(CQL, imitation=0.5))
+
+    @jax.jit
+    def slope(guidance):
+        def loss(temperature):
+            parts = trained | {"log_temperature": temperature}
+            own = policy_batch._replace(guidance=guidance)
+            return learner.loss(parts, target, batch, own, step_keys(1)[1])[0]
+
+        return jax.grad(loss)(trained["log_temperature"])
+
+    assert slope(jnp.zeros(COUNT)) == 0.0 and abs(slope(jnp.ones(COUNT))) > 1e-6
+
+
 @pytest.mark.parametrize(
     ("config", "cloning"),
     [(TD3_BC, {"q_weight": 0.0}), (AWAC, {"inverse_temperature": 0.0})],

@@ -10,7 +10,7 @@ from drivax import settings
 from drivax.cli import main
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import WeightConfig, draw_statistics
+from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.scenario.build.assemble import assemble
@@ -243,6 +243,18 @@ def test_second_stage_has_six_claims_about_arms_of_the_screening():
     assert second.claims[0].metric == "at_fault_collision" and second.claims[-1].margin == 0.02
     screened = [replace(arm, weights=None) for arm in screening.arms.values()]
     assert all(replace(arm, weights=None) in screened for arm in second.arms.values())
+
+
+def test_strong_weights_have_the_effective_sample_that_the_page_gives():
+    """Of 2,000 scenarios with different scores; the default weights have 0.66."""
+    scores = np.random.default_rng(0).permutation(2000) / 2000.0
+    steps = np.repeat(scores[:, None], 2, axis=1)
+    ids = tuple(map(str, range(2000)))
+    table = ScoreTable("kinematic", {}, "hash", ids, np.ones(steps.shape, bool), steps, scores, {})
+    strong = load_study("longtail2").arms["td3_bc_heuristic_strong"].weights
+    for weights, expected in ((strong, 0.35), (WeightConfig(), 0.66)):
+        drawn = draw_statistics(sampling_weights(table, weights, "scenario"), table.drawable)
+        assert drawn.effective == pytest.approx(expected, abs=0.005)
 
 
 def test_rates_by_kind_and_severity_of_events(data):

@@ -284,11 +284,8 @@ def _strata(study: Study, test: ScenarioSet) -> Strata:
 
 def event_groups(entries: Sequence[Mapping[str, Any]]) -> dict[str, Bool[np.ndarray, " scenario"]]:
     """Return masks of the scenarios with each kind of event, and with a severity below or at least the median."""
-    tags = [entry["tags"] for entry in entries]
-    kinds = np.array([tags_of_scenario.get("event", "") for tags_of_scenario in tags])
-    severity_mps2 = np.array(
-        [float(tags_of_scenario.get("severity_mps2", "nan")) for tags_of_scenario in tags]
-    )
+    kinds = np.array([entry["tags"].get("event", "") for entry in entries])
+    severity_mps2 = np.array([float(entry["tags"].get("severity_mps2", "nan")) for entry in entries])
     groups = {kind: kinds == kind for kind in sorted({*kinds.tolist()} - {""})}
     if groups:
         median_mps2 = float(np.nanmedian(severity_mps2))

@@ -196,7 +196,8 @@ class Cql(Offline[CqlConfig]):
             mean_q = mean_over_devices(jnp.abs(jnp.min(actor.q_values, axis=0)))
             scaled = jnp.mean(guidance * scaled_policy_loss(actor.loss, mean_q))
             total = scaled + self.config.imitation * jnp.mean(error**2)
-        return total + actor.temperature_loss, actor.logs | {
+        # Without guidance the entropy does not depend on the temperature, which would grow without limit.
+        return total + jnp.mean(guidance) * actor.temperature_loss, actor.logs | {
             "policy": total,
             "mean_q_policy": jnp.mean(actor.q_values),
             "imitation_error": jnp.mean(jnp.abs(error)),
