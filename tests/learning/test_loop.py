@@ -12,7 +12,7 @@ from drivax import kernels, settings
 from drivax.api import evaluate, load
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
-from drivax.learning import loop, training_log
+from drivax.learning import loop, training_log, training_set
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -339,7 +339,7 @@ def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypa
         calls.append((bank, weights))
         raise Stop
 
-    monkeypatch.setattr(loop, "training_data", note)
+    monkeypatch.setattr(training_set, "training_data", note)
     weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
     with pytest.raises(Stop):
         train(config, TrainingSet(data, weights), tmp_path / "run")

@@ -32,7 +32,8 @@ from drivax.planners.nuplan.map import MapApi, SemanticMapLayer
 from drivax.planners.nuplan.planner import Host, NuplanPlanner, View
 from drivax.planners.pdm.brake import EmergencyBrake
 from drivax.planners.simple import Expert
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator

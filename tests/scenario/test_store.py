@@ -22,6 +22,7 @@ from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
 from drivax.scenario import manifest as manifest_module
 from drivax.scenario import store
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import (
     SCHEMA_VERSION,
     Capacity,
@@ -137,6 +138,35 @@ def test_manifest(scenario_set: Path):
         assert hashlib.sha256((scenario_set / shard["file"]).read_bytes()).hexdigest() == shard["sha256"]
         crcs = scenario_set / shard["file"].replace(".npy", ".crc.npy")
         assert hashlib.sha256(crcs.read_bytes()).hexdigest() == shard["crc_sha256"]
+
+
+def test_sizes_of_a_set_are_those_of_its_records(scenario_set: Path):
+    opened = ScenarioSet.open(scenario_set)
+    assert all("sizes" in shard for shard in opened.manifest["shards"])
+    assert opened.sizes == Sizes.used(list(opened)) == Sizes.used(opened)
+    # Sets of earlier versions have none.
+    for shard in opened.manifest["shards"]:
+        del shard["sizes"]
+    assert ScenarioSet(scenario_set, opened.manifest).sizes == opened.sizes
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"agents": 10**9}, "size agents is 1000000000 of 3"),
+        ({"slots": -1}, "size slots is -1"),
+        ({"lanes": "8"}, "sizes are "),
+        ({"further": 1}, "sizes are "),
+    ],
+)
+def test_forged_sizes_are_refused(scenario_set: Path, changes: dict[str, Any], message: str):
+    manifest = json.loads((scenario_set / "manifest.json").read_text())
+    manifest["shards"][1]["sizes"].update(changes)
+    edit_manifest(scenario_set, **manifest)
+    with pytest.raises(DataError, match="manifest is damaged"):
+        ScenarioSet.open(scenario_set)
+    with pytest.raises(ValueError, match=message):
+        Sizes.read(manifest["shards"][1]["sizes"], SMALL)
 
 
 def test_files_are_plain_numpy(scenario_set: Path):

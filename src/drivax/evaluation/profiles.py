@@ -26,7 +26,8 @@ from drivax.files import write_text
 from drivax.geometry.boxes import corners
 from drivax.planners.nuplan.map import lane_lines, roadblocks
 from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
-from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files

@@ -32,7 +32,8 @@ from drivax.planners.catalogue import PLANNERS
 from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner, add_noise, hold, limit_speed
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
+from drivax.scenario.bank.scenario_bank import ScenarioBank, identities, too_short
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
@@ -129,7 +130,7 @@ def run_evaluation(
     scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
     # Only evaluated scenarios need verification; the others only contribute their sizes.
-    sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
+    sizes = sizes or ScenarioSet.open(data.path, verify=False).sizes
     needed_bytes = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
     check_space(Path(out), needed_bytes)
     with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:

@@ -25,7 +25,8 @@ from drivax.planners.nuplan import interface as nuplan
 from drivax.planners.nuplan.map import MapApi
 from drivax.planners.nuplan.poses import BUFFER
 from drivax.scenario.bank.columns import SizeColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank, last_used
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import last_used
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S, AgentKind, LightState, Scenario
 from drivax.simulator.types import HISTORY, MOTION_SPEED, SimState, Situation
