@@ -289,7 +289,7 @@ def test_yaml_cannot_make_objects(tmp_path: Path):
 
 
 def test_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: tmp_path)
     (tmp_path / "studies").mkdir()
     (tmp_path / "fast.yaml").write_text("steps: 3\n")
     (tmp_path / "studies" / "slow.yaml").write_text("steps: 4\n")
@@ -352,7 +352,7 @@ def test_another_preset_of_a_section_starts_again(tmp_path: Path):
 
 
 def test_files_extend_presets_and_presets_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: tmp_path)
     (tmp_path / "offline").mkdir()
     (tmp_path / "slow.yaml").write_text("steps: 3\nname: slow")
     (tmp_path / "offline" / "slow.yaml").write_text("extends: slow\nname: offline")
@@ -426,7 +426,7 @@ def test_dump_is_readable():
 def test_no_file_shadows_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A folder of a stranger may hold files of any name, and a configuration file is trusted."""
     configs, folder = tmp_path / "configs", tmp_path / "stranger"
-    monkeypatch.setattr(settings, "_configs", lambda: configs)
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: configs)
     for place, steps in ((configs, 3), (folder, 9)):
         (place / "studies").mkdir(parents=True)
         for name in ("fast.yaml", "studies/slow.yaml"):

@@ -14,6 +14,8 @@ from typing import Any
 
 from drivax.escaping import escape_controls
 
+__all__ = ["DataError", "DrivaxError", "UsageError"]
+
 #: Extra that installs a package, by its import name.
 _EXTRAS = {
     "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",

@@ -338,7 +338,7 @@ class _Evaluation:
         """Return the evaluation after checking that planner, task and start are compatible."""
         task = simulator.task
         if not isinstance(task, Task):
-            raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
+            raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.Task")
         if not 0 <= start_step < steps - 1:
             raise UsageError(f"no episode can start at step {start_step}", cure=f"use 0 to {steps - 2}")
         check_actions(planner, task)

@@ -455,7 +455,7 @@ def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
 def _user_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     metric = find_named(entry)
     if not isinstance(metric, Metric):
-        raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.catalogue.Metric")
+        raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.Metric")
     if name in METRICS or name in others:
         raise UsageError(f"{entry!r}: the metric {name!r} already exists", cure="choose another name")
     for input_name in metric.inputs:

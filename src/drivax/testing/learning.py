@@ -230,7 +230,7 @@ def _check_planner(
     keys = jax.random.key(0), jax.random.key(1)
     for samples in (False, True):
         planner = learner.planner(parameters, "checked", samples)
-        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see planners.planner.Planner")
+        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see drivax.planners.Planner")
         first, second = (np.asarray(act(planner, bank, key)) for key in keys)
         valid = first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all()
         expect(valid, f"{what} returns action {first}", "return two numbers in [-1, 1]")

@@ -67,7 +67,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     """
     planner = make_planner(planner) if isinstance(planner, str) else planner
     valid = isinstance(planner, Planner) and not isinstance(planner, type)
-    cure = "give it name, replays, init and act (planners.planner.Planner)"
+    cure = "give it name, replays, init and act (drivax.planners.Planner)"
     expect(valid, f"{planner!r} is not a planner", cure)
     what = f"planner {planner.name!r}"
     simulator, bank = Simulator(evaluation_task(task or Task())), worlds.worlds()

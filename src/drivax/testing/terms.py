@@ -193,6 +193,6 @@ def _check_computed(what: str, metric: Metric) -> None:
         result = program.check_pure(*rows) if defined else program(*rows)
         valid = isinstance(result, Value) and result.value.shape == result.defined.shape == (12,)
         valid = valid and result.defined.dtype == bool
-        cure = "return drivax.metrics.steps.Value(number, defined)"
+        cure = "return drivax.metrics.Value(number, defined)"
         expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))

@@ -262,5 +262,5 @@ def make_traffic(name: str) -> Traffic:
     if isinstance(traffic, type) or not isinstance(traffic, Traffic):
         traffic = traffic() if makes(traffic, Traffic) else None
     if not isinstance(traffic, Traffic):
-        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
+        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.Traffic")
     return traffic
