@@ -609,6 +609,9 @@ def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.Mo
 def test_only_a_package_that_is_not_installed_is_missing():
     missing = missing_package(ModuleNotFoundError("no module", name="av"))
     assert missing is not None and missing.cure == "pip install 'drivax[show]'"
+    missing = missing_package(ModuleNotFoundError("no module", name="google.protobuf.message"))
+    assert str(missing) == "protobuf is not installed; pip install 'drivax[womd]'"
+    assert missing_package(ModuleNotFoundError("no module", name="not_there")) is None
     assert missing_package(ImportError("libavformat.so: not found", name="av._core")) is None
 
 

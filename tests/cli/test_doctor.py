@@ -342,10 +342,10 @@ def test_machine(capsys):
 
 
 def test_a_missing_extra_names_its_pip_line(monkeypatch):
-    monkeypatch.setattr(doctor, "_EXTRAS", {"womd": (("sys", "not_there", "not_there.inside"), "Waymo")})
+    monkeypatch.setattr(doctor, "EXTRAS", {"womd": ("Waymo", ("sys", "not_there", "not_there.inside"))})
     monkeypatch.setattr(doctor, "devices", lambda: "cpu")
     rows = dict(doctor.machine())
-    assert rows["womd (Waymo)"] == "not_there, not_there.inside missing: pip install 'drivax[womd]'"
+    assert rows["womd (Waymo)"] == "not_there, inside are not installed; pip install 'drivax[womd]'"
 
 
 @pytest.mark.parametrize(

@@ -244,13 +244,20 @@ def test_the_picture_shows_the_current_step_of_a_short_log(tmp_path, inspect, mo
     drawn = []
 
     class Picture:
-        def savefig(self, path):
-            path.touch()
+        def savefig(self, file, format):
+            file.write(b"half")
+            if drawn[1:]:
+                raise OSError("interrupted")
 
     def draw(task, bank, title, step):
         drawn.append((title, step))
         return Picture()
 
     monkeypatch.setattr("drivax.report.pictures.observation.draw_log_observation", draw)
-    inspect(tmp_path / "set", "--observations", "--draw", tmp_path / "seen.png")
-    assert drawn == [("short, step 7", 7)]
+    words = (tmp_path / "set", "--observations", "--draw", tmp_path / "seen.png")
+    inspect(*words)
+    assert drawn == [("short, step 7", 7)] and (tmp_path / "seen.png").read_bytes() == b"half"
+    (tmp_path / "seen.png").write_bytes(b"old")
+    inspect(*words, "--overwrite", status=1)
+    assert (tmp_path / "seen.png").read_bytes() == b"old"
+    assert {path.name for path in tmp_path.iterdir()} == {"set", "seen.png"}

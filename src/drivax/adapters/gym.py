@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
+from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_missing_package
 from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_metrics
 from drivax.report.pictures.still import draw_pixels
@@ -36,12 +36,10 @@ from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 
-try:
+with explain_missing_package():
     import gymnasium
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
-except ModuleNotFoundError as error:
-    raise missing_package(error) or error from error
 
 #: Bound to which observations are clipped (5 km, 1.5 km/s), user-defined groups too, so that spaces are bounded.
 LIMIT = 100.0

@@ -46,7 +46,7 @@ class Column:
         definition: One line for tables and reports.
         label: Heading; by default the name of the metric with spaces for underscores.
         kind: Scale of the values.
-        headline: Position in the first table of a report; None if it is not in that table.
+        headline: Position in printed summaries and the first table of a report; None if it is in neither.
         summarised: Whether the mean over episodes is reported.
         fails_on_crash: Whether the value is 0 if the planner crashed.
 

@@ -74,11 +74,11 @@ class Generation:
     Attributes:
         workers: Number of worker processes. With 0 this process draws the scenarios, and their last bits depend on the
             processor: only workers write the same bytes on any x86-64 processor.
-        capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
-        future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
-        egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.assemble``).
-        split: Percentages of train/validation/test, such as 80/10/10, for lists in ``splits/``, by map; None: no lists.
-        overwrite: Replace an existing scenario set.
+        capacity: Padded sizes; sets that are used together need the same.
+        future_s: Seconds of a scenario after its current step, 8 to 60; 15 in nuPlan's challenges.
+        egos: Vehicles per scenario with a route and a goal, 1 to 8, which training with `egos: moving` drives.
+        split: Write lists for train/validation/test to OUT/splits, by map: percentages, such as 80/10/10.
+        overwrite: Replace OUT if it is a scenario set.
         world: Settings of the world.
     """
 

@@ -32,15 +32,15 @@ class Export:
 
     Attributes:
         format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
-        filters: Conditions that must all hold (``scenario.select.selection``).
-        ids: File of scenario ids, one per line, or ``dataset<TAB>id``; None: all.
-        limit: Write only the first N of the selected scenarios; None: all.
-        paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
+        filters: Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated.
+        ids: Only scenarios named in this file: one id per line, or data set, tab and id (a split file).
+        limit: At most N scenarios.
+        paths: Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m.
         shard_size: Scenarios per TFRecord shard.
-        overwrite: Replace an existing set (by a set) or export (by another format); other folders are never replaced.
+        overwrite: Replace OUT if it is an earlier export (or a scenario set, for the format set).
     """
 
-    format: Literal["set", "tfexample", "gpudrive"] = "set"
+    format: str = "set"
     filters: tuple[str, ...] = ()
     ids: Path | None = None
     limit: int | None = None

@@ -16,14 +16,7 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
-from drivax.checks import (
-    MOST_RETURN_STEPS,
-    MOST_SAMPLES,
-    check_above_zero,
-    check_at_least,
-    check_at_most,
-    check_shares,
-)
+from drivax.checks import MOST_RETURN_STEPS, check_above_zero, check_at_least, check_counts, check_shares
 from drivax.errors import UsageError
 from drivax.learning.algorithms.off_policy import (
     Carry,
@@ -114,9 +107,8 @@ class OfflineConfig:
     renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "batch", "updates", "steps")
-        check_at_most(self, MOST_SAMPLES, "batch", "updates")
-        check_at_most(self, MOST_RETURN_STEPS, "steps")
+        check_counts(self, "batch", "updates")
+        check_counts(self, "steps", most=MOST_RETURN_STEPS)
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
         check_shares(self, "gamma", "tau", "min_q_weight")
         check_above_zero(self, "gradient_norm")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivax.errors import UsageError, missing_package
+from drivax.errors import UsageError, explain_missing_package
 from drivax.report.pictures.drawing import LIGHTS, Drawing, Shape
 from drivax.report.pictures.palette import LEGEND, LIGHT, theme_colours
 from drivax.scenario.schema import Scenario
@@ -42,10 +42,8 @@ def draw_scenario(
     """
     if not 0 <= step < int(scenario.steps):
         raise UsageError(f"step {step} is not in the scenario", cure=f"use 0 to {int(scenario.steps) - 1}")
-    try:
+    with explain_missing_package():
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_package(error) or error from error
     path = None if ego is None else np.asarray(ego, dtype=np.float64)
     centre = scenario.agent_xy[step, 0]
     if path is not None and np.isfinite(path[step]).all():
