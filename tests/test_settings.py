@@ -75,7 +75,7 @@ class Sized:
     @classmethod
     def preset(cls, name: str) -> Sized:
         if name != "large":
-            raise UsageError(f"there is no size {name!r}", cure="use large")
+            raise UsageError(f"unknown size {name!r}", cure="use large")
         return cls(width=99, depth=9, adam=Adam(lr=0.5, clip=1.0))
 
 
@@ -239,7 +239,7 @@ def test_another_kind_drops_previous_settings():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("steps", "'steps' is not a setting; write --section.key value"),
+        ("steps", "unexpected argument 'steps'; write --section.key value"),
         ("--stesp=1", r"stesp: .* did you mean 'steps'\?"),
         ("--steps=x", "steps: 'x' is not an integer"),
         ("--network.optimizer.lr=fast", r"network\.optimizer\.lr: 'fast' is not a number"),
@@ -468,7 +468,7 @@ def test_record_may_start_from_its_own_preset():
     assert settings.load(Sized, {"preset": "large", "width": 1}) == Sized(1, 9, large.adam)
     assert settings.load(House, settings.parse_yaml(settings.dump(changed))) == changed
     assert "preset" not in settings.dump(changed)
-    with pytest.raises(UsageError, match=r"^rooms: there is no size 'huge'; use large$"):
+    with pytest.raises(UsageError, match=r"^rooms: unknown size 'huge'; use large$"):
         house("rooms: {preset: huge}")
 
 

@@ -218,7 +218,7 @@ def test_folders_without_recordings(files, words, tmp_path, capsys):
 def test_empty_paths_are_named(tmp_path, capsys):
     status, out = asked(tmp_path / "none", capsys)
     assert status == 1 and "does not exist" in out
-    with pytest.raises(UsageError, match="there is no format"):
+    with pytest.raises(UsageError, match="unknown format"):
         diagnose(tmp_path, "wmod")
 
 

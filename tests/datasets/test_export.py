@@ -169,7 +169,7 @@ def test_only_exports_are_overwritten_and_only_on_request(stored, tmp_path, name
 
 
 def test_a_set_cannot_replace_itself(stored):
-    with pytest.raises(UsageError, match="is the set that is read"):
+    with pytest.raises(UsageError, match="is the input set"):
         export(stored, stored, Export(overwrite=True))
     assert len(ScenarioSet.open(stored)) == 5
 

@@ -28,7 +28,7 @@ import numpy as np
 from drivax.datasets.doctor import Estimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
-from drivax.errors import DataError, DrivaxError, UsageError, explain_system
+from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean, explain_system
 from drivax.files import count_text
 from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
@@ -100,7 +100,7 @@ class Conversion:
             find_reader(self.format)
         for name, choices in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
             if (value := getattr(self, name)) not in choices:
-                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(choices)}")
+                raise UsageError(f"unknown {name} {value!r}", cure=did_you_mean(value, choices))
         for name in ("limit", "stride", "workers", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -293,9 +293,9 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return what must be equal for a conversion to resume an interrupted one.
+    """Return the properties that must be equal for a conversion to resume an interrupted one.
 
-    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
+    They are versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
     companions (maps, poses, tables) included.
     """
     companions = {

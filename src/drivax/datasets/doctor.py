@@ -120,7 +120,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 
 def _seal_problems(folder: Path) -> Iterator[BadRecord]:
-    """Yield what is wrong with the seal of a scenario set or run folder; earlier versions wrote none."""
+    """Yield the problems of the seal of a scenario set or run folder; earlier versions wrote none."""
     for name, read in ((MANIFEST, read_manifest), ("run.json", _check_run)):
         file = folder / name
         if file.exists() and isinstance(problem := attempt(read, folder, file=file), BadRecord):

@@ -44,7 +44,7 @@ def find_reader(name: str) -> Reader:
     if name not in readers:
         choices = f"use one of {', '.join((AUTO, *readers))}"
         cure = did_you_mean(name, readers, otherwise=choices)
-        raise UsageError(f"there is no format {name!r}", cure=cure)
+        raise UsageError(f"unknown format {name!r}", cure=cure)
     return readers[name]
 
 

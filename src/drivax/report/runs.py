@@ -51,7 +51,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     if not folders:
         raise UsageError("no run folder is given", cure="drivax report RUN [RUN ...]")
     if repeated := [folder for row, folder in enumerate(folders) if paths[row] in paths[:row]]:
-        raise UsageError("is named twice", file=repeated[0], cure="name each run once")
+        raise UsageError("duplicate run", file=repeated[0], cure="name each run once")
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
     tables, charts = dict[str, list[Path]](), dict[str, list[Path]]()

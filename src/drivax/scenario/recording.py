@@ -337,7 +337,7 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
 
 
 def is_even(timestamps_s: Float[Array, " time"]) -> bool:
-    """Whether no step differs from the median by more than 20 ms."""
+    """Return whether no step differs from the median by more than 20 ms."""
     return step_seconds(timestamps_s)[1] <= LATE_S
 
 

@@ -182,7 +182,7 @@ def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
     while arguments:
         flag = arguments.pop(0)
         if not flag.startswith("--") or flag == "--":
-            raise UsageError(f"{flag!r} is not a setting", cure="write --section.key value")
+            raise UsageError(f"unexpected argument {flag!r}", cure="write --section.key value")
         name, sign, text = flag[2:].partition("=")
         if not sign:
             text = arguments.pop(0) if arguments and not arguments[0].startswith("--") else "true"

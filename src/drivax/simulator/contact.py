@@ -122,7 +122,7 @@ def classify_contacts(
     frame: Frame, slot: Integer, begins: Bool[Array, " S"], speed: Scalar, others_speed: Float[Array, " S"],
     unlawful: Bool[Array, ""],
 ) -> tuple[Bool[Array, " S"], Integer]:  # fmt: skip
-    """Return which contacts that begin at this step (mask ``begins``) are at fault, and the type of the nearest one.
+    """Return a mask of the at-fault contacts among those of ``begins``, and the type of the nearest one of ``begins``.
 
     As in nuPlan, the agent is not at fault if it is stopped. Otherwise it is at fault if the other is stopped, or if
     the other is not behind and the agent hits it with its front or is ``unlawful``: in several lanes or off the road.

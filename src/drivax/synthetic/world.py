@@ -263,7 +263,7 @@ def _drive_without_event(
 def _stage_event(
     inputs: _AttemptInputs, traffic: Traffic, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
-    """Return a recording of the event without perception noise, or why none was staged or the last was rejected."""
+    """Return a recording of the event without perception noise, or the reason for none: no occasion, or a rejection."""
     view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
         staged = stage(inputs.event, view, inputs.severity_mps2, rng)

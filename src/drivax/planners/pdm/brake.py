@@ -35,7 +35,7 @@ _OVERSHOOT = 1.1
 
 @dataclass(frozen=True)
 class BrakeConfig:
-    """When to brake, and how hard; defaults as published.
+    """Thresholds and gains of the emergency brake; defaults as published.
 
     Attributes:
         within_s: Largest time to an at-fault collision that triggers the brake.

@@ -242,7 +242,7 @@ def _adjacent(
 
 
 def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Whether lane ``b`` runs along ``a`` in its direction, its distance and arc-length shift: ``[pair, probe]``."""
+    """Return the mask of lanes ``b`` that run along ``a``, their distance and arc-length shift: ``[pair, probe]``."""
     fraction = np.array(_PROBES)
     index = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
     probe = samples[a][:, index]

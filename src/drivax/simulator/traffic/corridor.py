@@ -56,7 +56,7 @@ class Movers:
 
 @record
 class Leaders:
-    """What is ahead of R vehicles."""
+    """Leaders of R vehicles, and the agents around their corridors."""
 
     # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]

@@ -124,7 +124,7 @@ def _yields_to(
 
 
 def _are_separate(approaches: list[list[Move]], conflicts: Conflicts) -> bool:
-    """Whether no moves of two approaches are in conflict."""
+    """Return whether no moves of two approaches are in conflict."""
     a, b = approaches
     return not any(conflicts[x.lane, y.lane] for x in a for y in b)
 
