@@ -184,7 +184,7 @@ def executed():
         plan = space.plan(poses[:41]).reshape(-1, 3)
         more = poses[40] + jnp.arange(1, 41)[:, None] * (poses[40] - poses[39]) * jnp.array([1, 1, 0])
         car, wheelbase = Car(motion, jnp.float32(0.2), jnp.float32(0.05)), jnp.float32(WHEELBASE)
-        reference = Reference.fitted(plan, 40, wheelbase, CONFIG)
+        reference = Reference.fit(plan, 40, wheelbase, CONFIG)
         cars = track(car, reference, wheelbase, CONFIG, about_axle=True)
         whole = jnp.concatenate([plan, more])
 

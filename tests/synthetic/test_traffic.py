@@ -246,8 +246,8 @@ def test_cars_stop_for_pedestrians_on_a_crossing():
 def test_repeated_runs_are_equal_and_users_keep_their_order():
     network, _ = road(400.0)
     steps = 50
-    parked = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
-    extra = ScriptedUser.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
+    parked = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
+    extra = ScriptedUser.from_pose(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     pedestrians = (Pedestrian(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
     scene = roles(
         network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(parked,)
@@ -323,9 +323,9 @@ def staged_run(seed, world):
             len(traffic.times_s),
             [Pose(*drawn.paths[k].curve.xy[n], 0.0) for k, n in ((1, -80), (0, 300))],
         )
-        pedestrian = ScriptedUser.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), poses[0], steps)
+        pedestrian = ScriptedUser.from_pose(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), poses[0], steps)
         pedestrian.valid[:20] = False
-        car = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), poses[1], steps)
+        car = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.5, 1.8, 1.5), poses[1], steps)
         staging = Staging((Override(1, 66, 90, -5.0),), (pedestrian, car), (Tailgate(2, 0.5),), (3,))
     return Run(traffic, staging, ego)
 

@@ -111,7 +111,7 @@ class Conversion:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of the scenarios."""
-        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+        return CAPACITIES[self.capacity].with_future(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:
@@ -318,7 +318,7 @@ def _digest(data: Survey, formats: Mapping[Path, str | None]) -> str:
     digest = hashlib.sha256()
     for path, name in formats.items():
         size, ends = _ends(path)
-        digest.update(f"{data.relative(path)}\t{size}\t{name}\t{ends}\n".encode())
+        digest.update(f"{data.relative_path(path)}\t{size}\t{name}\t{ends}\n".encode())
     return digest.hexdigest()
 
 
@@ -458,7 +458,7 @@ class _Sink:
 
 def _row(data: Survey, record: BadRecord) -> dict[str, Any]:
     """Return a bad record as JSON values."""
-    return {**vars(record), "file": data.relative(record.file)}
+    return {**vars(record), "file": data.relative_path(record.file)}
 
 
 def _drain(

@@ -99,7 +99,7 @@ class Survey:
         """Return the files of some formats (None: of an unknown one); all without an argument."""
         return [entry.path for entry in self.inputs if not formats or entry.format in formats]
 
-    def relative(self, path: Path) -> str:
+    def relative_path(self, path: Path) -> str:
         """Return a file's name in messages and manifests: its path below the root, or its own name."""
         inside = self.root.is_dir() and path.is_relative_to(self.root)
         return path.relative_to(self.root).as_posix() if inside else path.name

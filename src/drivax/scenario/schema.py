@@ -159,7 +159,7 @@ class Capacity:
     lane_run: int = 160
     egos: int = 1
 
-    def lasting(self, future_s: float) -> Capacity:
+    def with_future(self, future_s: float) -> Capacity:
         """Return the capacity of scenarios with ``future_s`` seconds after the current step, 2 to 60.
 
         Each second beyond 8 s adds 40 m to the room for routes (144 km/h).

@@ -110,7 +110,7 @@ class Generation:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario with these options."""
-        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+        return CAPACITIES[self.capacity].with_future(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:

@@ -37,7 +37,7 @@ from drivax.synthetic.expert.violations import EGO_SKIN_M
 from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, add_perception_noise, largest_shift_m, sight
 from drivax.synthetic.traffic.placement import LARGEST_VEHICLE_M
 from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
@@ -281,7 +281,7 @@ def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Ge
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
     is_visible = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=is_visible)
+    return replace(recording, tracks=add_perception_noise(tracks, ego, rng, config.noise), seen=is_visible)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:

@@ -28,6 +28,7 @@ from drivax.testing import worlds
 from drivax.testing.contract import (
     TOLERANCE,
     Program,
+    are_same,
     array_type,
     check_numbers,
     check_rotated,
@@ -37,7 +38,6 @@ from drivax.testing.contract import (
     layout,
     program,
     result_shapes,
-    same,
 )
 from drivax.testing.worlds import ANGLE
 
@@ -80,7 +80,9 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     check_numbers(what, run(worlds.without_others(bank), index, step))
     result = program(what, act)(bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
     cure = "write it for one agent in one scenario, take randomness from the key, and keep no state between calls"
-    expect(same(actions[0], result, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure)
+    expect(
+        are_same(actions[0], result, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure
+    )
     check_variants(what, actions, worlds.BANK_VARIANTS, lambda change: run(change(bank), index, step))
     check_rotated(what, actions, run(worlds.worlds(ANGLE), index, step))
     if not privileged:

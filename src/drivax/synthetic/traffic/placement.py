@@ -73,14 +73,14 @@ def parked_cars(
         if is_occupied and size[0] < bay.length_m:
             clearance = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
-            pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
-            result.append(ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
+            pose = replace(pose.shift_left(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
+            result.append(ScriptedUser.from_pose(AgentKind.VEHICLE, size, pose, steps))
     has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
         bay, size = network.bays[index], _draw_size(rng, network.bays[index].length_m)
         if _can_double_park(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
-            return (*result, ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
+            return (*result, ScriptedUser.from_pose(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
 
 
@@ -98,7 +98,7 @@ def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: f
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
     side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
-    return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
+    return centre.shift_left(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
 def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
