@@ -83,7 +83,7 @@ def test_environments_by_id(data):
 
 
 @pytest.mark.slow
-def test_discrete_actions(data):
+def test_discrete_action_is_a_pair_of_acceleration_and_curvature_levels(data):
     """Choice i of 7 x 13 is acceleration level i // 13 and curvature level i % 13; the middle one does nothing."""
     env = DrivingEnv(data, replace(SMALL, actions=TASKS["discrete"].actions))
     assert env.action_space == gymnasium.spaces.Discrete(91)

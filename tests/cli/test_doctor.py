@@ -331,7 +331,7 @@ def test_shards_are_grouped_by_folder(tmp_path, capsys):
 # --- The machine.
 
 
-def test_machine(capsys):
+def test_doctor_lists_packages_and_resources_in_100_columns(capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100

@@ -328,7 +328,7 @@ def test_page_names_runs_with_other_starts_or_fewer_scenarios(runs, tmp_path):
     assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
-def test_report_command(runs, tmp_path, capsys):
+def test_report_command_writes_pages_and_reports_errors_in_one_line(runs, tmp_path, capsys):
     assert main(["report", *map(str, runs), "--out", str(tmp_path / "r.html"), "--episodes", "2"]) == 0
     assert "r.html" in capsys.readouterr().out
     assert main(["report", *map(str, runs[:3])]) == 0 and (runs[2] / "report.html").is_file()
