@@ -20,7 +20,7 @@ from drivax.metrics.catalogue import METRICS
 from drivax.report.pages.report import _provenance, write_report
 from drivax.report.pictures.palette import LIGHT
 from drivax.report.pictures.player_data import ABSENT
-from drivax.report.runs import Training, read_runs
+from drivax.report.runs import TrainingCurves, read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
@@ -381,5 +381,7 @@ def test_canvases_are_not_empty(runs, tmp_path, width):
 
 
 def test_provenance_names_the_data_of_a_training():
-    training = Training(Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {})
+    training = TrainingCurves(
+        Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {}
+    )
     assert "sets/a 0123456789ab<" in _provenance([training])

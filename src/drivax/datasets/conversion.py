@@ -25,7 +25,7 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 
-from drivax.datasets.doctor import Estimate, estimate
+from drivax.datasets.doctor import SizeEstimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
 from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean, explain_system
@@ -191,11 +191,11 @@ def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Resul
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConversionPlan:
     """Files to convert, expected size, and number of scenarios that an interrupted conversion has written already."""
 
     data: Survey
-    estimate: Estimate
+    estimate: SizeEstimate
     written: int
 
 
@@ -232,7 +232,7 @@ def convert(
     options: Conversion | None = None,
     progress: Progress | None = None,
     audit: Audit | None = None,
-    announce: Callable[[Plan], None] | None = None,
+    announce: Callable[[ConversionPlan], None] | None = None,
 ) -> Converted:
     """Convert a file or folder of a public data set to a scenario set.
 
@@ -267,7 +267,7 @@ def convert(
         sink = _Sink(writer, data, options, audit)
         expected = estimate(data, Path(out), capacity, options.stride, options.limit)
         if announce is not None:
-            announce(Plan(data, expected, written))
+            announce(ConversionPlan(data, expected, written))
         if not options.filters:  # with filters the size is unknown
             expected.check(Path(out), written)
         done = _drain(data, options, sink, writer, progress)

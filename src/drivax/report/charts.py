@@ -17,7 +17,7 @@ from drivax.geometry.vectors import wrap
 from drivax.metrics import comfort
 from drivax.metrics.comfort import WINDOW, savgol_matrix
 from drivax.report.pictures.palette import Stroke, stroke
-from drivax.report.runs import Training
+from drivax.report.runs import TrainingCurves
 from drivax.scenario.schema import DT_S
 
 #: Size of a chart, and its margins other than the left one, pixels.
@@ -30,7 +30,7 @@ _MAX_POINTS = 150
 _VISIBLE = ("validation", "evaluation", "rollout")
 
 
-def curve_sections(runs: Sequence[Training]) -> str:
+def curve_sections(runs: Sequence[TrainingCurves]) -> str:
     """Return a chart of each quantity that was logged more than once.
 
     The policy's results (:data:`_VISIBLE`), or else the first six quantities, are visible, all others collapsed.
@@ -77,7 +77,7 @@ def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
     return np.stack([bin_points.mean(axis=0) for bin_points in np.array_split(points, _MAX_POINTS)])
 
 
-def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
+def _charts(names: Sequence[str], runs: Sequence[TrainingCurves]) -> str:
     """Return a chart of each quantity, with a line per run that logged it."""
     charts = []
     for name in names:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
-from drivax.settings.structure import Flag, NameAlone, kind_of, parse_yaml, plain, structure, write_yaml
+from drivax.settings.structure import FlagText, NameAlone, kind_of, parse_yaml, plain, structure, write_yaml
 
 __all__ = [
     "check_names", "dump", "is_path", "kind_of", "load", "modules_of", "parse_yaml", "plain", "preset", "presets",
@@ -156,7 +156,7 @@ def _merge(base: Any, values: Any) -> Any:
 
 def _section(value: Any) -> dict[str, Any]:
     """Return a setting as a section: a mapping unchanged, a name as its ``kind``, other values as an empty section."""
-    content = parse_yaml(value) if isinstance(value, Flag) else value
+    content = parse_yaml(value) if isinstance(value, FlagText) else value
     if isinstance(content, str):
         return {NameAlone("kind"): type(value)(content)}
     return content if isinstance(content, dict) else {}
@@ -172,7 +172,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
             section = section[name]
         if key == "kind" and str(section.get("kind")) != text:
             section.clear()  # Settings of the former kind do not apply.
-        section[key] = Flag(text)
+        section[key] = FlagText(text)
     return values
 
 
@@ -221,7 +221,7 @@ def _names(values: Any) -> set[str]:
     stack, names, visited = [values], set[str](), set[int]()
     while stack:
         value = stack.pop()
-        if is_dotted(value) and not isinstance(value, Flag):
+        if is_dotted(value) and not isinstance(value, FlagText):
             names.add(value)
         elif isinstance(value, Mapping | list | tuple) and id(value) not in visited:
             visited.add(id(value))  # YAML may repeat a list by aliases.

@@ -92,7 +92,7 @@ def result_shapes(what: str, function: Callable[..., Any], *arguments: Any) -> A
         return jax.eval_shape(function, *arguments)
 
 
-class Program:
+class BatchedFunction:
     """A compiled and batched function, called ``what`` in messages; ``in_axes`` as in ``jax.vmap``."""
 
     def __init__(

@@ -27,7 +27,7 @@ from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     TOLERANCE,
-    Program,
+    BatchedFunction,
     are_same,
     array_type,
     check_numbers,
@@ -74,7 +74,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     _check_layout(what, simulator, planner, bank)
     index, step = (axis.ravel() for axis in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     act = _two_actions(simulator, planner)
-    run = Program(what, act, (None, 0, 0))
+    run = BatchedFunction(what, act, (None, 0, 0))
     actions = run(bank, index, step)
     check_numbers(what, actions)
     check_numbers(what, run(worlds.without_others(bank), index, step))
@@ -154,7 +154,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     what = f"traffic {traffic.name!r}"
     bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
-    index, run = jnp.arange(len(bank)), Program(what, _roll_out(traffic), (None, 0))
+    index, run = jnp.arange(len(bank)), BatchedFunction(what, _roll_out(traffic), (None, 0))
     rollout: _Rollout = run.check_pure(bank, index)
     _check_rows(what, rollout)
 
