@@ -36,7 +36,7 @@ _TTC_HORIZON_S = 5.0
 _APPEARANCE_M = 40.0
 #: Longitudinal and lateral distance of a new actor from other agents, m: for a vehicle, and for other kinds of actors.
 _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
-#: Distance of centres below which parallel vehicles are in the way of a new actor, m.
+#: Distance of centres below which parallel vehicles block a new actor, m.
 _SAME_LANE_M = 6.5
 #: Margins added to the length and width of a crossing vehicle, and largest distance of centres in overlap tests, m.
 _CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
@@ -166,7 +166,7 @@ def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
 
 
 def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
-    """Return the rows of vehicles that are in the way of a new actor at any step up to ``until``.
+    """Return the rows of vehicles that block a new actor at any step up to ``until``.
 
     Lanes play no role: a vehicle counts if it is near the actor and has about the same heading.
     """
