@@ -106,7 +106,7 @@ def test_pages_are_found():
 
 
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_python_blocks_of_each_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Blocks of a page share their names, as a reader who types them in order has them.
 
     A block that begins with the name of a file, as ``# my_terms.py``, is that file in the folder of the reader.
@@ -137,7 +137,7 @@ def test_imports_are_public_names_of_rooms(file: Path):
 
 
 @pytest.mark.parametrize("block", SHELL_BLOCKS, ids=lambda block: block.place)
-def test_commands_exist(block: Block):
+def test_commands_in_docs_exist_with_their_flags(block: Block):
     for words in commands(block):
         flags = [word.split("=")[0] for word in words[1:] if word.startswith("--")]
         if len(words) == 1 or words[1] in ("--help", "--version"):

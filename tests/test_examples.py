@@ -22,7 +22,7 @@ def test_there_are_five_examples():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
-def test_example_runs(
+def test_example_runs_and_prints_a_result(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -1,4 +1,4 @@
-"""User errors in one line: what is wrong, where, and what to do about it."""
+"""User errors in one line: problem, location and cure."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
 
 
 def explain_library(error: BaseException) -> DrivaxError | None:
-    """Return what :func:`explain_system` returns for the system error that TensorStore or XLA quotes; None without one.
+    """Apply :func:`explain_system` to the system error that TensorStore or XLA quotes; None without one.
 
     Use it only for errors that end a command: an error about a damaged file may quote untrusted text.
     """

@@ -325,7 +325,7 @@ class PartialFolder:
         self._release()
 
     def restore(self) -> None:
-        """Give a folder its name back if a process was killed while it replaced the folder."""
+        """Restore the name of a folder if a process was killed while it replaced the folder."""
         if not self._target.exists() and self._old.is_dir():
             # The process is still running, or the disk is read-only.
             with contextlib.suppress(UsageError, OSError):
@@ -381,7 +381,7 @@ def can_resume(path: Path) -> bool:
 
 
 def restore_folder(path: Path) -> None:
-    """Give the folder ``path`` its name back if a process was killed while it replaced the folder."""
+    """Restore the name ``path`` of a folder if a process was killed while it replaced the folder."""
     PartialFolder(path).restore()
 
 

@@ -154,7 +154,7 @@ def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
         train(patient, data, tmp_path / "other", validation=None)
 
 
-def test_patience():
+def test_patience_ends_without_a_better_rank():
     ranks = [(0.1,), (0.5,), (0.5,), (0.4,), (0.6,)]
     assert [patience_exceeded(ranks[:n], 2) for n in range(6)] == [False, False, False, False, True, False]
     assert not patience_exceeded(ranks, 0) and not patience_exceeded([], 3)
@@ -163,7 +163,7 @@ def test_patience():
     assert patience_exceeded([(0.9, 0.5, 0.2), (0.8, 1.0, 1.0)], 1)
 
 
-def test_ranks():
+def test_ranks_compare_failures_before_progress_before_comfort():
     row = {
         "validation/vmax_score": 0.7, "validation/accuracy": 0.75, "validation/progress_ratio": 0.9,
         "validation/comfortable": None, "loss/value": 3.0,

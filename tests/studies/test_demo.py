@@ -6,7 +6,7 @@ import pytest
 
 from drivax.errors import DataError, UsageError
 from drivax.stats.intervals import Interval
-from drivax.studies.demo import Demo, run_demo
+from drivax.studies.demo import DemoResult, run_demo
 
 
 @pytest.mark.parametrize(
@@ -34,5 +34,5 @@ def test_demo_refuses_a_file_and_a_folder_with_content(tmp_path):
 
 def test_difference_of_a_single_scenario_has_no_interval():
     difference = {"success": Interval(0.5, None, None, 1).as_dict()}
-    text = Demo(Path("report.html"), [], {"idm": difference}, {"report": 1.0}).text()
+    text = DemoResult(Path("report.html"), [], {"idm": difference}, {"report": 1.0}).text()
     assert "policy - idm: success +0.500 [–, –] over 1 scenarios" in text

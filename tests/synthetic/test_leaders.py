@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.traffic.leaders import Leaders
+from drivax.synthetic.traffic.leaders import LeaderSearch
 from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
 
@@ -18,7 +18,7 @@ def leaders(routes, at, table, active=None, **roads):
     worlds = Worlds([network], [len(routes)])
     tables = PathTables(worlds, [lane_path(network, route, Sway()) for route in routes], table)
     is_active = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(worlds, table).find(tables, np.array(at, float), is_active)
+    return LeaderSearch(worlds, table).find(tables, np.array(at, float), is_active)
 
 
 @pytest.mark.parametrize("seed", range(5))

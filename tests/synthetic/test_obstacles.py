@@ -36,7 +36,7 @@ def street(high=6.0):
 
 
 def parked(x, y, steps, speed=None):
-    one = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
+    one = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
     return one if speed is None else dataclasses.replace(one, speed=np.full(steps, speed))
 
 

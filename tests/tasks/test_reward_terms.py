@@ -338,7 +338,7 @@ def test_terms_read_only_their_registered_facts(term):
     )
 
 
-def test_published_weights():
+def test_published_presets_have_the_published_weights():
     assert {"collision": -1, "offroad": -1, "red_light": -1}.items() <= PUBLISHED.items()
     rest = {"off_route": -0.2, "any_progress": 0.2, "comfort": 0.2, "any_speeding": -0.1}
     assert dict(PUBLISHED.items() - PRESETS["safety"].items()) == rest
@@ -456,7 +456,7 @@ def test_own_terms_have_factors():
     assert conditioned(rewards, {"alive": 0.25})["alive"] == pytest.approx(0.075)
 
 
-def test_configurations():
+def test_reward_weights_override_presets_and_are_checked():
     rewards = {"preset": "published", "collision_margin_m": 0.5, "ttc": -0.3, "ttc_s": 0.95}
     made = settings.load(TrainConfig, {"task": {"rewards": rewards}}).task.rewards
     assert made.weights() == PUBLISHED | {"ttc": -0.3} and made.ttc_s == 0.95

@@ -44,7 +44,7 @@ def find_reader(name: str) -> Reader:
     if name not in readers:
         choices = f"use one of {', '.join((AUTO, *readers))}"
         cure = did_you_mean(name, readers, otherwise=choices)
-        raise UsageError(f"there is no format {name!r}", cure=cure)
+        raise UsageError(f"unknown format {name!r}", cure=cure)
     return readers[name]
 
 
@@ -99,7 +99,7 @@ class Survey:
         """Return the files of some formats (None: of an unknown one); all without an argument."""
         return [entry.path for entry in self.inputs if not formats or entry.format in formats]
 
-    def relative(self, path: Path) -> str:
+    def relative_path(self, path: Path) -> str:
         """Return a file's name in messages and manifests: its path below the root, or its own name."""
         inside = self.root.is_dir() and path.is_relative_to(self.root)
         return path.relative_to(self.root).as_posix() if inside else path.name

@@ -1,4 +1,4 @@
-"""Data that drivax does not read, and what to use instead: other forms of public data sets, archives, scenario sets.
+"""Errors for unsupported data, with a cure: other forms of public data sets, archives, scenario sets.
 
 Detection reads the beginning of a file, its first record, or file names.
 """

@@ -269,7 +269,7 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
 def _corner_distances(
     bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
 ) -> Float[Array, "t 4"]:
-    """Return how far each corner of ego's boxes is beyond the road edges, m, at ground heights ``z``."""
+    """Return the distance of each corner of ego's boxes beyond the road edges, m, at ground heights ``z``."""
     index = jnp.zeros((), jnp.int32)
 
     def box_distances(box: Float[Array, " 6"], ground: Float[Array, ""]) -> Float[Array, " 4"]:

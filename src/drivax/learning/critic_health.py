@@ -92,7 +92,7 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
 def critic_problems(
     rows: Sequence[Mapping[str, float]], entropy: float | None = None, needs_failures: bool = False
 ) -> list[str] | None:
-    """Return what is wrong with the critics of a run, given its rows of ``metrics.jsonl`` up to the loaded policy.
+    """Diagnose the critics of a run from its rows of ``metrics.jsonl`` up to the loaded policy; return the problems.
 
     None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
     None for a policy without one; ``needs_failures`` is the setting of the algorithm.

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.plugins import find_named, is_dotted, is_trusted, trust_cure
 from drivax.reading import read_text
-from drivax.settings.structure import Flag, NameAlone, parse_yaml, plain, structure, write_yaml
+from drivax.settings.structure import FlagText, NameAlone, parse_yaml, plain, structure, write_yaml
 
 Record = TypeVar("Record")
 
@@ -143,7 +143,7 @@ def _merge(base: Any, values: Any) -> Any:
 
 def _section(value: Any) -> dict[str, Any]:
     """Return a setting as a section: a mapping unchanged, a name as its ``kind``, other values as an empty section."""
-    content = parse_yaml(value) if isinstance(value, Flag) else value
+    content = parse_yaml(value) if isinstance(value, FlagText) else value
     if isinstance(content, str):
         return {NameAlone("kind"): type(value)(content)}
     return content if isinstance(content, dict) else {}
@@ -159,7 +159,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
             section = section[name]
         if key == "kind" and str(section.get("kind")) != text:
             section.clear()  # Settings of the former kind do not apply.
-        section[key] = Flag(text)
+        section[key] = FlagText(text)
     return values
 
 
@@ -169,7 +169,7 @@ def _parse_flags(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
     while arguments:
         flag = arguments.pop(0)
         if not flag.startswith("--") or flag == "--":
-            raise UsageError(f"{flag!r} is not a setting", cure="write --section.key value")
+            raise UsageError(f"unexpected argument {flag!r}", cure="write --section.key value")
         name, sign, text = flag[2:].partition("=")
         if not sign:
             text = arguments.pop(0) if arguments and not arguments[0].startswith("--") else "true"
@@ -208,7 +208,7 @@ def _names(values: Any) -> set[str]:
     stack, names, visited = [values], set[str](), set[int]()
     while stack:
         value = stack.pop()
-        if is_dotted(value) and not isinstance(value, Flag):
+        if is_dotted(value) and not isinstance(value, FlagText):
             names.add(value)
         elif isinstance(value, Mapping | list | tuple) and id(value) not in visited:
             visited.add(id(value))  # YAML may repeat a list by aliases.

@@ -56,7 +56,7 @@ class DemoConfig:
 
 
 @dataclass(frozen=True)
-class Demo:
+class DemoResult:
     """Result of the demo: the report, a summary of each planner, the policy's paired differences, seconds by stage."""
 
     report: Path
@@ -108,7 +108,7 @@ class _Stages:
 def run_demo(
     out: Path, config: DemoConfig | None = None, log: Callable[[str], None] = lambda _: None, *,
     overwrite: bool = False,
-) -> Demo:  # fmt: skip
+) -> DemoResult:  # fmt: skip
     """Generate both sets, train, evaluate all planners and write the report.
 
     Args:
@@ -159,7 +159,7 @@ def run_demo(
         for name in REFERENCES
     }
     summaries = [result.summary() for result in results.values()]
-    demo = Demo(report, summaries, differences, stages.seconds())
+    demo = DemoResult(report, summaries, differences, stages.seconds())
     write_json(result_file, demo.as_json())
     return demo
 

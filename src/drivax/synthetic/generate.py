@@ -110,7 +110,7 @@ class Generation:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario with these options."""
-        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+        return CAPACITIES[self.capacity].with_future(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:
@@ -318,7 +318,7 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
 
 
 @dataclass(frozen=True)
-class Split:
+class BenchmarkSplit:
     """One of the benchmark's sets; without a ``rare_rate`` it has the configuration's share of events."""
 
     scenarios: int
@@ -326,12 +326,12 @@ class Split:
     rare_rate: float | None = None
 
 
-SPLITS: Mapping[str, Split] = MappingProxyType(
+SPLITS: Mapping[str, BenchmarkSplit] = MappingProxyType(
     {
-        "train": Split(4096, RESERVED_SEED),
-        "validation": Split(512, RESERVED_SEED + 1),
-        "test": Split(1024, RESERVED_SEED + 2),
-        "test-rare": Split(512, RESERVED_SEED + 3, rare_rate=1.0),
+        "train": BenchmarkSplit(4096, RESERVED_SEED),
+        "validation": BenchmarkSplit(512, RESERVED_SEED + 1),
+        "test": BenchmarkSplit(1024, RESERVED_SEED + 2),
+        "test-rare": BenchmarkSplit(512, RESERVED_SEED + 3, rare_rate=1.0),
     }
 )
 

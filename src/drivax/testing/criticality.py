@@ -13,7 +13,7 @@ from drivax.curation.logged import LoggedScenario, read_log
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.testing import worlds
 from drivax.testing.contract import (
-    Program,
+    BatchedFunction,
     array_type,
     check_numbers,
     check_rotated,
@@ -51,7 +51,7 @@ def check_criticality(method: Callable[[ScenarioBank, LoggedScenario], dict[str,
             expect(is_right, problem, "return a number for every step of the log")
         return values
 
-    program, bank = Program(what, components, (None, 0)), worlds.worlds()
+    program, bank = BatchedFunction(what, components, (None, 0)), worlds.worlds()
     rows = jnp.arange(len(bank))
     result = program.check_pure(bank, rows)
     check_numbers(what, result)

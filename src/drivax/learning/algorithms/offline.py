@@ -305,7 +305,7 @@ class Offline(OffPolicy[Config]):
         return metrics
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
-        """Return what is wrong with the critics of a finished run, given the rows of its log; None if not checked."""
+        """Return the problems of the critics of a finished run, given the rows of its log; None if not checked."""
         return critic_problems(rows, getattr(self, "target_entropy", None), self.config.needs_failures)
 
     def q_value(

@@ -23,6 +23,6 @@ from .roles import ScriptedUser as ScriptedUser
 from .roles import Staging as Staging
 from .roles import Tailgate as Tailgate
 from .simulation import Run as Run
-from .simulation import Traffic as Traffic
+from .simulation import WorldTraffic as WorldTraffic
 from .simulation import run_all as run_all
 from .simulation import simulate as simulate

@@ -19,7 +19,7 @@ from drivax.synthetic.traffic.roles import Drivers
 _CYCLIST_PASSING_M = 0.35 + 0.55 + 1.5
 
 
-class Leaders:
+class LeaderSearch:
     """Search for the leader of every vehicle."""
 
     def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
