@@ -143,33 +143,25 @@ def train(
     scenarios, weights, validation_scenarios = _divide(config, data, training.weights, validation_set)
     source = Source.of(config, scenarios, weights, episodes, trust)
     residents = Residents.of(source, opts.memory)
-    if residents is not None:
-        config = replace(config, residency=residents.rotation.residency)
-    bank = source.load() if residents is None else residents.load(0)
+    config, bank = residents.config, residents.load()
     learner = config.algorithm.build(source.environment, bank, config.iterations)
     held_out = _held_out(config, source.environment, learner, validation_scenarios, episodes)
     seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
-    iteration_data = source.complete(bank) if residents is None else residents.complete(bank, 0)
-    program = Program(Seeds(learner, tuple(seeds)), iteration_data, config.devices)
-    if opts.resume:
-        warn_of_other_bits(folders[0].info, len(program.devices), opts.log)
+    program = Program(Seeds(learner, tuple(seeds)), residents.complete(bank), config.devices)
+    warn_of_other_bits([folder.info for folder in folders], len(program.devices), opts.log)
     (memory := program.account(None if held_out is None else held_out.bank)).check()
-    if isinstance(validation_set, HoldOut):
-        opts.log(validation_set.text())
-    opts.log(memory.text())
-    if residents is not None:
-        opts.log(residents.note)
+    notice = validation_set.text() if isinstance(validation_set, HoldOut) else ""
+    for line in filter(None, (notice, residents.text(bank), memory.text())):
+        opts.log(line)
     # Read before folders are created, because an error must leave none.
     networks = {} if opts.resume else pretrained_networks(config.begin_from, program, opts.log)
     rules = (config.checkpoint_rule, config.keep, config.patience)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(explain_full_disk(out))
+    use = f"in training; {memory.text()}"
+    with contextlib.ExitStack() as stack, explain_full_disk(out), report_out_of_memory(use, memory.cure):
         notes["devices"] = len(program.devices)
         folders = folders or _create_folders(config, data, notes, out, seeds, opts.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
-        stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
-        if residents is not None:
-            stack.callback(residents.close)
+        stack.callback(residents.close)
         _Training(config, program, logs, held_out, networks, opts.log, trust, residents).run()
     return RunFolder.open(out)
 
@@ -350,7 +342,7 @@ class _Training:
     networks: Mapping[str, Any]
     log: Callable[[str], None]
     trust: Sequence[str]
-    residents: Residents | None
+    residents: Residents
 
     def run(self) -> None:
         """Run the remaining iterations.
@@ -361,9 +353,7 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
-        if self.residents is not None and done:
-            bank = self.residents.load(done)
-            program.data = program.place(self.residents.complete(bank, done))
+        self.residents.resume(program, done)
         total_steps, done_steps = self._steps(config.iterations), self._steps(done)
         with Progress("training", "steps", total_steps, done=done_steps) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
@@ -372,9 +362,7 @@ class _Training:
                 started = time.perf_counter()
                 state, values, finite = program.step(state)
                 values, finite = jax.device_get((values, finite))
-                exchanged: dict[str, float] = {}
-                if self.residents is not None:
-                    state, exchanged = self.residents.exchange(program, state, iteration)
+                state, exchanged = self.residents.exchange(program, state, iteration)
                 rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
                 # Read once, so that all seeds write a checkpoint of the same iteration.
                 preempted = stop.received and iteration < config.iterations

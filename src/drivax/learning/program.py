@@ -244,13 +244,17 @@ def former_devices(info: Mapping[str, Any]) -> int:
     return int(info.get("devices") or 1)  # Runs of version 0.1.0 lack it; those on a CPU used one.
 
 
-def warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
-    """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
-    differences = [kernels_difference(info)]
-    if (former := former_devices(info)) != devices:
-        differences.append(f"the run used {former} devices, this process {devices}")
-    for difference in filter(None, differences):
-        log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
+def warn_of_other_bits(infos: Sequence[Mapping[str, Any]], devices: int, log: Callable[[str], None]) -> None:
+    """Warn if a run to resume used other native kernels or another number of devices.
+
+    ``infos`` are the ``run.json`` of its folders, of which the first is read; none for a new run.
+    """
+    for info in infos[:1]:
+        differences = [kernels_difference(info)]
+        if (former := former_devices(info)) != devices:
+            differences.append(f"the run used {former} devices, this process {devices}")
+        for difference in filter(None, differences):
+            log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
 
 
 def shard_axis(tree: Any, axis: int) -> Any:

@@ -30,7 +30,6 @@ from drivax.learning.program import Program
 from drivax.learning.replay import Replay
 from drivax.learning.training_set import Rows, Source
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
 
 #: Mean number of episodes that begin in a scenario while it is resident, and the steps of an episode that is assumed.
 _EPISODES, _EPISODE_STEPS = 8, 40
@@ -38,6 +37,8 @@ _EPISODES, _EPISODE_STEPS = 8, 40
 _MOST_LEAVING = 0.125
 #: Most scenarios of a block: their arrays are stacked together.
 _MOST_BLOCK = 64
+#: Loads scenarios by their numbers.
+_Load = Callable[[Rows], ScenarioBank]
 #: Scenarios whose bytes stand for those of all.
 _SAMPLE = 32
 
@@ -75,6 +76,10 @@ class Rotation:
         """Number of blocks that take no new episodes."""
         return -(-self.lead // self.residency.every) + 1 if self.lead else 0
 
+    def exchanges(self, iteration: int) -> int:
+        """Return the number of exchanges in a number of iterations."""
+        return iteration // self.residency.every
+
     def resident(self, exchanges: int) -> Int[np.ndarray, " R"]:
         """Return the resident scenarios after a number of exchanges, by row."""
         block = self.residency.block
@@ -107,18 +112,6 @@ class Rotation:
             result[of_pass] = _shuffled(self.total, self.seed, int(number))[place[of_pass]]
         return result
 
-    def text(self, scenario_bytes: float, config: TrainConfig) -> str:
-        """Return a line for the log of a run, given the bytes of a scenario."""
-        residency, iterations = self.residency, config.iterations
-        size = format_bytes(int(residency.scenarios * scenario_bytes))
-        of_pass = math.ceil(self.total * residency.every / residency.block)
-        passes = (residency.scenarios + iterations // residency.every * residency.block) / self.total
-        return (
-            f"residency: {residency.scenarios:,} of {self.total:,} scenarios ({size} per device); "
-            f"{residency.block} are exchanged every {residency.every} iterations, all in {of_pass:,} of "
-            f"{iterations:,}: a scenario is resident {passes:.1f} times"
-        )
-
 
 @lru_cache(maxsize=2)
 def _shuffled(total: int, seed: int, number: int) -> Int[np.ndarray, " total"]:
@@ -139,37 +132,34 @@ def _within(scenarios: int, steps_per_iteration: int, lead: int) -> Residency:
 
 
 class Residents:
-    """The resident scenarios of a training run; a thread prepares the block that enters next."""
+    """The scenarios on the device in a training run: all of them, or some that a thread reads and exchanges."""
 
-    def __init__(
-        self, rotation: Rotation, load: Callable[[Rows], Any], source: Source, note: str = ""
-    ) -> None:
-        self.rotation, self.note = rotation, note
-        self._load, self._source = load, source
+    def __init__(self, source: Source, rotation: Rotation | None = None, load: _Load | None = None) -> None:
+        self.source, self.rotation = source, rotation
+        self._load = load
         self._thread = ThreadPoolExecutor(1, "residents")
-        self._next: Future[Any] | None = None
-        self._update = jax.jit(partial(_replace_rows, rotation.residency), donate_argnums=0)
+        self._next: Future[ScenarioBank] | None = None
 
     @classmethod
-    def of(cls, source: Source, memory: int | None) -> Residents | None:
-        """Return the residents of a run, as configured or as many as fit in ``memory`` bytes; None: all are resident.
+    def of(cls, source: Source, memory: int | None) -> Residents:
+        """Return the residents of a run: as configured, as many as fit in ``memory`` bytes, or all.
 
         Raises:
             UsageError: There are recorded episodes, or too few scenarios are resident for the length of episodes.
         """
         config, total = source.config, len(source.scenarios)
         if memory is None and config.residency is None:
-            return None
+            return cls(source)
         if source.episodes:
             cure = "leave out --memory and residency, or the episodes"
             raise UsageError("recorded episodes need all of their scenarios on the device", cure=cure)
-        load = partial(_load, source, Sizes.used(source.scenarios), False)
+        load = partial(_load, source, False)
         rows = np.arange(min(total, _SAMPLE))
         sample = load(rows)
         learner = config.algorithm.build(source.environment, sample, config.iterations)
         experience = source.complete(sample, rows)
         if isinstance(experience, Experience):
-            load = partial(_load, source, Sizes.used(source.scenarios), True)
+            load = partial(_load, source, True)
             sample = load(rows)
         scenario_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(sample)) / len(rows)
         state = jax.eval_shape(learner.init, experience, jax.random.key(0))
@@ -182,14 +172,21 @@ class Residents:
             copies = config.devices or jax.local_device_count() if jax.default_backend() == "cpu" else 1
             scenarios = int((memory or 0) / (scenario_bytes * copies))
             if scenarios >= total:
-                return None
+                return cls(source)
             residency = _within(scenarios, steps, lead)
-        rotation = Rotation(residency, total, config.seed, lead)
-        return cls(rotation, load, source, rotation.text(scenario_bytes, config))
+        return cls(source, Rotation(residency, total, config.seed, lead), load)
 
-    def load(self, iteration: int) -> ScenarioBank:
-        """Return the bank for an iteration, given the number of finished ones, and begin to load the next block."""
-        exchanges = self._exchanges(iteration)
+    @property
+    def config(self) -> TrainConfig:
+        """Settings of the run, with the residency that was chosen."""
+        config = self.source.config
+        return config if self.rotation is None else replace(config, residency=self.rotation.residency)
+
+    def load(self, iteration: int = 0) -> Any:
+        """Return the environment's data in an iteration, given the number of finished ones; begin to read a block."""
+        if self.rotation is None or self._load is None:
+            return self.source.load()
+        exchanges = self.rotation.exchanges(iteration)
         blocks = np.split(self.rotation.resident(exchanges), self.rotation.blocks)
         # Block by block as in training, because batches of other sizes may round otherwise.
         bank = jax.tree.map(_join, *(jax.tree.map(np.asarray, self._load(rows)) for rows in blocks))
@@ -198,9 +195,16 @@ class Residents:
         self._next = self._thread.submit(self._load, self.rotation.entering(exchanges))
         return replace(bank, chances=jnp.asarray(self.rotation.chances(exchanges)))
 
-    def complete(self, bank: ScenarioBank, iteration: int) -> Any:
-        """Return the data of the iteration after a number of finished ones, given its bank."""
-        return self._source.complete(bank, self.rotation.resident(self._exchanges(iteration)))
+    def complete(self, data: Any, iteration: int = 0) -> Any:
+        """Return the data of the algorithm in an iteration, given those of the environment."""
+        if self.rotation is None:
+            return self.source.complete(data)
+        return self.source.complete(data, self.rotation.resident(self.rotation.exchanges(iteration)))
+
+    def resume(self, program: Program, iteration: int) -> None:
+        """Load the data of a run that continues after some iterations."""
+        if self.rotation is not None and iteration:
+            program.data = program.place(self.complete(self.load(iteration), iteration))
 
     def exchange(self, program: Program, state: Any, iteration: int) -> tuple[Any, dict[str, float]]:
         """Exchange a block if one is due after an iteration; return the state, and values to log.
@@ -209,33 +213,49 @@ class Residents:
             DataError: A scenario is damaged, or its file has vanished.
         """
         rotation = self.rotation
-        if iteration % rotation.residency.every or self._next is None:
+        if (
+            rotation is None
+            or self._next is None
+            or self._load is None
+            or iteration % rotation.residency.every
+        ):
             return state, {}
         started = time.perf_counter()
-        exchanges = self._exchanges(iteration)
+        exchanges = rotation.exchanges(iteration)
         block, first = self._next.result(), rotation.first_row(exchanges - 1)
         waited = time.perf_counter() - started
         self._next = self._thread.submit(self._load, rotation.entering(exchanges))
         bank = replace(environment_data(program.data), chances=None)
         program.data = None  # its arrays are donated
-        bank = self._update(bank, program.place(block), first)
+        bank = _replace_rows(bank, program.place(block), first, rotation.residency)
         bank = replace(bank, chances=program.place(jnp.asarray(rotation.chances(exchanges))))
         program.data = program.place(self.complete(bank, iteration))
         state = _leave(state, first, rotation.residency.block)
         taken = time.perf_counter() - started
         return state, {"residency/waited_s": waited, "residency/exchange_s": taken}
 
-    def _exchanges(self, iteration: int) -> int:
-        return iteration // self.rotation.residency.every
+    def text(self, bank: ScenarioBank) -> str:
+        """Return a line for the log, given the bank; nothing if all scenarios are resident."""
+        if self.rotation is None:
+            return ""
+        rotation, residency, iterations = self.rotation, self.rotation.residency, self.config.iterations
+        size = format_bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(bank)))
+        entering = iterations // residency.every * residency.block
+        times = (residency.scenarios + entering) / rotation.total
+        return (
+            f"residency: {residency.scenarios:,} of {rotation.total:,} scenarios ({size} per device), "
+            f"{residency.block} exchanged every {residency.every} iterations: {entering:,} enter in the run, so that "
+            f"each is resident {times:.1f} times"
+        )
 
     def close(self) -> None:
         """Stop the thread."""
         self._thread.shutdown(cancel_futures=True)
 
 
-def _load(source: Source, sizes: Sizes, replays_log: bool, rows: Rows) -> ScenarioBank:
+def _load(source: Source, replays_log: bool, rows: Rows) -> ScenarioBank:
     """Return the bank of some scenarios, with the expert's steps if the algorithm learns from them."""
-    bank = source.bank(source.scenarios.take(rows.tolist()), sizes)
+    bank = source.bank(source.scenarios.take(rows.tolist()), source.scenarios.sizes)
     source.scenarios.release()
     return with_expert_steps(source.environment, bank) if replays_log else bank
 
@@ -244,14 +264,15 @@ def _join(*blocks: np.ndarray[Any, Any]) -> Array:
     return jax.device_put(np.concatenate(blocks))
 
 
-def _replace_rows(residency: Residency, data: Any, part: Any, first: Int[Array, ""]) -> Any:
-    """Return the data with a block of scenarios replaced from row ``first`` on."""
+@partial(jax.jit, static_argnums=3, donate_argnums=0)
+def _replace_rows(bank: Any, block: Any, first: Int[Array, ""], residency: Residency) -> Any:
+    """Return the bank with a block of scenarios replaced from row ``first`` on."""
 
     def update(rows: Array, new: Array) -> Array:
         per_scenario = rows.shape[0] // residency.scenarios
         return jax.lax.dynamic_update_slice_in_dim(rows, new, first * per_scenario, 0)
 
-    return jax.tree.map(update, data, part)
+    return jax.tree.map(update, bank, block)
 
 
 def _leave(state: Any, first: int, count: int) -> Any:
