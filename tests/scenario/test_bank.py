@@ -111,8 +111,8 @@ def test_batches_of_scenarios_stack_as_single_scenarios(monkeypatch, batch):
     assert Sizes.used(iter(scenarios)) == sizes
     bank = ScenarioBank.from_scenarios(scenarios, trim=sizes)
     for name in (field.name for field in fields(ScenarioBank) if not field.metadata):
-        if name == "chances":
-            assert bank.chances is None
+        if name in ("chances", "reward_factors"):
+            assert getattr(bank, name) is None
             continue
         each = np.concatenate([np.asarray(getattr(single, name)) for single in alone])
         np.testing.assert_array_equal(np.asarray(getattr(bank, name)), each, err_msg=name)

@@ -16,6 +16,7 @@ from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
+from drivax.learning.curriculum import Stage
 from drivax.learning.driving import Driving, Egos, check_learnable
 from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.learning.training_log import Rule
@@ -85,6 +86,7 @@ class TrainConfig:
             :class:`~drivax.learning.driving.Driving`). The first episodes of a run may also begin later, so that they
             end at different times.
         residency: Scenarios on the device at a time; None: all of them.
+        curriculum: Stages of the run (:mod:`drivax.learning.curriculum`); none: a single one.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are loaded,
             the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.
@@ -106,6 +108,7 @@ class TrainConfig:
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
     residency: Residency | None = None
+    curriculum: tuple[Stage, ...] = ()
     begin_from: str | None = None
     evaluate_every: int = 0
     checkpoint_every: int = 20
@@ -118,6 +121,15 @@ class TrainConfig:
         check_learnable(self.task.actions)
         check_at_least(self, 1, "total_steps", "checkpoint_every", "keep")
         check_at_least(self, 0, "evaluate_every", "patience")
+        names = [stage.name for stage in self.curriculum]
+        if duplicates := [name for name in names if names.count(name) > 1]:
+            raise UsageError(f"duplicate stage {duplicates[0]!r}", cure="give each stage its own name")
+        if self.curriculum and isinstance(self.algorithm, OfflineConfig):
+            raise UsageError(
+                "a curriculum needs an algorithm that drives", cure="use ppo, sac, a warm start or bc"
+            )
+        if self.curriculum and self.residency is not None:
+            raise UsageError("a curriculum needs all scenarios on the device", cure="leave out residency")
         if self.patience and not self.evaluate_every:
             raise UsageError("patience needs validations", cure="set evaluate_every")
         fitted_q = isinstance(self.algorithm, OfflineConfig) and self.algorithm.fitted_q.updates > 0

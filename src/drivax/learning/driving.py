@@ -223,6 +223,10 @@ class Driving:
         if self.task.hold > 1:
             carry, _ = jax.lax.scan(step_on, carry, None, self.task.hold - 1)
         state, last_step, (reward, terms, terminated, truncated) = carry
+        if data.reward_factors is not None:
+            # A loss by a soft factor, TERM/FACTOR, belongs to its term.
+            terms = {n: data.reward_factors[n.partition("/")[0]] * value for n, value in terms.items()}
+            reward = sum(terms.values(), start=jnp.zeros_like(reward))
         ends = terminated | truncated
         # Metrics end with the episode, although vehicles of self-play drive on.
         episodes = replace(state, context=replace(state.context, step=last_step))

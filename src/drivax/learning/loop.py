@@ -19,6 +19,7 @@ from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.curriculum import mean_rollout
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving, count_egos
 from drivax.learning.experience import Experience, check_weights
@@ -352,7 +353,7 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
-        self.residents.resume(program, done)
+        self.residents.resume(program, done, self._logged(done) if config.curriculum else ())
         total_steps, done_steps = self._steps(config.iterations), self._steps(done)
         with Progress("training", "steps", total_steps, done=done_steps) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
@@ -366,8 +367,11 @@ class _Training:
                 # Read once, so that all seeds write a checkpoint of the same iteration.
                 preempted = stop.received and iteration < config.iterations
                 means = (mean_logs(program.seeds.member(values, number)) for number in range(len(self.logs)))
-                rows = [row | exchanged | {"steps_per_second": rate} for row in means]
+                stage = self.residents.note()
+                rows = [row | exchanged | stage | {"steps_per_second": rate} for row in means]
                 self._check(iteration, state, rows, np.atleast_1d(finite))
+                if line := self.residents.follow(program, mean_rollout(rows)):
+                    self.log(f"{line}, from step {self._steps(iteration):,}")
                 self._record(iteration, state, rows, preempted)
                 success = [row["rollout/success"] for row in rows if "rollout/success" in row]
                 note = f"success {sum(success) / len(success):.2f}" if success else ""
@@ -395,6 +399,12 @@ class _Training:
             log.folder = log.folder.note(critics=problems)
             for problem in problems or ():
                 self.log(f"warning: seed {seed}: unhealthy critics: {problem}")
+
+    def _logged(self, done: int) -> list[dict[str, float]]:
+        """Return the mean over seeds of what each finished iteration logged about rollouts."""
+        tables = [{row["step"]: row for row in log.folder.metric_rows()} for log in self.logs]
+        steps = map(self._steps, range(1, done + 1))
+        return [mean_rollout([table[step] for table in tables if step in table]) for step in steps]
 
     def _steps(self, iteration: int) -> int:
         """Return the environment steps of each seed after an iteration."""

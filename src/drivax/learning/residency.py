@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Int, UInt
 from drivax.errors import UsageError
 from drivax.files import format_bytes
 from drivax.learning.config import Residency, TrainConfig
+from drivax.learning.curriculum import Curriculum, Row
 from drivax.learning.driving import with_expert_steps
 from drivax.learning.environment import Environments, cumulative_probability
 from drivax.learning.experience import Experience, environment_data
@@ -140,6 +141,12 @@ class Residents:
         self._load = load
         self._thread = ThreadPoolExecutor(1, "residents")
         self._next: Future[ScenarioBank] | None = None
+        config = source.config
+        self.curriculum: Curriculum | None = None
+        if config.curriculum:
+            terms = config.task.rewards.weights()
+            steps = config.algorithm.steps_per_iteration
+            self.curriculum = Curriculum(config.curriculum, source.scenarios.entries, terms, steps)
 
     @classmethod
     def of(cls, source: Source, memory: int | None) -> Residents:
@@ -151,6 +158,8 @@ class Residents:
         config, total = source.config, len(source.scenarios)
         if memory is None and config.residency is None:
             return cls(source)
+        if config.curriculum:
+            raise UsageError("a curriculum needs all scenarios on the device", cure="leave out --memory")
         if source.episodes:
             cure = "leave out --memory and residency, or the episodes"
             raise UsageError("recorded episodes need all of their scenarios on the device", cure=cure)
@@ -186,7 +195,7 @@ class Residents:
     def load(self, iteration: int = 0) -> Any:
         """Return the environment's data in an iteration, given the number of finished ones; begin to read a block."""
         if self.rotation is None or self._load is None:
-            return self.source.load()
+            return self._with_stage(self.source.load())
         exchanges = self.rotation.exchanges(iteration)
         blocks = np.split(self.rotation.resident(exchanges), self.rotation.blocks)
         # Block by block as in training, because batches of other sizes may round otherwise.
@@ -202,10 +211,37 @@ class Residents:
             return self.source.complete(data)
         return self.source.complete(data, self.rotation.resident(self.rotation.exchanges(iteration)))
 
-    def resume(self, program: Program, iteration: int) -> None:
-        """Load the data of a run that continues after some iterations."""
-        if self.rotation is not None and iteration:
+    def resume(self, program: Program, iteration: int, rows: Sequence[Row]) -> None:
+        """Load the data of a run that continues after some iterations, given their logs."""
+        if self.curriculum is not None:
+            for row in rows:
+                self.curriculum.log(row)
+        if iteration and (self.rotation is not None or self.curriculum):
             program.data = program.place(self.complete(self.load(iteration), iteration))
+
+    def follow(self, program: Program, row: Row) -> str | None:
+        """Move on in the curriculum by an iteration, given its log; return a line for the log if a stage begins."""
+        if not self.curriculum:
+            return None
+        stage, factors = self.curriculum.number, self.curriculum.factors
+        self.curriculum.log(row)
+        begins = self.curriculum.number > stage
+        if begins or self.curriculum.factors != factors:
+            bank = self._with_stage(environment_data(program.data))
+            program.data = program.place(self.complete(bank))
+        return self.curriculum.text() if begins else None
+
+    def note(self) -> dict[str, float]:
+        """Return values to log about the present stage: its number, from 1 on."""
+        return {"curriculum/stage": self.curriculum.number + 1.0} if self.curriculum else {}
+
+    def _with_stage(self, bank: Any) -> Any:
+        """Return the bank with the scenarios and reward factors of the present stage, if there is a curriculum."""
+        if not self.curriculum:
+            return bank
+        chances = jnp.asarray(cumulative_probability(self.curriculum.scenarios))
+        factors = {name: jnp.asarray(value, jnp.float32) for name, value in self.curriculum.factors.items()}
+        return replace(bank, chances=chances, reward_factors=factors)
 
     def exchange(self, program: Program, state: Any, iteration: int) -> tuple[Any, dict[str, float]]:
         """Exchange a block if one is due after an iteration; return the state, and values to log.
@@ -238,6 +274,8 @@ class Residents:
     def notices(self, data: Any) -> list[str]:
         """Return lines for the log about residency and weights of scenarios, given the data of the algorithm."""
         lines, rotation, weights = [], self.rotation, self.source.weights
+        if self.curriculum:
+            lines.append(self.curriculum.text())
         if rotation is not None:
             residency, iterations = rotation.residency, self.config.iterations
             size = format_bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(environment_data(data))))

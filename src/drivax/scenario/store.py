@@ -400,6 +400,11 @@ class Subset(Sequence[Scenario]):
         self.data, self.indices = data, indices
 
     @property
+    def entries(self) -> list[dict[str, Any]]:
+        """Manifest entries of the scenarios."""
+        return [self.data.entries[index] for index in self.indices]
+
+    @property
     def sizes(self) -> Sizes:
         """Sizes that a bank of any scenario of the set fits."""
         return self.data.sizes

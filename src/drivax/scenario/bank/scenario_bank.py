@@ -97,6 +97,7 @@ class ScenarioBank:
         extension: Points 4 m apart beyond the last logged pose of moving agents, along lanes or straight on: x, y.
         chances: Cumulative probability that a training episode begins in each scenario, in units of ``1 / (2^32 - 1)``;
             None: all are equal.
+        reward_factors: Factors of the reward terms in training, by name; None: all are 1.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.
@@ -133,6 +134,7 @@ class ScenarioBank:
     identity: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     chances: UInt[Array, " N"] | None
+    reward_factors: dict[str, Float[Array, ""]] | None
     cell_m: float = static()
     edge_run: int = static()
     lane_run: int = static()
@@ -184,13 +186,13 @@ class ScenarioBank:
         return 0 if self.most_egos == 1 else self.egos.reshape(-1)[row]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Select scenarios by index; all are equally likely to be drawn."""
+        """Select scenarios by index, without what training adds (chances and reward factors)."""
         ego_rows = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
 
         def select(path: tuple[Any, ...], leaf: Array) -> Array:
             return leaf[ego_rows if path[0].name in PER_EGO else rows]
 
-        return jax.tree_util.tree_map_with_path(select, replace(self, chances=None))
+        return jax.tree_util.tree_map_with_path(select, replace(self, chances=None, reward_factors=None))
 
     @classmethod
     def from_scenarios(
@@ -230,6 +232,7 @@ class ScenarioBank:
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
             cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
             long_ego=sizes.long_ego, trimmed=trim is True, chances=None,
+            reward_factors=None,
         )  # fmt: skip
 
 
