@@ -11,7 +11,7 @@ import pytest
 from drivax import kernels, settings
 from drivax.api import evaluate, load
 from drivax.cli import main
-from drivax.errors import DrivaxError, UsageError
+from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.learning import loop, training_log, training_set
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
@@ -324,6 +324,39 @@ def test_a_resumed_run_keeps_its_devices_where_there_are_as_many(data, config, t
         with pytest.raises(Stop):
             train(config, data, run.path, validation=None, resume=True)
     assert requested == [1, 2, None, 1]
+
+
+def test_filters_select_scenarios_and_their_weights(data, config, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    calls = []
+
+    def note(algorithm, environment, bank, weights=None):
+        calls.append((bank, weights))
+        raise Stop
+
+    monkeypatch.setattr(training_set, "training_data", note)
+    tracks = [entry["source"]["tracks"] for entry in data.entries]
+    filtered = replace(config, filters=(f"tracks>={sorted(tracks)[1]}",))
+    rows = [row for row, count in enumerate(tracks) if count >= sorted(tracks)[1]]
+    weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
+    with pytest.raises(Stop):
+        train(filtered, TrainingSet(data, weights), tmp_path / "run", validation=None)
+    ((bank, training_weights),) = calls
+    assert len(rows) == len(bank) == 2
+    np.testing.assert_array_equal(training_weights, weights[rows])
+    np.testing.assert_array_equal(bank.identity, ScenarioBank.from_scenarios(data).identity[np.array(rows)])
+    for validation, problem in ((None, "no scenario is selected"), ("held_out", "no scenario is selected")):
+        with pytest.raises(DataError, match=problem):
+            train(replace(config, filters=("tracks<1",)), data, tmp_path / "run", validation=validation)
+    _, validated = splits.hold_out(data.entries).training, splits.hold_out(data.entries).validation
+    most = max(tracks)
+    only = [row for row, count in enumerate(tracks) if count == most]
+    use = "train on" if only == validated else "validate on"
+    with pytest.raises(DataError, match=f"no scenario to {use} meets tracks>={most}; use weaker filters"):
+        train(replace(config, filters=(f"tracks>={most}",)), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):

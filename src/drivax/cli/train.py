@@ -79,6 +79,10 @@ class Train:
     """Conversion of scores to weights; with --scores or --arm."""
     seeds: int = 1
     """Number of consecutive seeds to train in one program; each of several seeds has a folder in OUT."""
+    filters: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="filter", metavar="NAME=VALUE")
+    ] = ()
+    """Only scenarios of DATA with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated."""
     memory: str | None = None
     """Memory of a device for scenarios, like 2GB: a part of DATA is resident, and exchanged while training goes on. By
     default, all of DATA is."""
@@ -96,6 +100,7 @@ class Train:
 def run(args: Train, overrides: Sequence[str] = ()) -> int:
     """Train, then print the run folder."""
     flags = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
+    flags += [word for text in args.filters for word in ("--filter", text)]
     if args.memory is not None:
         flags += ["--memory", args.memory]
     if args.resume and flags:
@@ -106,6 +111,8 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     config = settings.load(TrainConfig, args.config, list(overrides))
     if args.begin_from is not None:
         config = replace(config, begin_from=args.begin_from)
+    if args.filters:
+        config = replace(config, filters=(*config.filters, *args.filters))
     folder = train(
         config,
         _data(args, config),

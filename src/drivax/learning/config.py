@@ -22,6 +22,7 @@ from drivax.learning.self_play import SelfPlay, SelfPlayConfig
 from drivax.learning.training_log import Rule
 from drivax.plugins import is_dotted
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.select.selection import Selection
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.log import LogTraffic
@@ -85,6 +86,7 @@ class TrainConfig:
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two (exceptions:
             :class:`~drivax.learning.driving.Driving`). The first episodes of a run may also begin later, so that they
             end at different times.
+        filters: Conditions on scenarios (``type=turn_left``); those that do not meet all of them are left out.
         residency: Scenarios on the device at a time; None: all of them.
         curriculum: Stages of the run (:mod:`drivax.learning.curriculum`); none: a single one.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are loaded,
@@ -107,6 +109,7 @@ class TrainConfig:
     egos: Egos = "recorded"
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
+    filters: tuple[str, ...] = ()
     residency: Residency | None = None
     curriculum: tuple[Stage, ...] = ()
     begin_from: str | None = None
@@ -121,6 +124,7 @@ class TrainConfig:
         check_learnable(self.task.actions)
         check_at_least(self, 1, "total_steps", "checkpoint_every", "keep")
         check_at_least(self, 0, "evaluate_every", "patience")
+        Selection.parse(self.filters)
         names = [stage.name for stage in self.curriculum]
         if duplicates := [name for name in names if names.count(name) > 1]:
             raise UsageError(f"duplicate stage {duplicates[0]!r}", cure="give each stage its own name")

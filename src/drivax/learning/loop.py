@@ -40,6 +40,7 @@ from drivax.learning.training_log import (
 from drivax.learning.training_set import Source, TrainingSet, episodes_digest, prepare_episodes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.select.splits import HoldOut, hold_out
 from drivax.scenario.store import ScenarioSet, Subset, check_lengths
 from drivax.seal import note_edits
@@ -189,19 +190,32 @@ def _divide(
 
     Raises:
         UsageError: Validation scenarios have another length, ``patience`` is set without any, or weights do not fit.
+        DataError: No scenario meets the filters.
     """
+    training: Sequence[int] = select_scenarios(data, config.filters) if config.filters else range(len(data))
+    scenarios: Sequence[Scenario] | None = None
     if isinstance(validation, HoldOut) and validation.recordings:
-        if weights is not None:
-            egos = count_egos(config.egos, data.capacity.egos)
-            weights = check_weights(weights, len(data), data.capacity.steps, egos)[validation.training]
-            weights = weights.reshape(-1, data.capacity.steps)
-        return Subset(data, validation.training), weights, data.take(validation.validation)
-    if isinstance(validation, ScenarioSet):
+        selected = set(training)
+        training, held_out = (
+            [row for row in rows if row in selected] for rows in (validation.training, validation.validation)
+        )
+        if not training or not held_out:
+            use = "validate on" if training else "train on"
+            problem = f"no scenario to {use} meets {' and '.join(config.filters)}"
+            raise DataError(problem, file=data.path, cure="use weaker filters, or pass --validation SET")
+        scenarios = data.take(held_out)
+    elif isinstance(validation, ScenarioSet):
         check_lengths(data, validation)
-        return data, weights, validation
-    if config.patience:
+        scenarios = validation
+    elif config.patience:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    return data, weights, None
+    if len(training) == len(data):
+        return data, weights, scenarios
+    if weights is not None:
+        egos = count_egos(config.egos, data.capacity.egos)
+        weights = check_weights(weights, len(data), data.capacity.steps, egos)[list(training)]
+        weights = weights.reshape(-1, data.capacity.steps)
+    return Subset(data, training), weights, scenarios
 
 
 def usable_steps(
