@@ -1,24 +1,33 @@
-"""The compiled library, if it is installed, and calls of its kernels through XLA's foreign function interface."""
+"""The compiled library, if installed: its stamp, and calls of its kernels through XLA's foreign function interface.
+
+``native/build.py`` runs this file by its path to append the stamp, which says what the library was built for and is
+checked before loading: this module needs only JAX, NumPy and the standard library.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import hashlib
+import json
 import os
+import re
 import stat
+import sysconfig
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.ffi
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap, sequential_vmap
 from jax.sharding import AxisType, PartitionSpec
 
-from drivax.kernels.stamp import read_stamp, stamp
-
+#: Major version of XLA's foreign function interface, in its header.
+_VERSION = re.compile(r"#define XLA_FFI_API_MAJOR (\d+)")
 #: ``make native`` and the wheels for Linux on x86-64 put it here. Loading it runs its code: no variable overrides it.
 PATH = Path(__file__).parent / "libdrivax.so"
 #: Its sources, in a checkout.
@@ -28,6 +37,33 @@ VARIABLE = "DRIVAX_NATIVE"
 
 #: Whether programs may call kernels. JAX traces and compiles again when it changes.
 _allowed = jax.make_user_context(True)
+
+
+def stamp(sources: Path) -> dict[str, str]:
+    """Return platform, major version of XLA's foreign function interface, and hash of the sources if they exist."""
+    header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h")
+    values = {"platform": sysconfig.get_platform(), "XLA FFI": "".join(_VERSION.findall(header.read_text()))}
+    if (sources / "build.py").is_file():
+        digest = hashlib.sha256()
+        for path in sorted([*sources.glob("*.cc"), *sources.glob("*.h"), sources / "build.py"]):
+            if not path.name.startswith("."):  # files of editors
+                digest.update(path.read_bytes())
+        values["sources"] = digest.hexdigest()[:12]
+    return values
+
+
+def append_stamp(library: bytes, values: dict[str, str]) -> bytes:
+    """Return a library with its stamp and, as the last line, the SHA-256 of everything before it."""
+    stamped = library + b"\n" + json.dumps(values).encode()
+    return stamped + b"\n" + hashlib.sha256(stamped).hexdigest().encode()
+
+
+def read_stamp(library: bytes) -> dict[str, str] | None:
+    """Return the stamp of a library; None if it has none or is incomplete."""
+    stamped, _, digest = library.rpartition(b"\n")
+    if hashlib.sha256(stamped).hexdigest().encode() != digest:
+        return None
+    return json.loads(stamped.rpartition(b"\n")[2])
 
 
 @cache
