@@ -28,8 +28,12 @@ from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import find_traffic
 from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
-from drivax.learning.recorded_episodes import RecordedDriving
-from drivax.learning.stored_episodes import StoredDriving, StoredEpisodes, match_observations
+from drivax.learning.recorded_episodes import (
+    RecordedDriving,
+    StoredDriving,
+    StoredEpisodes,
+    match_observations,
+)
 from drivax.learning.training_log import (
     Preempted,
     StopSignal,

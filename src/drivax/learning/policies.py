@@ -28,7 +28,7 @@ from drivax.tracking.run_folder import RunFolder, policy_folder, seed_folders, t
 POLICY_FILE = "policy.npz"
 #: Entries of ``run.json`` that an exported policy keeps from its training; only the command may contain paths.
 _PROVENANCE = ("command", "started", "versions", "git", "validation", "step", "critics")
-#: Suffix of the name of a policy whose critics are not healthy (:mod:`drivax.learning.critic_health`).
+#: Suffix of the name of a policy whose critics are not healthy (:mod:`drivax.learning.algorithms.offline`).
 _UNHEALTHY = " (unhealthy critics)"
 #: Overrides: parameters do not depend on traffic and starts, and the traffic of the training run may no longer exist.
 _AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")

@@ -18,8 +18,12 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import inside
 from drivax.learning.driving import Driving
-from drivax.learning.recorded_episodes import RecordedDriving, RecordedEpisodes, replay_episodes
-from drivax.learning.stored_episodes import StoredEpisodes
+from drivax.learning.recorded_episodes import (
+    RecordedDriving,
+    RecordedEpisodes,
+    StoredEpisodes,
+    replay_episodes,
+)
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
