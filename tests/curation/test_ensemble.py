@@ -35,8 +35,8 @@ from drivax.learning.divergence import DivergenceError
 from drivax.learning.driving import Driving
 from drivax.learning.experience import sample_steps
 from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
-from drivax.networks.entity import EntityConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

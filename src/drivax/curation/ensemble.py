@@ -38,8 +38,8 @@ from drivax.learning.experience import (
 )
 from drivax.learning.program import all_finite, isolated_leaves
 from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Distribution
-from drivax.networks.entity import EntityConfig
 from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet

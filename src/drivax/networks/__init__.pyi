@@ -4,12 +4,12 @@ from .actor_critic import NetworkConfig as NetworkConfig
 from .actor_critic import Policy as Policy
 from .actor_critic import TwinCritic as TwinCritic
 from .actor_critic import Value as Value
+from .attention import EntityConfig as EntityConfig
 from .distributions import Distribution as Distribution
 from .encoders import Encoder as Encoder
 from .encoders import EncoderConfig as EncoderConfig
 from .encoders import MlpConfig as MlpConfig
 from .encoders import NormalisedEncoder as NormalisedEncoder
-from .entity import EntityConfig as EntityConfig
 from .transformers import LqConfig as LqConfig
 from .transformers import LqhConfig as LqhConfig
 from .transformers import MtrConfig as MtrConfig
