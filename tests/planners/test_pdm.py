@@ -16,7 +16,6 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast, boxes_of
-from drivax.planners.pdm.ground import ground_at
 from drivax.planners.pdm.planner import (
     LINE_ALONG,
     LINE_CURVATURE,
@@ -26,7 +25,7 @@ from drivax.planners.pdm.planner import (
     PdmPlanner,
     unroll_idm,
 )
-from drivax.planners.pdm.scoring import ScoringConfig
+from drivax.planners.pdm.scoring import ScoringConfig, ground_at
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
