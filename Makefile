@@ -17,12 +17,12 @@ JAX := $(shell sed -n 's/^jax==\([^ ]*\).*/\1/p' requirements.lock)
 # Each process takes neighbouring files, because the tests of a file share compiled programs.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo native test test-all soak coverage lint docs bench setup lock hooks clean
+.PHONY: help demo native test test-slow test-results test-all soak coverage lint docs bench setup lock hooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
-	@echo "targets: demo  native  test  test-all  soak  coverage  lint  docs  bench  setup  lock  hooks  clean"
+	@echo "targets: demo  native  test  test-slow  test-results  test-all  soak  coverage  lint  docs  bench  setup  lock  hooks  clean"
 
 setup: $(STAMP)
 
@@ -49,6 +49,14 @@ bench: $(STAMP)
 
 test: $(STAMP)
 	$(PYTEST) -m "not slow" $(ARGS)
+
+# What test-all runs in addition to test.
+test-slow: $(STAMP)
+	DRIVAX_OPTIMISED=1 $(PYTEST) -m slow $(ARGS)
+
+# Whether the pages of results show the numbers that are stored.
+test-results: $(STAMP)
+	$(PYTEST) tests/test_results.py $(ARGS)
 
 # Includes the native kernels, if there is a C++ compiler.
 test-all: $(STAMP)

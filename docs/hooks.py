@@ -20,18 +20,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "",
         _docstring(_PACKAGE / "__init__.py"),
         "",
-        "| package | content |",
+        "| module | content |",
         "|---|---|",
     ]
-    exports = {
-        ".".join(stub.parent.relative_to(_PACKAGE.parent).parts): stub
-        for stub in _PACKAGE.rglob("__init__.pyi")
-    }
-    names = {package: public_names(stub, package) for package, stub in sorted(exports.items())}
+    modules = _public_modules()
+    names = {name: public_names(file, name) for name, file in sorted(modules.items())}
     # A name that several packages export is documented in the innermost one; the others link to it.
     home = {name: package for package in sorted(names, key=len) for name in names[package]}
     for package, exported in names.items():
-        summary = _docstring(exports[package].with_suffix(".py"))
+        summary = _docstring(modules[package].with_suffix(".py"))
         own = [f"::: {name}" for name in exported if home[name] == package]
         links = [f"[`{name.rpartition('.')[2]}`][{name}]" for name in exported if home[name] != package]
         parts = [f"# {package}", summary, *([f"Also exported: {', '.join(links)}."] if links else []), *own]
@@ -56,13 +53,24 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return markdown
 
 
-def public_names(stub: Path, package: str) -> list[str]:
-    """Return the full names that a package exports, from the stub that lists them."""
+def _public_modules() -> dict[str, Path]:
+    """Return the files that list public names: the stubs of packages, and modules with ``__all__`` next to them."""
+    stubs = {
+        ".".join(file.parent.relative_to(_PACKAGE.parent).parts): file
+        for file in _PACKAGE.rglob("__init__.pyi")
+    }
+    files = {f"{_PACKAGE.name}.{file.stem}": file for file in _PACKAGE.glob("[a-z]*.py")}
+    return stubs | {name: file for name, file in files.items() if public_names(file, name)}
+
+
+def public_names(file: Path, module: str) -> list[str]:
+    """Return the full names that a package exports, from its stub, or those in ``__all__`` of a module."""
     names = []
-    for node in ast.parse(stub.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.ImportFrom):
-            module = f"{package}.{node.module}" if node.level else node.module
-            names += [f"{module}.{alias.name}" for alias in node.names]
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if file.suffix == ".pyi" and isinstance(node, ast.ImportFrom):
+            names += [f"{module}.{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            names += [f"{module}.{name}" for name in ast.literal_eval(node.value)]
     return names
 
 

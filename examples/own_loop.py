@@ -7,8 +7,7 @@ from pathlib import Path
 import jax
 
 import drivax
-from drivax.learning import ReplayConfig, TrainConfig, make_agent
-from drivax.learning.algorithms import SacConfig
+from drivax.learning import ReplayConfig, SacConfig, TrainConfig, make_agent
 
 folder = Path(tempfile.mkdtemp())
 drivax.generate(folder / "set", scenarios=4, seed=0)

@@ -6,8 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 
 import drivax
-from drivax.learning import TrainConfig
-from drivax.learning.algorithms import PpoConfig
+from drivax.learning import PpoConfig, TrainConfig
 from drivax.testing import check_reward
 
 

@@ -26,7 +26,7 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import find_traffic
-from drivax.report.charts import compact
+from drivax.report.charts import format_compact
 from drivax.report.pictures.palette import LIGHT, SERIES
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -214,7 +214,7 @@ def page_tables(results: Mapping[str, Any]) -> dict[str, list[str]]:
 def _critics_table(critics: Mapping[str, Any]) -> list[str]:
     """Return the baseline's curves at the validations: mean over seeds, and the range at the end."""
     validations = slice(VALIDATION - 1, None, VALIDATION)
-    steps = [compact(step) for step in critics["steps"][validations]]
+    steps = [format_compact(step) for step in critics["steps"][validations]]
     rows = []
     for name, label in CURVES.items():
         values = np.array(critics["seeds"][name])[:, validations]
@@ -284,7 +284,7 @@ def draw_critics(critics: Mapping[str, Any]) -> Figure:
             axes.plot(steps, values, color=SERIES[number], linewidth=1.3, label=f"{baseline}, seed {number}")
         axes.set(xlabel="logged steps drawn", title=CURVES[name], xlim=(0, steps[-1]))
         axes.title.set(fontsize=10, color=LIGHT["ink"])
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: compact(value)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: format_compact(value)))
         axes.grid(color=LIGHT["crosswalk"])
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[-1].legend(frameon=False, fontsize=7, loc="lower left")

@@ -42,7 +42,7 @@ def imported(file: Path) -> set[str]:
     return names
 
 
-def test_layers(repository: Path):
+def test_imports_obey_the_contracts(repository: Path):
     result = subprocess.run(
         [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
         cwd=repository, capture_output=True, text=True, check=False,
@@ -51,7 +51,7 @@ def test_layers(repository: Path):
 
 
 @pytest.mark.parametrize("room", PURE_ROOMS)
-def test_pure_rooms(package: Path, room: str):
+def test_pure_rooms_import_no_files_or_tracking(package: Path, room: str):
     for file in sorted((package / room).rglob("*.py")):
         if str(file.relative_to(package)) in EDGES:
             continue
@@ -102,7 +102,7 @@ def test_folders_hold_at_most_20_files(package: Path):
     assert {folder.name: n for folder in folders if (n := len(list(folder.glob("*.py")))) > 20} == {}
 
 
-def test_sizes(package: Path):
+def test_files_and_functions_obey_the_size_limits(package: Path):
     """Files of at most 600 lines, functions of at most 60 lines and 8 parameters."""
     found = []
     for file in sorted(package.rglob("*.py")):

@@ -1,8 +1,9 @@
-"""The documentation is true: its Python runs, its commands exist, its links lead somewhere."""
+"""The documentation is true: its Python runs, its imports are public, its commands exist, its links lead somewhere."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import re
 import shlex
@@ -21,6 +22,26 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=indent)```", re.M | re.S)
 _FILE = re.compile(r"# (?P<file>[\w.]+\.(py|yaml))\n")
+_IMPORT = re.compile(
+    r"^ *(?:from (?P<room>drivax[\w.]*) import (?P<names>\([^)]*\)|[^\n#]*)|import (?P<module>drivax[\w.]*))",
+    re.M,
+)
+#: Packages below ``drivax.ROOM`` that users import from.
+SUB_ROOMS = [
+    *(
+        f"drivax.datasets.{name}"
+        for name in ("argoverse", "export", "nuplan", "nuscenes", "scenarionet", "womd")
+    ),
+    *(f"drivax.scenario.{name}" for name in ("bank", "build", "select")),
+    *(f"drivax.synthetic.{name}" for name in ("events", "expert", "roads", "traffic")),
+    "drivax.learning.algorithms",
+    "drivax.simulator.traffic",
+]
+#: Code for users: pages except records of the past, and examples.
+USER_CODE = [
+    *(page for page in PAGES if page.parent.name not in ("decisions", "log")),
+    *sorted((REPOSITORY / "examples").glob("*.py")),
+]
 _LINK = re.compile(r"!?\[[^\]]*\]\((?P<target>[^)\s]+)\)")
 
 
@@ -85,7 +106,7 @@ def test_pages_are_found():
 
 
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_python_blocks_of_each_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Blocks of a page share their names, as a reader who types them in order has them.
 
     A block that begins with the name of a file, as ``# my_terms.py``, is that file in the folder of the reader.
@@ -104,8 +125,19 @@ def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         exec(code, module.__dict__)
 
 
+@pytest.mark.parametrize("file", USER_CODE, ids=lambda file: str(file.relative_to(REPOSITORY)))
+def test_imports_are_public_names_of_rooms(file: Path):
+    for match in _IMPORT.finditer(file.read_text()):
+        name = match["room"] or match["module"]
+        assert name.count(".") <= 1 or name in SUB_ROOMS, f"import from {name.rpartition('.')[0]}: {match[0]}"
+        room = importlib.import_module(name)
+        for imported in re.findall(r"\w+", match["names"] or ""):
+            is_room = (Path(room.__file__ or "").parent / imported / "__init__.pyi").exists()
+            assert imported in room.__all__ or is_room, f"{name} does not export {imported}: {match[0]}"
+
+
 @pytest.mark.parametrize("block", SHELL_BLOCKS, ids=lambda block: block.place)
-def test_commands_exist(block: Block):
+def test_commands_in_docs_exist_with_their_flags(block: Block):
     for words in commands(block):
         flags = [word.split("=")[0] for word in words[1:] if word.startswith("--")]
         if len(words) == 1 or words[1] in ("--help", "--version"):

@@ -26,6 +26,7 @@ from drivax.files import (
     format_bytes,
     free_bytes,
     inside,
+    parse_bytes,
     replace_folder,
     restore_folder,
     write_json,
@@ -272,6 +273,17 @@ def test_space_is_checked_on_the_disk_of_a_folder_that_does_not_exist_yet(tmp_pa
 )
 def test_sizes_are_readable(size: float, text: str):
     assert format_bytes(size) == text
+
+
+def test_sizes_are_read_with_their_unit():
+    assert [parse_bytes(text) for text in ("540kB", "6.6 GB", " 2TB ")] == [
+        540_000,
+        6_600_000_000,
+        2 * 10**12,
+    ]
+    for text in ("2", "GB", "2gb", "-1GB", "1e3MB", ""):
+        with pytest.raises(UsageError, match="is no size; use a number and a unit: 800MB, 2GB"):
+            parse_bytes(text)
 
 
 # --- Kills and links.
@@ -597,6 +609,9 @@ def test_limits_of_the_process_are_named_with_their_value(monkeypatch: pytest.Mo
 def test_only_a_package_that_is_not_installed_is_missing():
     missing = missing_package(ModuleNotFoundError("no module", name="av"))
     assert missing is not None and missing.cure == "pip install 'drivax[show]'"
+    missing = missing_package(ModuleNotFoundError("no module", name="google.protobuf.message"))
+    assert str(missing) == "protobuf is not installed; pip install 'drivax[womd]'"
+    assert missing_package(ModuleNotFoundError("no module", name="not_there")) is None
     assert missing_package(ImportError("libavformat.so: not found", name="av._core")) is None
 
 

@@ -53,7 +53,7 @@ def run(environment: Path, *arguments: str, folder: Path) -> subprocess.Complete
     return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
 
 
-def test_content(wheel: Path, repository: Path):
+def test_wheel_contains_sources_presets_and_types_only(wheel: Path, repository: Path):
     names = set(zipfile.ZipFile(wheel).namelist())
     package = repository / "src" / "drivax"
     files = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
@@ -121,7 +121,7 @@ def test_a_wheel_for_one_platform_contains_the_native_kernels(
     assert "drivax/kernels/libdrivax.so" in zipfile.ZipFile(wheel).namelist()
 
 
-def test_metadata(wheel: Path):
+def test_wheel_declares_licence_python_and_entry_point(wheel: Path):
     archive = zipfile.ZipFile(wheel)
     (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
     metadata = Parser().parsestr(archive.read(name).decode())

@@ -521,7 +521,7 @@ def learning():
     }
 
 
-def test_learning_tables(script, learning):
+def test_learning_tables_show_stored_results(script, learning):
     tables = script("learning.tables")
     training = {
         "training": {"ppo": {"steps_per_second": 9000, "share": {"simulation": 0.25, "update": 0.75}}}

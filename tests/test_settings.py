@@ -75,7 +75,7 @@ class Sized:
     @classmethod
     def preset(cls, name: str) -> Sized:
         if name != "large":
-            raise UsageError(f"there is no size {name!r}", cure="use large")
+            raise UsageError(f"unknown size {name!r}", cure="use large")
         return cls(width=99, depth=9, adam=Adam(lr=0.5, clip=1.0))
 
 
@@ -171,7 +171,7 @@ def test_whole_floats_count_as_steps():
     assert isinstance(load("network: {optimizer: {lr: 1}}").network.optimizer.lr, float)
 
 
-def test_unions():
+def test_unions_are_read_by_kind_or_name():
     assert load("optimizer: {kind: sgd, momentum: 0.5}").optimizer == Sgd(momentum=0.5)
     assert load("optimizer: sgd").optimizer == Sgd()
     assert load("algorithm: {kind: td3_bc, alpha: 1}").algorithm == TD3BC(alpha=1.0)
@@ -181,7 +181,7 @@ def test_unions():
     assert load("limit: 4").limit == 4
 
 
-def test_kind_names():
+def test_kind_is_the_class_name_in_snake_case():
     class BcSac:
         pass
 
@@ -198,7 +198,7 @@ def test_missing_keys_keep_the_enclosing_defaults():
     assert load("optimizer: {clip: 2}").optimizer == Adam(clip=2.0)  # the kind is that of the default
 
 
-def test_overrides():
+def test_flags_override_the_file_by_type():
     changed = load(
         "steps: 5\noptimizer: {kind: sgd, lr: 1}",
         "--steps", "1e3", "--resume", "--name=12", "--network.hidden", "[3, 4]", "--seed", "null",
@@ -239,7 +239,7 @@ def test_another_kind_drops_previous_settings():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("steps", "'steps' is not a setting; write --section.key value"),
+        ("steps", "unexpected argument 'steps'; write --section.key value"),
         ("--stesp=1", r"stesp: .* did you mean 'steps'\?"),
         ("--steps=x", "steps: 'x' is not an integer"),
         ("--network.optimizer.lr=fast", r"network\.optimizer\.lr: 'fast' is not a number"),
@@ -247,7 +247,7 @@ def test_another_kind_drops_previous_settings():
         ("--network.hidden=[1", r"^network\.hidden: '\[1' is not a value"),
     ],
 )
-def test_mistaken_overrides(override: str, message: str):
+def test_mistaken_flags_are_refused(override: str, message: str):
     with pytest.raises(UsageError, match=message):
         load("", override)
 
@@ -258,7 +258,7 @@ def test_overrides_do_not_change_the_mapping():
     assert values == {"network": {"hidden": [1]}}
 
 
-def test_files(tmp_path: Path):
+def test_faulty_files_are_refused_with_file_and_line(tmp_path: Path):
     file = tmp_path / "train.yaml"
     file.write_text("stpes: 5\n")
     with pytest.raises(UsageError, match=r"train\.yaml: stpes: unknown setting"):
@@ -288,8 +288,8 @@ def test_yaml_cannot_make_objects(tmp_path: Path):
         settings.parse_yaml("!!python/object/apply:os.system ['true']")
 
 
-def test_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+def test_presets_are_found_by_name_in_subfolders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: tmp_path)
     (tmp_path / "studies").mkdir()
     (tmp_path / "fast.yaml").write_text("steps: 3\n")
     (tmp_path / "studies" / "slow.yaml").write_text("steps: 4\n")
@@ -352,7 +352,7 @@ def test_another_preset_of_a_section_starts_again(tmp_path: Path):
 
 
 def test_files_extend_presets_and_presets_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: tmp_path)
     (tmp_path / "offline").mkdir()
     (tmp_path / "slow.yaml").write_text("steps: 3\nname: slow")
     (tmp_path / "offline" / "slow.yaml").write_text("extends: slow\nname: offline")
@@ -426,7 +426,7 @@ def test_dump_is_readable():
 def test_no_file_shadows_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A folder of a stranger may hold files of any name, and a configuration file is trusted."""
     configs, folder = tmp_path / "configs", tmp_path / "stranger"
-    monkeypatch.setattr(settings, "_configs", lambda: configs)
+    monkeypatch.setattr("drivax.settings.loading._configs", lambda: configs)
     for place, steps in ((configs, 3), (folder, 9)):
         (place / "studies").mkdir(parents=True)
         for name in ("fast.yaml", "studies/slow.yaml"):
@@ -468,7 +468,7 @@ def test_record_may_start_from_its_own_preset():
     assert settings.load(Sized, {"preset": "large", "width": 1}) == Sized(1, 9, large.adam)
     assert settings.load(House, settings.parse_yaml(settings.dump(changed))) == changed
     assert "preset" not in settings.dump(changed)
-    with pytest.raises(UsageError, match=r"^rooms: there is no size 'huge'; use large$"):
+    with pytest.raises(UsageError, match=r"^rooms: unknown size 'huge'; use large$"):
         house("rooms: {preset: huge}")
 
 

@@ -90,6 +90,8 @@ def test_words_of_the_table_are_not_used():
         (".py", "besides = 1  # next to it\n", 0),
         (".py", "def f():\n    return told_twice\n", 1),
         (".py", "found = 1\nx.found = found\n", 2),
+        (".py", 'def f():\n    """See :class:`A`."""\n', 1),
+        (".py", 'def f():\n    """Return what is ahead."""\n', 1),
     ],
 )
 def test_the_search_finds_words_and_names(suffix: str, text: str, count: int):

@@ -49,7 +49,8 @@ from drivax.curation.rarity import (
 )
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.ranking import (
     auc_interval,

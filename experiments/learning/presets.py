@@ -24,7 +24,7 @@ import numpy as np
 
 from drivax.learning import TrainConfig
 from drivax.learning.policies import export_policy
-from drivax.report.runs import Training, read_runs
+from drivax.report.runs import TrainingCurves, read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import RunFolder, versions
@@ -73,7 +73,7 @@ def collect(run: Path, data: ScenarioSet) -> None:
     (policies / TRAINING).write_text(json.dumps(record, indent=1) + "\n")
 
 
-def training_seconds(training: Training) -> int:
+def training_seconds(training: TrainingCurves) -> int:
     """Return the seconds that a training takes at its median speed, without compilation and validation.
 
     Pauses, resumption and other work on the machine for less than half of the time do not count.
@@ -151,7 +151,7 @@ def _mean(results: Episodes, metric: str) -> dict[str, Any]:
     return mean_interval(results, metric).as_dict() | {"by_seed": seed_means}
 
 
-def learning_curves(trainings: Sequence[Training]) -> dict[str, dict[str, list[list[float]]]]:
+def learning_curves(trainings: Sequence[TrainingCurves]) -> dict[str, dict[str, list[list[float]]]]:
     """Return quantity -> seed -> points (step, value) of all validations."""
     return {
         metric: {

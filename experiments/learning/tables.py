@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from drivax.report.charts import compact
+from drivax.report.charts import format_compact
 from drivax.report.pictures.palette import LIGHT, SERIES
 from experiments.repository import DOCS
 
@@ -185,7 +185,7 @@ def draw_curves(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]
         axes.secondary_xaxis("top", functions=(lambda x: x * minutes, lambda x: x / minutes)).set(
             xlabel="minutes on one core"
         )
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: compact(value)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: format_compact(value)))
         axes.grid(color=LIGHT["crosswalk"])
         axes.spines[["top", "right"]].set_visible(False)
     panels[-1].legend(frameon=False, fontsize=8)

@@ -413,7 +413,7 @@ class SearchPlanner:
     ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
         """Simulate each cap along a line; return poses, travelled distances, and first acceleration and curvature."""
         ego_box, start_mps, desired_mps, stop_m = ego
-        max_curvature = self.actions.sharpest(ego_box[LENGTH])
+        max_curvature = self.actions.max_curvature(ego_box[LENGTH])
         rear, leader_speed = jax.vmap(
             lambda agents: _agents_in_corridor(line, exists, offsets, others, agents, ego_box)
         )((others.box, others.speed))

@@ -13,6 +13,7 @@ from .evaluation.episode_table import EpisodeTable as EpisodeTable
 from .learning.config import TrainConfig as TrainConfig
 from .learning.loop import make_agent as make_agent
 from .learning.loop import train as train
+from .planners.catalogue import make_planner as make_planner
 from .planners.functions import jax_planner as jax_planner
 from .planners.functions import python_planner as python_planner
 from .planners.planner import Planner as Planner

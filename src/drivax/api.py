@@ -19,7 +19,8 @@ from drivax.evaluation.runner import with_metrics
 from drivax.planners.catalogue import PLANNERS, as_planner, default_task, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
@@ -73,8 +74,7 @@ def load(
     if isinstance(data, str | Path):
         scenario_set = ScenarioSet.open(data)
         selection = scenario_set.take(select_scenarios(scenario_set, filters, scenarios, limit))
-        # Reading a scenario verifies it; of all others only the sizes matter.
-        sizes = Sizes.used(ScenarioSet.open(data, verify=False))
+        sizes = scenario_set.sizes
     elif filters or scenarios:
         raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:

@@ -28,6 +28,12 @@ def check_at_most(config: Any, most: int, *names: str) -> None:
     _check(config, names, lambda value: value <= most, f"use {most:,} or less")
 
 
+def check_counts(config: Any, *names: str, most: int = MOST_SAMPLES) -> None:
+    """Raise UsageError for the first of these settings that is below 1, or else above ``most``."""
+    check_at_least(config, 1, *names)
+    check_at_most(config, most, *names)
+
+
 def check_above_zero(config: Any, *names: str) -> None:
     """Raise UsageError for the first of these settings that is not above 0."""
     _check(config, names, lambda value: value > 0, "use more than 0")

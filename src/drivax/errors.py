@@ -1,25 +1,32 @@
-"""User errors in one line: what is wrong, where, and what to do about it."""
+"""User errors in one line: problem, location and cure."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
 import importlib
 import os
 import re
 import resource
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from drivax.escaping import escape_controls
 
-#: Extra that installs a package, by its import name.
-_EXTRAS = {
-    "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
-    "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
-    "minari": "minari", "h5py": "minari",
-}  # fmt: skip
+__all__ = ["DataError", "DrivaxError", "UsageError"]
+
+#: Purpose of every extra, and the modules that it installs.
+EXTRAS = {
+    "womd": ("Waymo, ScenarioMax", ("google.protobuf", "google_crc32c")),
+    "av2": ("Argoverse 2", ("pyarrow",)),
+    "maps": ("nuPlan, Argoverse 2, nuScenes", ("shapely", "pyproj")),
+    "show": ("pictures and videos", ("matplotlib", "av")),
+    "track": ("TensorBoard", ("tensorboardX",)),
+    "gym": ("Gymnasium", ("gymnasium",)),
+    "minari": ("Minari", ("minari", "h5py")),
+}
 #: Maximum length of a problem, record or cure, in characters; longer texts, which quote a value, keep both ends.
 _LONGEST = 1000
 #: Cure of a full disk.
@@ -126,7 +133,7 @@ def explain_system(error: BaseException, file: str | Path | None = None) -> Driv
 
 
 def explain_library(error: BaseException) -> DrivaxError | None:
-    """Return what :func:`explain_system` returns for the system error that TensorStore or XLA quotes; None without one.
+    """Apply :func:`explain_system` to the system error that TensorStore or XLA quotes; None without one.
 
     Use it only for errors that end a command: an error about a damaged file may quote untrusted text.
     """
@@ -145,13 +152,30 @@ def check_memory_limit() -> None:
         raise UsageError(problem, cure="raise the limit: ulimit -v unlimited")
 
 
+def not_installed(extra: str, modules: Iterable[str]) -> UsageError:
+    """Return the error for modules of an extra that are not installed."""
+    names = [module.rpartition(".")[2] for module in modules]
+    problem = f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not installed"
+    return UsageError(problem, cure=f"pip install 'drivax[{extra}]'")
+
+
 def missing_package(error: ImportError) -> UsageError | None:
     """Return the error for an optional package that is not installed; None if it is broken, or belongs to no extra."""
     package = (error.name or str(error)).split(".")[0]
-    if package not in _EXTRAS or not isinstance(error, ModuleNotFoundError):
-        return None
-    name = "protobuf" if package == "google" else package
-    return UsageError(f"{name} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
+    for extra, (_, modules) in EXTRAS.items():
+        for module in modules:
+            if module.split(".")[0] == package and isinstance(error, ModuleNotFoundError):
+                return not_installed(extra, [module])
+    return None
+
+
+@contextlib.contextmanager
+def explain_missing_package() -> Iterator[None]:
+    """Raise a UsageError when the block imports a package of an extra that is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise missing_package(error) or error from error
 
 
 def import_extra(package: str) -> Any:
@@ -160,17 +184,27 @@ def import_extra(package: str) -> Any:
     Raises:
         UsageError: The package is not installed.
     """
-    try:
+    with explain_missing_package():
         return importlib.import_module(package)
-    except ImportError as error:
-        raise missing_package(error) or error from error
 
 
-def did_you_mean(name: str, names: Iterable[str], *, otherwise: str | None = None) -> str:
-    """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names."""
+def did_you_mean(
+    name: str, names: Iterable[str], *, otherwise: str | None = None, aliases: Mapping[str, str] | None = None,
+    cutoff: float = 0.6,
+) -> str:  # fmt: skip
+    """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names.
+
+    Args:
+        name: The unknown name.
+        names: The known names.
+        otherwise: Cure if no known name is close.
+        aliases: Known name behind each further name to compare with.
+        cutoff: Least similarity of a close name, 0 to 1.
+    """
     candidates = list(names)
-    if matches := difflib.get_close_matches(name, candidates, n=1):
-        return f"did you mean {matches[0]!r}?"
+    targets = {**(aliases or {}), **dict(zip(candidates, candidates, strict=True))}
+    if matches := difflib.get_close_matches(name, targets, n=1, cutoff=cutoff):
+        return f"did you mean {targets[matches[0]]!r}?"
     if otherwise is not None:
         return otherwise
     return f"use one of {', '.join(candidates)}" if candidates else "there are none"

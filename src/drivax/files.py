@@ -23,6 +23,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import resource
 import shutil
 import stat
@@ -112,6 +113,18 @@ def format_bytes(size: float) -> str:
         if size >= scale:
             return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:,.0f} {unit}"
     return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} bytes"
+
+
+def parse_bytes(text: str) -> int:
+    """Return the bytes of a size like ``2GB``, ``1.5 GB`` or ``800MB``, with the units of :func:`format_bytes`.
+
+    Raises:
+        UsageError: It is no size.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMGT])B\s*", text)
+    if match is None:
+        raise UsageError(f"{text!r} is no size", cure="use a number and a unit: 800MB, 2GB")
+    return int(float(match[1]) * {"k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}[match[2]])
 
 
 def count_text(number: int, noun: str) -> str:
@@ -312,7 +325,7 @@ class PartialFolder:
         self._release()
 
     def restore(self) -> None:
-        """Give a folder its name back if a process was killed while it replaced the folder."""
+        """Restore the name of a folder if a process was killed while it replaced the folder."""
         if not self._target.exists() and self._old.is_dir():
             # The process is still running, or the disk is read-only.
             with contextlib.suppress(UsageError, OSError):
@@ -368,7 +381,7 @@ def can_resume(path: Path) -> bool:
 
 
 def restore_folder(path: Path) -> None:
-    """Give the folder ``path`` its name back if a process was killed while it replaced the folder."""
+    """Restore the name ``path`` of a folder if a process was killed while it replaced the folder."""
     PartialFolder(path).restore()
 
 

@@ -83,7 +83,7 @@ def test_environments_by_id(data):
 
 
 @pytest.mark.slow
-def test_discrete_actions(data):
+def test_discrete_action_is_a_pair_of_acceleration_and_curvature_levels(data):
     """Choice i of 7 x 13 is acceleration level i // 13 and curvature level i % 13; the middle one does nothing."""
     env = DrivingEnv(data, replace(SMALL, actions=TASKS["discrete"].actions))
     assert env.action_space == gymnasium.spaces.Discrete(91)
@@ -191,10 +191,10 @@ def test_scenario_set_folder_is_loaded(tmp_path, data):
 def test_errors_are_one_line(env):
     env.reset(seed=0)
     for options, words in (
-        ({"scenario": 2}, "there is no scenario 2; use a row from 0 to 1"),
-        ({"scenario": -1}, "there is no scenario -1; use a row from 0 to 1"),
-        ({"scenario": "a"}, "there is no scenario 'a'; use a row from 0 to 1"),
-        ({"scenari": 1}, "there is no reset option 'scenari'; the only one is 'scenario'"),
+        ({"scenario": 2}, "unknown scenario 2; use a row from 0 to 1"),
+        ({"scenario": -1}, "unknown scenario -1; use a row from 0 to 1"),
+        ({"scenario": "a"}, "unknown scenario 'a'; use a row from 0 to 1"),
+        ({"scenari": 1}, "unknown reset option 'scenari'; the only one is 'scenario'"),
     ):
         with pytest.raises(UsageError) as error:
             env.reset(options=options)
@@ -300,8 +300,8 @@ def test_seeds_and_errors_of_a_batch(data):
     assert all(one == other for one, other in drawn) and len({tuple(one) for one, _ in drawn}) > 1
     for options, words in (
         ({"scenarios": [0, 1]}, "2 scenarios for 3 environments; give one per environment"),
-        ({"scenarios": [0, 1, 2]}, "there is no scenario 2; use a row from 0 to 1"),
-        ({"scenario": 1}, "there is no reset option 'scenario'; the only one is 'scenarios'"),
+        ({"scenarios": [0, 1, 2]}, "unknown scenario 2; use a row from 0 to 1"),
+        ({"scenario": 1}, "unknown reset option 'scenario'; the only one is 'scenarios'"),
         ({"scenarios": 1}, "the reset option 'scenarios' is 1; give a list of 3 rows"),
     ):
         rows = vector._rows

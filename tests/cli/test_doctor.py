@@ -218,7 +218,7 @@ def test_folders_without_recordings(files, words, tmp_path, capsys):
 def test_empty_paths_are_named(tmp_path, capsys):
     status, out = asked(tmp_path / "none", capsys)
     assert status == 1 and "does not exist" in out
-    with pytest.raises(UsageError, match="there is no format"):
+    with pytest.raises(UsageError, match="unknown format"):
         diagnose(tmp_path, "wmod")
 
 
@@ -331,7 +331,7 @@ def test_shards_are_grouped_by_folder(tmp_path, capsys):
 # --- The machine.
 
 
-def test_machine(capsys):
+def test_doctor_lists_packages_and_resources_in_100_columns(capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
@@ -342,10 +342,10 @@ def test_machine(capsys):
 
 
 def test_a_missing_extra_names_its_pip_line(monkeypatch):
-    monkeypatch.setattr(doctor, "_EXTRAS", {"womd": (("sys", "not_there", "not_there.inside"), "Waymo")})
+    monkeypatch.setattr(doctor, "EXTRAS", {"womd": ("Waymo", ("sys", "not_there", "not_there.inside"))})
     monkeypatch.setattr(doctor, "devices", lambda: "cpu")
     rows = dict(doctor.machine())
-    assert rows["womd (Waymo)"] == "not_there, not_there.inside missing: pip install 'drivax[womd]'"
+    assert rows["womd (Waymo)"] == "not_there, inside are not installed; pip install 'drivax[womd]'"
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_tables_of_many_sets_fit_the_terminal(sets, inspect):
     assert len([line for line in out.splitlines() if line.startswith("scenarios ")]) == 2
 
 
-def test_filters(sets, inspect):
+def test_filters_select_the_scenarios_that_are_summarised(sets, inspect):
     out = inspect(sets[0], "--filter", "place=boston|pittsburgh", "--filter", "audit.distance_m>0")
     assert cells(out, "scenarios") == "2 of 4 (recorded segments: 2, shards: 1)"
     assert "1 lack the value of 'place=boston|pittsburgh'" in out
@@ -139,7 +139,7 @@ def test_json_of_one_set_and_of_several(sets, inspect):
     assert both[0]["scenarios"] == one["scenarios"] and len(both[1]["scenarios"]) == 2
 
 
-def test_page(sets, inspect, tmp_path):
+def test_html_page_is_replaced_only_with_overwrite(sets, inspect, tmp_path):
     page = tmp_path / "page.html"
     assert inspect(*sets, "--html", page).split() == [str(page)]
     text = page.read_text()
@@ -151,7 +151,7 @@ def test_page(sets, inspect, tmp_path):
 
 
 @pytest.mark.slow
-def test_observations(sets, inspect, tmp_path):
+def test_observation_statistics_are_printed_and_drawn(sets, inspect, tmp_path):
     """Described as a table and as JSON, and drawn; the task is that of a training configuration."""
     observation = "{agents: 2, steps: 2, road: 20, lights: 1, route: 2}"
     task = f"task: {{actions: published, observation: {observation}}}\n"
@@ -244,13 +244,20 @@ def test_the_picture_shows_the_current_step_of_a_short_log(tmp_path, inspect, mo
     drawn = []
 
     class Picture:
-        def savefig(self, path):
-            path.touch()
+        def savefig(self, file, format):
+            file.write(b"half")
+            if drawn[1:]:
+                raise OSError("interrupted")
 
     def draw(task, bank, title, step):
         drawn.append((title, step))
         return Picture()
 
     monkeypatch.setattr("drivax.report.pictures.observation.draw_log_observation", draw)
-    inspect(tmp_path / "set", "--observations", "--draw", tmp_path / "seen.png")
-    assert drawn == [("short, step 7", 7)]
+    words = (tmp_path / "set", "--observations", "--draw", tmp_path / "seen.png")
+    inspect(*words)
+    assert drawn == [("short, step 7", 7)] and (tmp_path / "seen.png").read_bytes() == b"half"
+    (tmp_path / "seen.png").write_bytes(b"old")
+    inspect(*words, "--overwrite", status=1)
+    assert (tmp_path / "seen.png").read_bytes() == b"old"
+    assert {path.name for path in tmp_path.iterdir()} == {"set", "seen.png"}

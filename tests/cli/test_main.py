@@ -53,14 +53,14 @@ def raiser(error: BaseException) -> Any:
 
 
 @pytest.mark.parametrize("argv", [[], ["--help"], ["-h"], ["help"]])
-def test_overview(argv: list[str], capsys: pytest.CaptureFixture[str]):
+def test_overview_lists_all_commands_in_100_columns(argv: list[str], capsys: pytest.CaptureFixture[str]):
     assert cli.main(argv) == 0
     out = capsys.readouterr().out
     assert all(f"  {name} " in out for name in cli.COMMANDS)
     assert max(map(len, out.splitlines())) <= 100
 
 
-def test_version(capsys: pytest.CaptureFixture[str], repository: Path):
+def test_version_equals_that_of_the_project_file(capsys: pytest.CaptureFixture[str], repository: Path):
     assert cli.main(["--version"]) == 0
     version = capsys.readouterr().out.removeprefix("drivax ").strip()
     assert f'version = "{version}"' in (repository / "pyproject.toml").read_text()
@@ -140,7 +140,9 @@ def test_debug_shows_the_traceback(probe: Any, capsys: pytest.CaptureFixture[str
         (["--vresion"], "unknown option '--vresion'; see drivax --help"),
     ],
 )
-def test_unknown_commands(argv: list[str], line: str, capsys: pytest.CaptureFixture[str]):
+def test_unknown_command_suggests_the_closest_one(
+    argv: list[str], line: str, capsys: pytest.CaptureFixture[str]
+):
     assert cli.main(argv) == 2
     assert capsys.readouterr().err == f"drivax: {line}\n"
 
@@ -152,7 +154,7 @@ def test_usage_errors_have_status_2(probe: Any, argv: list[str], capsys: pytest.
     assert "drivax probe" in capsys.readouterr().err or argv[-1] == "x"
 
 
-def test_command_help(probe: Any, capsys: pytest.CaptureFixture[str]):
+def test_command_help_lists_its_flags(probe: Any, capsys: pytest.CaptureFixture[str]):
     probe(lambda args: 0)
     assert cli.main(["probe", "--help"]) == 0
     assert "--number" in capsys.readouterr().out

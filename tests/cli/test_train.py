@@ -125,7 +125,7 @@ def test_weights_change_the_draws(place):
     assert effective[1] / effective[0] == pytest.approx(5 / 9, rel=0.05)
 
 
-def test_validation_option(place, monkeypatch):
+def test_validation_flag_chooses_held_out_none_or_a_set(place, monkeypatch):
     calls = []
 
     def note(*_, validation, **__):

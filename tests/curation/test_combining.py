@@ -24,7 +24,7 @@ def by_hand(name, values):
 
 
 @pytest.mark.parametrize("name", ["max", "mean", "std", "p0", "p50", "p99", "p100", "top1", "top10", "top99"])
-def test_aggregators(name):
+def test_aggregators_equal_hand_computed_values_of_valid_steps(name):
     expected = [by_hand(name, steps[valid]) for steps, valid in zip(STEPS, VALID, strict=True)]
     np.testing.assert_allclose(aggregate(STEPS, VALID, name), expected, atol=1e-12)
     # Values of invalid steps have no effect.

@@ -353,7 +353,7 @@ def test_members_disagree_on_rare_data(ensemble, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("weighted", ["plain", "rarity"])
-def test_ensemble_table(data, ensemble, weighted):
+def test_ensemble_scores_saturate_relative_to_the_99th_percentile(data, ensemble, weighted):
     trained = ensemble if weighted == "plain" else train_ensemble(replace(TINY, weighted="rarity"), data)
     table = ensemble_table(trained, data)
     assert table.method == "ensemble"

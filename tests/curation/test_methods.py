@@ -50,7 +50,9 @@ def tables(data, tmp_path_factory):
     write_scores(curate("kinematic", Request(data)), like)
     # These need training, other tables or evaluations, and have their own tests.
     names = [name for name in METHODS if name not in ("ensemble", "mixture", "failures", "novelty", "query")]
-    return {name: curate(name, Request(data, like if name == "random_matched" else None)) for name in names}
+    return {
+        name: curate(name, Request(data, like=like if name == "random_matched" else None)) for name in names
+    }
 
 
 def test_every_method_scores_every_step_and_round_trips(data, tables, tmp_path):
@@ -223,11 +225,11 @@ def test_invalid_arguments_are_refused(data, tmp_path):
         ("uniform", tmp_path / "x.npz", "leave out --like"),
     ):
         with pytest.raises(UsageError, match=f"random_matched needs --like.*; {cure}"):
-            curate(name, Request(data, like))
+            curate(name, Request(data, like=like))
     with pytest.raises(UsageError, match="unknown method 'kinematics'; did you mean 'kinematic'"):
         curate("kinematics", Request(data))
     with pytest.raises(DataError, match="score table not found"):
-        curate("random_matched", Request(data, tmp_path / "none.npz"))
+        curate("random_matched", Request(data, like=tmp_path / "none.npz"))
 
 
 def test_settings_of_a_method(data, tables, tmp_path, capsys):

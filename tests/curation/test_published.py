@@ -94,7 +94,7 @@ def test_distances_are_to_points(result):
     assert result["aside"]["off_road"].max() == 0.0
 
 
-def test_density(result):
+def test_published_density_is_agents_over_50(result):
     np.testing.assert_allclose(result["crowd"]["density"], 8 / 50)
 
 

@@ -57,7 +57,7 @@ def test_inverse_frequency_tempered_and_clipped(temper):
     np.testing.assert_allclose(other, [1.0 if temper else 0.2, 0.2])
 
 
-def test_published_histogram():
+def test_published_histogram_equals_counts_cell_by_cell():
     """The histogram is counted and weighted cell by cell."""
     config = PublishedRarity()
     acceleration, curvature = config.edges

@@ -317,7 +317,7 @@ def test_command_writes_scores(data, tmp_path, capsys):
             main([*command, "--out", str(tmp_path / "x"), "--export", str(tmp_path / "y"), out_of_range]) == 2
         )
         assert "of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
-    for taken, words in ((data.path, "is the set that is read"), (top, "already exists")):
+    for taken, words in ((data.path, "is the input set"), (top, "already exists")):
         assert main([*command, "--out", str(tmp_path / "x"), "--export", str(taken), "1"]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

@@ -38,7 +38,7 @@ def of_kind(found, kind):
 
 
 @pytest.mark.parametrize("centrelines", [True, False])
-def test_lanes(read, centrelines):
+def test_centre_lines_are_given_or_in_the_middle_of_boundaries(read, centrelines):
     """Centre lines as given in forecasting maps (their z = 0 is replaced), else the middle of the boundaries."""
     found = lanes(read(av2_motion.local_map(centrelines)))
     assert set(found) == set(IDS.values())
@@ -245,7 +245,7 @@ def real(request, real_data):
     return request.param, read_map(path), json.loads(path.read_bytes())
 
 
-def test_real_counts(real):
+def test_real_maps_have_the_published_numbers_of_elements(real):
     name, found, content = real
     kinds = Counter(lane.kind for lane in lanes(found).values())
     wanted = {

@@ -78,7 +78,7 @@ def test_check_list_19_rows_ids_and_marks(recording):
     ]  # fmt: skip
 
 
-def test_states(recording):
+def test_tracks_equal_the_positions_of_the_file(recording):
     tracks, t = recording.tracks, np.arange(110)
     np.testing.assert_allclose(tracks.xy[0], place(30 + 0.8 * t, 1.75)[:, :2])
     np.testing.assert_allclose(tracks.velocity[2], np.broadcast_to([-8.0, 0.0], (110, 2)))
@@ -246,7 +246,7 @@ def test_truncated_and_empty_files_are_refused(sample, tmp_path):
         assert line.startswith(f"{path}: ") and bad.cure and "\n" not in line
 
 
-def test_recognise(sample, tmp_path):
+def test_only_scenario_parquet_files_are_recognised(sample, tmp_path):
     assert isinstance(READER, Reader)
     assert READER.recognise(sample) and READER.count(sample) == 1
     other = tmp_path / "table.parquet"
@@ -258,7 +258,7 @@ def test_recognise(sample, tmp_path):
     assert READER.count(empty) == 0
 
 
-def test_describe(sample):
+def test_description_names_city_steps_and_tracks(sample):
     found = READER.describe(sample)
     assert (found.dataset, found.recordings) == ("Argoverse 2 Motion Forecasting", 1)
     assert "110 steps in austin" in found.flavour and "5 tracks" in found.notes
@@ -281,7 +281,7 @@ def real(real_data) -> Recording:
     return recording
 
 
-def test_real_counts(real, real_data):
+def test_real_scenario_has_the_counted_tracks_of_each_kind(real, real_data):
     tracks = real.tracks
     assert tracks.valid.shape == (58, 110) and tracks.valid.sum() == 2434 and real.lost == {}
     kinds = [int((tracks.kind == kind).sum()) for kind in AgentKind]

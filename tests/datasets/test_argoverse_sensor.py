@@ -174,7 +174,7 @@ def test_poses_may_be_unordered_and_repeated(rewritten, recording):
         ("SPACESHIP", AgentKind.OTHER),
     ],
 )
-def test_categories(rewritten, category, kind):
+def test_categories_become_agent_kinds(rewritten, category, kind):
     def renamed(boxes):
         return boxes | {"category": [category if c == "PEDESTRIAN" else c for c in boxes["category"]]}
 
@@ -273,7 +273,7 @@ def real(real_data) -> Recording:
     return recording
 
 
-def test_real_counts(real):
+def test_real_log_has_the_counted_tracks_of_each_kind(real):
     tracks = real.tracks
     assert tracks.valid.shape == (120, 157) and tracks.valid.sum() == 13_820
     assert tracks.valid[0].all() and real.tags["place"] == "miami" and real.lost == {}

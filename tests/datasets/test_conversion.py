@@ -98,7 +98,7 @@ def test_strict_stops_and_leaves_nothing(folder, tmp_path):
 @pytest.mark.parametrize(
     ("limit", "workers", "ids"), [(1, 1, ["a0"]), (3, 1, ["a0", "a1", "b0"]), (2, 2, ["a0", "a1"])]
 )
-def test_limit(folder, tmp_path, limit, workers, ids):
+def test_limit_keeps_the_first_scenarios(folder, tmp_path, limit, workers, ids):
     convert(folder, tmp_path / "set", Conversion(limit=limit, workers=workers))
     assert [entry["scenario_id"] for entry in ScenarioSet.open(tmp_path / "set").entries] == ids
 
@@ -128,7 +128,7 @@ def test_audit_without_a_scenario_is_refused(folder, tmp_path):
     assert leftovers(tmp_path) == ["src"]
 
 
-def test_overwrite(folder, tmp_path):
+def test_existing_set_is_replaced_only_with_overwrite(folder, tmp_path):
     convert(folder, tmp_path / "set", Conversion(limit=1))
     with pytest.raises(UsageError, match="--overwrite"):
         convert(folder, tmp_path / "set")
@@ -418,7 +418,7 @@ def test_split_files_cover_the_set(thirty, tmp_path):
     ScenarioSet.open(tmp_path / "set").check()
 
 
-def test_stride(wire, write_records, tmp_path):
+def test_stride_sets_the_starts_of_windows(wire, write_records, tmp_path):
     path = write_records("long.tfrecord", wire.scenario("long", steps=180, now=wire.whole(10, 0)))
     plans = []
     convert(path, tmp_path / "set", Conversion(stride=10), announce=plans.append)

@@ -76,7 +76,7 @@ def test_export_of_all_scenarios_keeps_the_data(stored, tmp_path):
         ("a\ntwo\ta\n", [("one", "a"), ("two", "a")]),
     ],
 )
-def test_ids(stored, tmp_path, text, expected_ids):
+def test_ids_file_selects_scenarios(stored, tmp_path, text, expected_ids):
     (tmp_path / "ids.txt").write_text(text)
     export(stored, tmp_path / "part", Export(ids=tmp_path / "ids.txt"))
     assert ids(tmp_path / "part") == expected_ids
@@ -108,14 +108,14 @@ def test_filters_ids_and_limit_together(stored, tmp_path):
     assert ids(tmp_path / "part") == [("one", "c"), ("two", "a")]
 
 
-def test_nothing_selected(stored, tmp_path):
+def test_export_without_selected_scenarios_is_refused(stored, tmp_path):
     for name in ("set", "tfexample", "gpudrive"):
         with pytest.raises(DataError, match="no scenario is selected"):
             export(stored, tmp_path / "part", Export(format=name, filters=("audit.distance_m>1000",)))
     assert listing(tmp_path) == []
 
 
-def test_tfrecord_shards(stored, tmp_path):
+def test_tfrecord_shards_have_the_names_and_sizes_of_womd(stored, tmp_path):
     calls = []
     options = Export(format="tfexample", shard_size=2)
     done = export(stored, tmp_path / "turns", options, lambda *call: calls.append(call))
@@ -134,7 +134,7 @@ def test_tfrecord_shards(stored, tmp_path):
     }  # fmt: skip
 
 
-def test_gpudrive_files(stored, tmp_path):
+def test_gpudrive_export_writes_a_file_per_scenario(stored, tmp_path):
     done = export(stored, tmp_path / "json", Export(format="gpudrive", limit=2))
     names = ["tfrecord-00000-of-00001_0.json", "tfrecord-00000-of-00001_1.json"]
     assert listing(tmp_path / "json") == [NOTE, *names] and done.files == 2
@@ -169,7 +169,7 @@ def test_only_exports_are_overwritten_and_only_on_request(stored, tmp_path, name
 
 
 def test_a_set_cannot_replace_itself(stored):
-    with pytest.raises(UsageError, match="is the set that is read"):
+    with pytest.raises(UsageError, match="is the input set"):
         export(stored, stored, Export(overwrite=True))
     assert len(ScenarioSet.open(stored)) == 5
 

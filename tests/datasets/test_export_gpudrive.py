@@ -43,7 +43,7 @@ def test_keys_are_those_of_the_published_files(content):
     assert (content["name"], content["scenario_id"]) == ("x.json", "0123456789abcdef")
 
 
-def test_objects(content, source):
+def test_objects_end_with_ego_and_keep_their_states(content, source):
     assert [thing["id"] for thing in content["objects"]] == [17, 900, 2406]  # the ego last
     assert [thing["type"] for thing in content["objects"]] == ["cyclist", "pedestrian", "vehicle"]
     assert content["metadata"] == {
@@ -112,7 +112,7 @@ def round_trip(recording):
     return stored, back
 
 
-def test_round_trip(source):
+def test_map_and_valid_steps_survive_a_round_trip(source):
     stored, back = round_trip(source)
     assert_same_map(back, source, 0.1)
     again = assemble(back)

@@ -192,7 +192,7 @@ def test_short_recordings_and_cones():
     assert len(back.timestamps_s) == 11
 
 
-def test_real_recording(real_data):
+def test_real_recording_is_restored_up_to_parked_poses(real_data):
     """A real recording and its restored form agree."""
     (recording,) = GpuDrive().read(real_data / "gpudrive" / "tfrecord-00000-of-01000_325.json")
     stored = assemble(recording)

@@ -179,7 +179,7 @@ def test_layout_equals_that_of_a_real_record(real_data):
     }
 
 
-def test_states(found, source):
+def test_states_equal_the_tracks_of_the_source(found, source):
     ids = found["state/id"]
     assert ids[:3].tolist() == [2406, 900, 17] and (ids[3:] == -1).all()
     assert found["state/type"][:4].tolist() == [1, 2, 3, -1]
@@ -212,7 +212,7 @@ def test_invalid_states_are_minus_one(found):
         assert (found[f"state/{name}"][:3] >= 0).all(), name
 
 
-def test_item_19_marks(found):
+def test_marks_of_ego_prediction_and_interest_follow_the_agents(found):
     assert found["state/is_sdc"][:3].tolist() == [1, 0, 0]
     assert found["state/tracks_to_predict"][:3].tolist() == [0, 0, 1]
     assert found["state/objects_of_interest"][:3].tolist() == [1, 0, 1]
@@ -238,7 +238,7 @@ def test_lights_are_time_major(found):
     np.testing.assert_allclose(x[(ids == 2)], womd_scenario.X0 + 40, atol=1e-3)
 
 
-def test_roadgraph(found):
+def test_roadgraph_samples_are_ordered_as_by_the_official_writer(found):
     kinds, valid = found["roadgraph_samples/type"][:, 0], found["roadgraph_samples/valid"][:, 0] == 1
     ids, xyz = found["roadgraph_samples/id"][:, 0], found["roadgraph_samples/xyz"]
     count = int(valid.sum())
@@ -273,14 +273,14 @@ def test_directions_are_unit_vectors_to_the_next_point(found):
         assert (to[rows[-1]] == 0).all()
 
 
-def test_item_12_speed_limits_are_mph(found):
+def test_speed_limits_are_in_miles_per_hour(found):
     ids, limit = found["roadgraph_samples/id"][:, 0], found["roadgraph_samples/speed_limit"]
     np.testing.assert_allclose(limit[ids == 1], 25.0, rtol=1e-5)
     np.testing.assert_allclose(limit[ids == 4], 45.0, rtol=1e-5)
     assert (limit[(ids != 1) & (ids != 4)] == -1).all()
 
 
-def test_paths(found, source):
+def test_path_samples_start_at_ego_with_points_1_m_apart(found, source):
     xyz, valid = found["path_samples/xyz"], found["path_samples/valid"] == 1
     counts = valid.sum(axis=1)
     used = np.flatnonzero(counts)
@@ -379,7 +379,7 @@ def test_coordinates_beyond_float32_become_local():
     np.testing.assert_allclose(over_time(near, "x")[0], driving()[:, 0] + 8000.0, atol=1e-3)
 
 
-def test_item_22_ids_that_do_not_fit_are_numbered():
+def test_ids_beyond_the_range_are_renumbered():
     tracks = replace(make_tracks([driving(), driving(6.0, y=3.5)]), track_id=np.array([2**24 + 1, 5]))
     features = tuple(
         replace(f, feature_id=f.feature_id + 2**33, left_neighbours=(), right_neighbours=())
@@ -402,7 +402,7 @@ def test_cones_are_others(source):
     assert table(assemble(make_recording(tracks=tracks)))["state/type"][:3].tolist() == [1, 4, -1]
 
 
-def test_item_20_short_recordings_have_no_future():
+def test_short_recordings_have_no_future():
     tracks = make_tracks([driving(steps=11)])
     stored = assemble(make_recording(tracks=tracks))
     found = table(stored)
@@ -459,7 +459,7 @@ def round_trip(recording, tolerance_m: float = 1e-3):
     return stored, back
 
 
-def test_round_trip(source):
+def test_map_and_valid_steps_survive_a_round_trip(source):
     stored, back = round_trip(source)
     assert_same_map(back, source, 0.1)
     again = assemble(back)

@@ -19,7 +19,7 @@ def test_varints_are_those_of_the_wire_format(values):
 
 
 @pytest.mark.parametrize("value", [0, 127, 128, 300, 2**31, 2**63 - 1, -1, -(2**63)])
-def test_varint_limits(value):
+def test_varints_at_size_limits_equal_the_reference(value):
     assert varints(np.array([value])) == womd_scenario.varint(value)
 
 

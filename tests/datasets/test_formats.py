@@ -73,10 +73,12 @@ def test_a_mixed_folder_is_sorted_by_content(sampled):
 
 def test_names_are_relative_to_what_was_given(sampled, tmp_path):
     found = survey(sampled[0])
-    assert "gpudrive/tfrecord-00000-of-01000_1.json" in {found.relative(one.path) for one in found.inputs}
-    assert found.relative(tmp_path / "elsewhere" / "map.json") == "map.json"
+    assert "gpudrive/tfrecord-00000-of-01000_1.json" in {
+        found.relative_path(one.path) for one in found.inputs
+    }
+    assert found.relative_path(tmp_path / "elsewhere" / "map.json") == "map.json"
     one = survey(sampled[1]["gpudrive"])
-    assert one.relative(sampled[1]["gpudrive"]) == "tfrecord-00000-of-01000_1.json"
+    assert one.relative_path(sampled[1]["gpudrive"]) == "tfrecord-00000-of-01000_1.json"
 
 
 def test_sensor_data_is_not_opened(tmp_path, wire, write_records, monkeypatch):

@@ -29,7 +29,7 @@ def read(path) -> Recording:
     return recording
 
 
-def test_tracks(tmp_path):
+def test_tracks_equal_the_objects_of_the_file(tmp_path):
     recording = read(sample.write(tmp_path))
     tracks = recording.tracks
     assert isinstance(GpuDrive(), Reader)
@@ -51,12 +51,12 @@ def test_tracks(tmp_path):
     assert recording.current_step == 10
 
 
-def test_item_1_headings_are_wrapped(content):
+def test_headings_are_wrapped(content):
     content["objects"][3]["heading"] = [7 * math.pi / 2] * 91
     np.testing.assert_allclose(decode(content).tracks.heading[3], -math.pi / 2)
 
 
-def test_item_4_invalid_steps_stay_empty(content):
+def test_invalid_steps_stay_empty(content):
     tracks = decode(content).tracks
     for values in (tracks.xy, tracks.z, tracks.heading, tracks.velocity, tracks.size):
         assert not values[~tracks.valid].any()  # -10000 in the file
@@ -67,7 +67,7 @@ def test_steps_without_a_position_are_invalid(content):
     assert not decode(content).tracks.valid[0, 30:36].any()
 
 
-def test_item_19_ego_and_marks_rows_versus_ids(content):
+def test_prediction_marks_are_rows_and_interest_marks_are_ids(content):
     recording = decode(content)
     assert recording.ego == 3
     assert recording.to_predict == (0,)  # rows in the file
@@ -76,7 +76,7 @@ def test_item_19_ego_and_marks_rows_versus_ids(content):
     assert stored.agent_id[0] == 2406
 
 
-def test_roads(content):
+def test_road_elements_become_map_features(content):
     recording = decode(content)
     kinds = {feature.feature_id: feature.kind for feature in recording.features}
     assert kinds == {
@@ -99,7 +99,7 @@ def test_roads(content):
         ("2", "road_line", RoadKind.LINE_UNKNOWN),
     ],
 )
-def test_road_codes(content, code, word, kind):
+def test_road_codes_become_feature_kinds(content, code, word, kind):
     content["roads"][0] |= {"map_element_id": code, "type": word}
     assert decode(content).features[0].kind == kind
 
@@ -112,7 +112,7 @@ def test_unknown_and_one_point_roads_are_counted(content):
     assert len(recording.features) == 9
 
 
-def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(content):
+def test_lanes_without_links_are_chained_and_flagged(content):
     stored = assemble(decode(content))
     lanes = stored.lane_id.tolist()
     first, second = lanes.index(1), lanes.index(2)
@@ -121,7 +121,7 @@ def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(content):
     assert Flag.SPEED_LIMITS not in stored.has
 
 
-def test_item_5_jumps_split_dense_polylines_only(content):
+def test_jumps_split_dense_polylines_only(content):
     edge = content["roads"][4]["geometry"]
     del edge[40:60]
     assert decode(content).split_gap_m == 1.0
@@ -141,7 +141,7 @@ def test_only_a_map_with_thinned_lines_is_called_thinned(tmp_path):
         assert any("thinned" in note for note in notes) == is_thinned
 
 
-def test_item_3_implausible_sizes_are_those_of_the_class(content):
+def test_implausible_sizes_become_those_of_the_class(content):
     content["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
     stored = assemble(decode(content))
     row = stored.agent_id.tolist().index(78)
@@ -151,7 +151,7 @@ def test_item_3_implausible_sizes_are_those_of_the_class(content):
 
 
 @pytest.mark.parametrize("value", [0, -4.5, 1e6, 1e-9, math.nan, math.inf])
-def test_item_3_implausible_sizes_are_counted(content, value):
+def test_implausible_sizes_are_counted(content, value):
     assert "implausible_sizes" not in decode(content).lost
     content["objects"][0]["width"] = content["objects"][2]["length"] = value
     recording = decode(content)
@@ -297,7 +297,7 @@ def test_recognises_by_content(tmp_path, content):
     assert not GpuDrive().recognise(other) and not GpuDrive().recognise(tmp_path)
 
 
-def test_describe(tmp_path):
+def test_description_counts_objects_and_needs_metadata(tmp_path):
     described = GpuDrive().describe(sample.write(tmp_path))
     assert described.recordings == 1 and "4 objects, 10 road elements" in described.notes[0]
     assert any("no traffic lights" in note for note in described.notes)
@@ -310,7 +310,7 @@ REAL = {"325": ("ef3a8f65142f41ac", 62, 61, 157, 10_527), "4": ("db4edc9bd0c9d18
 
 
 @pytest.mark.parametrize("number", REAL)
-def test_real_files(real_data, number):
+def test_real_files_have_the_counted_content_and_headings_along_motion(real_data, number):
     path = real_data / "gpudrive" / f"tfrecord-00000-of-01000_{number}.json"
     recording = read(path)
     stored = assemble(recording)

@@ -79,7 +79,7 @@ def test_reader_recognises_only_logs(log, tmp_path):
     assert not reader.recognise(tmp_path)
 
 
-def test_description(log, tmp_path):
+def test_description_names_the_missing_map(log, tmp_path):
     found = NuPlan().describe(log)
     assert (found.dataset, found.recordings, found.missing) == ("nuPlan", 2, ())
     assert "map us-nv-las-vegas-strip" in found.notes
@@ -99,7 +99,7 @@ def test_count_is_the_number_of_windows(log, recordings, tmp_path):
 # --- Identity and time.
 
 
-def test_identity(recordings):
+def test_recordings_have_scene_tokens_and_place(recordings):
     scenes = [sample.token("scene", number).hex() for number in (0, 1)]
     assert [recording.scenario_id for recording in recordings] == scenes
     for recording in recordings:
@@ -121,7 +121,7 @@ def test_every_second_sweep_is_read_with_the_time_of_the_lidar(recordings):
     assert [sweeps_of(r)[[0, -1]].tolist() for r in recordings] == [[0, 358], [180, 498]]
 
 
-def test_scene_borders(recordings):
+def test_recordings_extend_scenes_by_history_and_future(recordings):
     """A recording is a scene with 10 steps before and 80 after it; its current steps are the scene's own."""
     first, second = (sweeps_of(recording) for recording in recordings)
     assert first[0] == 0 and first[-1] == 398 + 2 * 80 - 200  # scene 0 ends with sweep 198 at 10 Hz
@@ -173,7 +173,7 @@ def test_yaw_against_scipy(yaw, pitch, roll, flip):
 # --- Agents.
 
 
-def test_agents(recordings):
+def test_agents_follow_the_boxes_of_the_log(recordings):
     kinds = Counter(AgentKind(kind) for kind in recordings[0].tracks.kind)
     assert kinds == {
         AgentKind.VEHICLE: 1 + 4, AgentKind.CYCLIST: 1, AgentKind.PEDESTRIAN: 2, AgentKind.STATIC: 5,
@@ -305,7 +305,7 @@ def test_scenario_types_come_from_the_scene_itself(recordings):
     assert recordings[1].tags["scenario_types"] == "near_construction_zone_sign"
 
 
-def test_route_corridor(recordings):
+def test_route_corridor_lists_the_lanes_of_the_roadblocks(recordings):
     expected = (
         feature_id("lanes_polygons", sample.IN["w"]), feature_id("lanes_polygons", sample.SECOND),
         feature_id("lane_connectors", sample.TURN), feature_id("lanes_polygons", sample.OUT["n"]),

@@ -101,7 +101,7 @@ def test_lanes_keep_direction_and_position(features):
     assert all((feature.points[:, 2] == 0.0).all() for feature in features.values())
 
 
-def test_lane_graph(features):
+def test_connectors_link_exit_lanes_to_entry_lanes(features):
     """``exit_lane_fid`` is the lane before a connector, ``entry_lane_fid`` the one after."""
     for pair in sample.CONNECTORS:
         before, after = sample.connector_ends(pair)
@@ -164,7 +164,7 @@ def test_widths_between_boundaries(features):
         assert features[connector_id(*pair)].width_m == pytest.approx(sample.WIDTH, abs=0.05)
 
 
-def test_unknown_widths(tmp_path):
+def test_lanes_without_width_polygons_have_no_width(tmp_path):
     layers = sample.map_layers()
     del layers["gen_lane_connectors_scaled_width_polygons"]
     shape, values = layers["lanes_polygons"].rows[51]
@@ -223,7 +223,7 @@ def test_stop_sign_and_its_lane(features):
     assert sign.lanes == (lane_id(sample.IN["s"]),)
 
 
-def test_crosswalks(features):
+def test_crosswalks_keep_their_outline(features):
     crossing = local(features[feature_id("crosswalks", 1)])
     expected = sample.rectangle("e", 13.0, 16.0, -3.5, 3.5)
     np.testing.assert_allclose(np.sort(crossing, axis=0), np.sort(expected, axis=0), atol=1e-5)

@@ -90,7 +90,7 @@ def test_touching_equals_brute_force(tmp_path):
     for x, y in rng.uniform(-1.0, 1.0, (20, 2)):
         box = (x, y, x + 0.2, y + 0.3)
         expected = [i for i, shape in enumerate(shapes) if shape.intersects(shapely.box(*box))]
-        assert layer.touching(box).tolist() == expected
+        assert layer.query_box(box).tolist() == expected
 
 
 BAD = {
@@ -119,7 +119,7 @@ def test_invalid_geometries_are_none_without_bounds(tmp_path, name):
     assert found[1] is None or found[1].is_empty
     assert found[0].equals(SHAPES[0]) and found[2].equals(SHAPES[2])
     assert np.isnan(layer.bounds[1]).all()
-    assert 1 not in layer.touching((-180.0, -90.0, 180.0, 90.0))
+    assert 1 not in layer.query_box((-180.0, -90.0, 180.0, 90.0))
 
 
 @pytest.mark.parametrize("envelope", [True, False])

@@ -108,7 +108,7 @@ def test_the_test_split_has_no_annotations_and_is_refused(tmp_path):
     assert bad.file.name == "sample_annotation.json" and "the test split has none" in str(bad.error())
 
 
-def test_item_16_keyframes_of_two_hertz_become_ten_hertz(scene):
+def test_keyframes_at_2_hz_become_10_hz(scene):
     assert len(scene.timestamps_s) == 196
     np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1, atol=1e-9)
     car, t = scene.tracks.xy[1], scene.timestamps_s
@@ -116,14 +116,14 @@ def test_item_16_keyframes_of_two_hertz_become_ten_hertz(scene):
     np.testing.assert_allclose(scene.tracks.velocity[1], [[8.0, 0.0]] * 196, atol=1e-6)
 
 
-def test_item_16_heading_is_unwrapped_before_it_is_interpolated(scene):
+def test_heading_is_unwrapped_before_interpolation(scene):
     heading = scene.tracks.heading[4]
     expected = math.pi - 0.2 + 0.02 * scene.timestamps_s / 0.5
     np.testing.assert_allclose(np.exp(1j * heading), np.exp(1j * expected), atol=1e-9)
     assert np.abs(heading).max() <= math.pi
 
 
-def test_item_16_gaps_are_not_interpolated(scene):
+def test_long_gaps_are_not_interpolated(scene):
     seen = scene.tracks.valid[2]
     # Keyframes 9 and 12 are 1.5 s apart: steps 45 and 60 are observed, nothing in between.
     assert seen[:46].all()
@@ -168,7 +168,7 @@ def test_tables_and_fields_of_unknown_names_are_counted(tmp_path):
     assert scene.lost == {"dangling_links": 1, "unknown_fields": 4}
 
 
-def test_lane_graph(scene):
+def test_lanes_have_links_neighbours_and_widths(scene):
     lanes = {f.feature_id: f for f in scene.features if f.kind is RoadKind.LANE_SURFACE}
     right, left, on, north, turn = (lanes[i] for i in range(5))
     assert (right.successors, left.successors, turn.successors) == ((2,), (4,), (3,))

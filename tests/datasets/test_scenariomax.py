@@ -94,7 +94,7 @@ def test_19_padding_is_dropped_by_validity(recording, wire):
         assert other.tracks.track_id.tolist() == [0, 1, 2]
 
 
-def test_identity(recording):
+def test_recording_has_id_data_set_and_source(recording):
     assert (recording.scenario_id, recording.segment, recording.dataset) == (
         "sm_0001",
         "sm_0001",
@@ -108,7 +108,7 @@ def test_23_missing_times_are_ten_hertz(recording):
     np.testing.assert_allclose(recording.timestamps_s, 0.1 * np.arange(91))
 
 
-def test_states(recording):
+def test_tracks_equal_the_states_of_the_example(recording):
     tracks, t = recording.tracks, np.arange(91)
     np.testing.assert_array_equal(tracks.xy[0, :, 0], t - 10.0)
     np.testing.assert_array_equal(tracks.valid, [t >= 0, t >= 20, t >= 0])
@@ -144,7 +144,7 @@ def test_12_limits_come_with_points_in_mph(recording, wire):
     assert {f.limit_mps for f in without.features} == {None}
 
 
-def test_map(recording):
+def test_map_elements_become_features(recording):
     kinds = {f.feature_id: f.kind for f in recording.features}
     assert kinds == {
         7: RoadKind.LANE_SURFACE, 3: RoadKind.LANE_SURFACE, 4: RoadKind.LANE_FREEWAY, 9: RoadKind.EDGE_BOUNDARY,

@@ -42,7 +42,7 @@ def by_id(recording: Recording) -> dict[int, MapFeature]:
 # --- WOMD's flavour.
 
 
-def test_identity(tree):
+def test_recording_has_id_data_set_and_ego(tree):
     recording = decode(tree)
     assert (recording.scenario_id, recording.segment) == ("0123456789abcdef",) * 2
     assert (recording.dataset, recording.current_step, recording.ego) == ("womd", 10, 2)
@@ -644,7 +644,7 @@ def real(request, real_data) -> tuple[str, Recording]:
     return request.param, recording
 
 
-def test_real_counts(real):
+def test_real_files_have_the_counted_content(real):
     name, recording = real
     lanes = sum(f.kind in LANE_KINDS for f in recording.features)
     found = (*recording.tracks.valid.T.shape, len(recording.lights), len(recording.features), lanes)

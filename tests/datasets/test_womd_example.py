@@ -264,7 +264,7 @@ def real(real_data) -> Recording:
     return recording
 
 
-def test_real_counts(real):
+def test_real_example_has_the_counted_content(real):
     assert (real.scenario_id, real.ego) == ("a3bb37c25ce56418", 8)
     assert real.tracks.valid.shape == (128, 91)
     assert real.tracks.valid[:, real.current_step].sum() == 73
@@ -287,7 +287,7 @@ def test_real_lights_do_not_jump(real):
         assert gap.min() < 0.1
 
 
-def test_real_units(real):
+def test_real_example_is_in_metres_seconds_and_radians(real):
     tracks = real.tracks
     assert np.abs(tracks.heading).max() <= math.pi
     run = tracks.valid[:, :-2] & tracks.valid[:, 1:-1] & tracks.valid[:, 2:]

@@ -44,7 +44,7 @@ def test_identity_and_time(recording):
     assert recording.tags == {"source_format": "womd-scenario"}
 
 
-def test_assembled_flags(recording):
+def test_assembled_scenario_has_lights_graph_limits_and_route(recording):
     measured = Flag.LIGHTS | Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
     assert assemble(recording).has & ~Flag.DEFAULT_LIMITS == measured
 
@@ -78,7 +78,7 @@ def test_rows_are_rows_and_ids_are_ids(recording):
     assert recording.of_interest == (1, 2)  # the file gives ids 17 and 2406
 
 
-def test_states(recording, wire):
+def test_tracks_equal_the_states_of_the_proto(recording, wire):
     tracks = recording.tracks
     t = np.arange(91)
     np.testing.assert_array_equal(tracks.xy[2], np.stack([wire.X0 + t - 10, np.full(91, wire.Y0)], axis=1))
@@ -120,7 +120,7 @@ def test_12_lanes_and_limits_in_mph(recording, wire):
     np.testing.assert_array_equal(first.points, wire.line(0.0, stop=40.0))
 
 
-def test_other_features(recording, wire):
+def test_map_elements_other_than_lanes_become_features(recording, wire):
     features = by_id(recording)
     kinds = {number: feature.kind for number, feature in features.items()}
     assert kinds == {
@@ -472,7 +472,7 @@ def real(real_data) -> Recording:
     return recording
 
 
-def test_real_counts(real):
+def test_real_scenario_has_the_counted_content(real):
     kinds = [feature.kind.name.split("_")[0] for feature in real.features]
     assert {kind: kinds.count(kind) for kind in set(kinds)} == {
         "EDGE": 28, "LINE": 59, "LANE": 199, "CROSSWALK": 4, "SPEED": 3, "STOP": 8
@@ -494,7 +494,7 @@ def test_real_ego_and_predictions(real):
     np.testing.assert_allclose(real.tracks.size[82, 0], [5.286, 2.332, 2.33], atol=1e-3)
 
 
-def test_real_units(real):
+def test_real_scenario_is_in_metres_seconds_and_radians(real):
     limits = {round(f.limit_mps / 0.44704, 6) for f in real.features if f.limit_mps is not None}
     assert limits == {10.0, 15.0, 40.0, 45.0}
     tracks = real.tracks

@@ -82,7 +82,7 @@ def test_truncation_at_every_offset(good, read, wire):
             assert number == whole and "truncated" in str(error) and f"record {whole}" in str(error)
 
 
-def test_empty_file(read):
+def test_empty_file_is_reported_as_one_bad_record(read):
     records, path = read(b"")
     assert (
         str(one_error(records)[1]) == f"{path}: record 0: the file is empty; copy or download the file again"

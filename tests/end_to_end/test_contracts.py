@@ -81,7 +81,7 @@ def evaluation(data):
     return out
 
 
-def test_episodes(evaluation, data):
+def test_episodes_csv_has_the_declared_columns_and_values(evaluation, data):
     with (evaluation / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [*KEYS, *METRICS, *ADDED]
@@ -118,7 +118,7 @@ def test_summary_is_recomputable(evaluation):
             assert value["mean"] is None
 
 
-def test_trajectories(evaluation):
+def test_trajectories_have_the_declared_shapes_and_types(evaluation):
     with np.load(evaluation / "trajectories.npz") as arrays:
         assert arrays["ego"].shape == (5, 81, 4) and arrays["ego"].dtype == np.float32
         assert (arrays["start"] == 10).all() and np.isfinite(arrays["ego"]).all()
@@ -126,7 +126,7 @@ def test_trajectories(evaluation):
         assert not arrays["action"].any(), "a constant velocity asks for nothing"
 
 
-def test_inspect(data, capsys):
+def test_inspect_json_matches_its_schema(data, capsys):
     assert main(["inspect", str(data), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     jsonschema.validate(found, INSPECT)
@@ -139,7 +139,7 @@ QUICK = ("dynamics", "agents", "contacts", "ttc", "edges", "lanes", "route", "me
 
 
 @pytest.mark.slow
-def test_bench(data, capsys, monkeypatch):
+def test_bench_json_matches_its_schema(data, capsys, monkeypatch):
     parts = bench._parts
     monkeypatch.setattr(bench, "_parts", lambda of: {name: parts(of)[name] for name in QUICK})
     check_bench(data, capsys, LEAN)
@@ -219,7 +219,7 @@ def test_python_planner_that_raises_is_a_crash(data, tmp_path, capsys):
     jsonschema.validate(json.loads((tmp_path / "run" / "summary.json").read_text()), SUMMARY)
 
 
-def test_report(evaluation, data):
+def test_report_page_shows_the_planner(evaluation, data):
     out = data.parent / "report.html"
     assert main(["report", str(evaluation), "--out", str(out)]) == 0
     page = out.read_text()

@@ -386,8 +386,8 @@ def test_values_out_of_range_are_named():
         ComparisonPlan(resamples=10)
 
 
-def test_run_that_is_named_twice_on_one_side_is_refused():
-    with pytest.raises(UsageError, match=r"^runs/one: is named twice"):
+def test_duplicate_run_on_one_side_is_refused():
+    with pytest.raises(UsageError, match=r"^runs/one: duplicate run"):
         compare(PLAN, [table("two")], [table("one"), table("one")])
 
 

@@ -265,10 +265,10 @@ def test_sampled_states_lie_within_their_logs(logs):
 
 
 def test_capacity_for_fifteen_seconds_has_room_for_longer_routes():
-    longer = CAPACITIES["default"].lasting(15.0)
+    longer = CAPACITIES["default"].with_future(15.0)
     assert (longer.steps, longer.route_points, longer.name) == (161, 680, "default-15s")
-    assert CAPACITIES["large"].lasting(8.0) is CAPACITIES["large"]
-    assert CAPACITIES["default"].lasting(3.0).steps == 41
+    assert CAPACITIES["large"].with_future(8.0) is CAPACITIES["large"]
+    assert CAPACITIES["default"].with_future(3.0).steps == 41
 
 
 def test_scenarios_of_several_lengths_are_refused_together(logs):

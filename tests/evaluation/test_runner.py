@@ -15,8 +15,14 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.episode_table import ADDED, FAILED, KEYS, Crash, EpisodeTable, fail_crashed
 from drivax.evaluation.result_tables import paired_difference, summarise
-from drivax.evaluation.runner import EvaluationConfig, evaluate, format_crashes, run_evaluation
-from drivax.metrics.catalogue import METRICS
+from drivax.evaluation.runner import (
+    EvaluationConfig,
+    evaluate,
+    format_crashes,
+    format_summary,
+    run_evaluation,
+)
+from drivax.metrics.catalogue import METRICS, headline
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank, identities
 from drivax.scenario.build.assemble import assemble
@@ -343,3 +349,20 @@ def test_start_at_the_last_step_of_a_log_is_refused():
     logs = [named(straight_road([car()]), "good"), named(cut(straight_road([car()]), 41), "short")]
     with pytest.raises(UsageError, match="short: the log has no action after step 40 in 1 of 2"):
         evaluate(fragile(), logs, start=NoisyStart(), start_step=40)
+
+
+def test_summary_has_all_headline_metrics_of_all_planners_within_100_columns():
+    values = {name: {"mean": rank / 8} for rank, name in enumerate(METRICS)}
+    values["red_light"] = {"mean": None}
+    planners = ["expert", "constant_velocity", "policy (route)", "own_drivers:cruise", "idm", "x" * 60]
+    tables = format_summary([{"planner": name, "metrics": values} for name in planners]).split("\n\n")
+    for text, names in zip(tables, (planners[:5], planners[5:]), strict=True):
+        heading, *lines = text.splitlines()
+        assert max(map(len, (heading, *lines))) <= 100
+        assert len(lines) == len(headline(METRICS)) and lines[0].split() == [
+            "success",
+            *["0.250"] * len(names),
+        ]
+        assert [line for line in lines if not line[-1].isdigit()] == ["red light"]
+        assert any(line.split()[:3] == ["at-fault", "collision", "1.125"] for line in lines)
+    assert tables[0].split("\n")[0].split() == ["metric", *" ".join(planners[:5]).split()]

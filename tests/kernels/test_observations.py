@@ -139,7 +139,7 @@ def assert_equal(actual, expected, clear_road, clear_agents):
 
 @pytest.mark.parametrize("name", CONFIGS)
 @pytest.mark.parametrize("size", SIZES, ids=str)
-def test_random_arrays(name, size):
+def test_kernel_equals_jax_on_random_arrays(name, size):
     config = CONFIGS[name]
     for seed in range(4):
         arrays = world(size, seed)

@@ -274,7 +274,7 @@ def test_a_weight_of_a_condition_is_no_penalty():
     assert set(TrainConfig(task=task).environment(LogTraffic()).penalties) == {"offroad", "red_light"}
 
 
-def test_configuration():
+def test_constraints_of_file_and_flags_are_merged():
     flags = ["--algorithm.constraints.collision", "0.02", "--algorithm.multiplier_rate", "0.05"]
     config = load(TrainConfig, {"algorithm": {"kind": "ppo", "constraints": {"offroad": 0.005}}}, flags)
     assert config.algorithm.constraints == {"offroad": 0.005, "collision": 0.02}

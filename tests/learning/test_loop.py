@@ -12,7 +12,7 @@ from drivax import kernels, settings
 from drivax.api import evaluate, load
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
-from drivax.learning import loop, training_log
+from drivax.learning import loop, training_log, training_set
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -154,7 +154,7 @@ def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
         train(patient, data, tmp_path / "other", validation=None)
 
 
-def test_patience():
+def test_patience_ends_without_a_better_rank():
     ranks = [(0.1,), (0.5,), (0.5,), (0.4,), (0.6,)]
     assert [patience_exceeded(ranks[:n], 2) for n in range(6)] == [False, False, False, False, True, False]
     assert not patience_exceeded(ranks, 0) and not patience_exceeded([], 3)
@@ -163,7 +163,7 @@ def test_patience():
     assert patience_exceeded([(0.9, 0.5, 0.2), (0.8, 1.0, 1.0)], 1)
 
 
-def test_ranks():
+def test_ranks_compare_failures_before_progress_before_comfort():
     row = {
         "validation/vmax_score": 0.7, "validation/accuracy": 0.75, "validation/progress_ratio": 0.9,
         "validation/comfortable": None, "loss/value": 3.0,
@@ -339,7 +339,7 @@ def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypa
         calls.append((bank, weights))
         raise Stop
 
-    monkeypatch.setattr(loop, "training_data", note)
+    monkeypatch.setattr(training_set, "training_data", note)
     weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
     with pytest.raises(Stop):
         train(config, TrainingSet(data, weights), tmp_path / "run")

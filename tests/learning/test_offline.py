@@ -547,7 +547,7 @@ def test_multiplier_reaches_the_gap():
     assert result[1.0][1] > result[-0.5][1] > result[-1.0][1]
 
 
-def test_timeouts_bootstrap():
+def test_values_bootstrap_at_timeouts_but_not_at_terminations():
     """One state for ever, paid 1 a step: 1 / (1 - gamma) where episodes are cut off, 1 where they end."""
     ones, number = jnp.ones((20, 10)), jnp.broadcast_to(jnp.arange(10), (20, 10))
     never = jnp.zeros((20, 10), bool)

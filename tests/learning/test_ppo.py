@@ -210,7 +210,7 @@ def test_chunks_divide_a_batch(batch, chunk):
     ],
     ids=["grid-shared", "beta"],
 )
-def test_heads(network):
+def test_every_head_learns_and_samples_valid_actions(network):
     environment = Pendulum(levels=((-1.0, 0.0, 1.0),))
     config = PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2)
     learner = config.build(environment, (), 1)

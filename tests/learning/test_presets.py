@@ -49,7 +49,7 @@ def test_every_algorithm_has_its_presets():
     assert {f"published/{name}" for name in OFFLINE if name != "cql_bc"} <= names
 
 
-def test_published_numbers():
+def test_published_presets_have_the_published_defaults():
     """As the semantics list them (Learning, published defaults)."""
     sac = settings.load(TrainConfig, "published/sac")
     learner = sac.algorithm

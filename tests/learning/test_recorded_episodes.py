@@ -223,7 +223,7 @@ def test_best_drives_have_the_highest_return_of_their_scenario(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_drives_of_another_set_traffic_or_start_are_refused(data, tmp_path):
+def test_episodes_of_another_set_traffic_or_start_are_refused(data, tmp_path):
     run = record(IdmPlanner(), data, tmp_path / "run", start_step=12)
     with pytest.raises(UsageError, match="traffic of its episodes is log, not idm; train with it, or"):
         read_episodes([run], data, TASK, "idm")

@@ -109,7 +109,7 @@ def compare(seed):
 
 @settings(max_examples=2)
 @given(st.integers(0, 2**31))
-def test_random_scenes(seed):
+def test_metrics_of_random_scenes_equal_the_oracle(seed):
     compare(seed)
 
 

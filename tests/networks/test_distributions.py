@@ -12,8 +12,8 @@ from drivax.networks.distributions import (
     Beta,
     Distribution,
     Grid,
-    Mixture,
     SquashedGaussian,
+    SquashedMixture,
     distribution,
     initial_parameters,
     parameter_count,
@@ -24,7 +24,7 @@ LEVELS = ((-1.0, -0.25, 0.0, 0.25, 1.0), (-0.5, 0.0, 0.5))
 GAUSSIAN = SquashedGaussian(jnp.array([0.3, -1.0]), jnp.array([0.2, 1.4]))
 BETA = Beta(jnp.array([1.0, 7.5]), jnp.array([3.0, 2.0]))
 GRID = Grid(jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32), LEVELS)
-MIXTURE = Mixture(
+MIXTURE = SquashedMixture(
     jnp.array([0.5, -0.3, 0.1]),
     SquashedGaussian(
         jnp.array([[0.3, -1.0], [-0.8, 0.2], [0.0, 1.5]]), jnp.array([[0.2, 1.4], [0.5, 0.3], [0.1, 0.8]])

@@ -180,7 +180,7 @@ def count(config):
 
 
 @pytest.mark.slow
-def test_parameter_counts():
+def test_parameter_counts_equal_hand_computed_sums():
     # agents 4, ego 3, ego_static 2, lights 3, route 2 features to 8 numbers, each with bias and a norm.
     embedding = (4 + 3 + 2 + 3 + 2) * 8 + 5 * (8 + 16)
     attention, norm, feed_forward = 4 * 8 * 8, 16, 8 * 32 + 32 + 32 * 8 + 8

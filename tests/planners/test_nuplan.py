@@ -29,10 +29,11 @@ from drivax.planners.nuplan.interface import (
     TrackedObjectType,
 )
 from drivax.planners.nuplan.map import MapApi, SemanticMapLayer
-from drivax.planners.nuplan.planner import Host, NuplanPlanner, View
+from drivax.planners.nuplan.planner import Host, NuplanPlanner, ScenarioView
 from drivax.planners.pdm.brake import EmergencyBrake
 from drivax.planners.simple import Expert
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
@@ -338,7 +339,7 @@ def test_types_equal_those_of_the_devkit_by_name():
 
 
 def test_vehicle_has_nuplan_proportions():
-    view = View(assemble(straight_road([car(0, 0, 0, 8, length=5.176, width=2.297)]), SMALL))
+    view = ScenarioView(assemble(straight_road([car(0, 0, 0, 8, length=5.176, width=2.297)]), SMALL))
     vehicle = view.vehicle
     found = (vehicle.front_length, vehicle.rear_length, vehicle.wheel_base, vehicle.rear_axle_to_center)
     assert found == pytest.approx((4.049, 1.127, 3.089, 1.461), abs=1e-5)
@@ -350,7 +351,7 @@ def test_vehicle_has_nuplan_proportions():
 
 def states_of(scenario):
     """Ego and observation of step 10, as planners get them."""
-    view = View(scenario)
+    view = ScenarioView(scenario)
     return view.ego(10, np.tile([0.0, 0.0, 0.0, 8.0], (23, 1))), view.logged_tracks(10), view.map
 
 
@@ -405,7 +406,7 @@ def test_states_are_split_and_joined(scenarios):
 
 def test_the_rear_axle_has_the_speed_along_the_heading():
     """On a circle of 10 m the rear axle has 5 m/s and the centre of a 5.176 m car hypot(5, 1.461 x 0.5)."""
-    view = View(assemble(straight_road([car(0, 0, 0, 8, length=5.176)]), SMALL))
+    view = ScenarioView(assemble(straight_road([car(0, 0, 0, 8, length=5.176)]), SMALL))
     angle = 0.05 * np.arange(23)
     x, y = 10 * np.sin(angle) + 1.461 * np.cos(angle), -10 * np.cos(angle) + 1.461 * np.sin(angle)
     motions = np.column_stack([x, y, angle, np.full(23, np.hypot(5.0, 1.461 * 0.5))])
@@ -471,12 +472,12 @@ def test_layers_are_answered_or_refused(scenarios):
 
 def test_routes_are_extended_or_refused():
     short = assemble(junction(route_lanes=(1,)), SMALL)
-    assert View(short).initialization().route_roadblock_ids == ["1", "3"]
+    assert ScenarioView(short).initialization().route_roadblock_ids == ["1", "3"]
     record = short.record.copy()
     record["route_points"] = 0
     lost = replace(short, record=record)
     with pytest.raises(PlannerError, match="scenario hand-made has no route"):
-        View(lost).initialization()
+        ScenarioView(lost).initialization()
 
 
 def test_the_call_sequence_of_the_devkits_idm_planner_works(monkeypatch):

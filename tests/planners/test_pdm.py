@@ -14,7 +14,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency, stop
+from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking_acceleration, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast, boxes_of
 from drivax.planners.pdm.planner import (
     LINE_ALONG,
@@ -334,7 +334,7 @@ def test_invalid_settings_are_refused():
 
 
 def test_emergency_brake_equals_hand_computation():
-    acceleration = lambda v, a: float(braking(jnp.asarray(v), jnp.asarray(a)))  # noqa: E731
+    acceleration = lambda v, a: float(braking_acceleration(jnp.asarray(v), jnp.asarray(a)))  # noqa: E731
     assert acceleration(5.0, 0.0) == pytest.approx(-4.05)
     assert acceleration(0.3, -9.0) == pytest.approx(-3.0)  # -10 v above 0.2 m/s
     assert acceleration(0.1, -0.5) == pytest.approx(-0.4 + 0.5)  # -4 v - a below
@@ -399,7 +399,7 @@ def test_controller_stops_as_with_the_published_poses():
 
     def step(now, _):
         motion, last = now
-        plan = stop(space, motion, braking(motion[3], last[0]), length)
+        plan = stop(space, motion, braking_acceleration(motion[3], last[0]), length)
         last = space.actuate(motion, plan, last, length)
         return (space.move(motion, last, length), last), motion
 

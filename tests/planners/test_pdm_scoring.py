@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter
 
 from drivax.kernels import without_kernels
 from drivax.planners.pdm import scoring
-from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
+from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, predict_overlaps
 from drivax.planners.pdm.scoring import (
     Ground,
     ProposalMetrics,
@@ -273,7 +273,7 @@ def test_overlaps_within_a_horizon_equal_small_steps():
     rows = [
         (rng.uniform(5, 25), rng.uniform(-8, 8), rng.uniform(-3, 3), rng.uniform(0, 9), 1) for _ in range(4)
     ]
-    masks = lambda m, o: [overlapping(m, SIZE, o, horizon) for horizon in (0.0, 0.44, 0.9)]  # noqa: E731
+    masks = lambda m, o: [predict_overlaps(m, SIZE, o, horizon) for horizon in (0.0, 0.44, 0.9)]  # noqa: E731
     found = np.stack(quick(masks, straight(6.0), others(*rows)))
     assert found.any((1, 2)).all() and not found.all((1, 2)).any()
     for t in range(0, 41, 4):

@@ -77,7 +77,7 @@ def test_gains_equal_the_riccati_recursion_for_one_step():
         assert float(found) == pytest.approx(-0.1 * gains[axis], rel=1e-4)
 
 
-def test_actuators_lag():
+def test_actuators_close_two_thirds_of_their_error_per_step():
     car = Car(jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.zeros(()), jnp.zeros(()))
     for n in range(1, 6):
         car = step_car(car, jnp.asarray(2.0), jnp.asarray(0.3), jnp.asarray(WHEELBASE), CONFIG)
@@ -184,7 +184,7 @@ def executed():
         plan = space.plan(poses[:41]).reshape(-1, 3)
         more = poses[40] + jnp.arange(1, 41)[:, None] * (poses[40] - poses[39]) * jnp.array([1, 1, 0])
         car, wheelbase = Car(motion, jnp.float32(0.2), jnp.float32(0.05)), jnp.float32(WHEELBASE)
-        reference = Reference.fitted(plan, 40, wheelbase, CONFIG)
+        reference = Reference.fit(plan, 40, wheelbase, CONFIG)
         cars = track(car, reference, wheelbase, CONFIG, about_axle=True)
         whole = jnp.concatenate([plan, more])
 

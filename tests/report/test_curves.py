@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.report.charts import chart, compact, curve_sections, ticks
+from drivax.report.charts import chart, curve_sections, format_compact, ticks
 from drivax.report.pictures.palette import Stroke
 from drivax.report.runs import read_runs
 
@@ -35,7 +35,13 @@ def test_ticks_are_even_and_enclose_the_range(a, b):
 
 
 def test_compact_numbers_use_k_m_and_g():
-    assert [compact(v) for v in (0, 1500, 2.5e6, -0.25, 1e-3)] == ["0", "1.5k", "2.5M", "−0.25", "0.001"]
+    assert [format_compact(v) for v in (0, 1500, 2.5e6, -0.25, 1e-3)] == [
+        "0",
+        "1.5k",
+        "2.5M",
+        "−0.25",
+        "0.001",
+    ]
 
 
 def test_straight_line_is_drawn_straight_and_to_scale():

@@ -20,7 +20,7 @@ from drivax.metrics.catalogue import METRICS
 from drivax.report.pages.report import _provenance, write_report
 from drivax.report.pictures.palette import LIGHT
 from drivax.report.pictures.player_data import ABSENT
-from drivax.report.runs import Training, read_runs
+from drivax.report.runs import TrainingCurves, read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
@@ -328,7 +328,7 @@ def test_page_names_runs_with_other_starts_or_fewer_scenarios(runs, tmp_path):
     assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
-def test_report_command(runs, tmp_path, capsys):
+def test_report_command_writes_pages_and_reports_errors_in_one_line(runs, tmp_path, capsys):
     assert main(["report", *map(str, runs), "--out", str(tmp_path / "r.html"), "--episodes", "2"]) == 0
     assert "r.html" in capsys.readouterr().out
     assert main(["report", *map(str, runs[:3])]) == 0 and (runs[2] / "report.html").is_file()
@@ -381,5 +381,7 @@ def test_canvases_are_not_empty(runs, tmp_path, width):
 
 
 def test_provenance_names_the_data_of_a_training():
-    training = Training(Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {})
+    training = TrainingCurves(
+        Path("a"), "ppo", {"data": [{"path": "sets/a", "hash": "0123456789abcdef"}]}, {}
+    )
     assert "sets/a 0123456789ab<" in _provenance([training])

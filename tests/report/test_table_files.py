@@ -138,7 +138,7 @@ def test_latex_has_balanced_braces_and_columns(written):
 
 
 @pytest.mark.skipif(LATEX is None, reason="no LaTeX on this machine")
-def test_latex_compiles(written, tmp_path):
+def test_latex_tables_compile_with_hostile_names(written, tmp_path):
     inputs = "\n\n".join(rf"\input{{{file}}}" for name, file in written.items() if name.endswith(".tex"))
     rows = tuple((Cell(name), Cell()) for name in (NASTY, HARD, "[b]"))
     inputs += Table("names", (Column("planner", label=True), Column("success")), rows, "Names").latex()

@@ -105,7 +105,7 @@ def test_existing_page_and_empty_selection_are_refused(page, data, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
-def test_view_command(data, tmp_path, capsys):
+def test_view_command_plays_the_selected_scenarios(data, tmp_path, capsys):
     assert main(["view", str(data.path), "--limit", "2"]) == 0
     page = data.path.with_name("roads.html")
     assert "roads.html (2 of 3 scenarios, 0." in capsys.readouterr().out

@@ -65,7 +65,7 @@ def test_values_that_overflow_stay_in_their_episode():
         (1.5, -2.0, 3.0, True),
     ],
 )  # fmt: skip
-def test_clipped_surrogate(ratio, advantage, loss, slope):
+def test_clipped_surrogate_has_no_gradient_beyond_the_clip(ratio, advantage, loss, slope):
     def of(log_prob):
         return clipped_surrogate_loss(log_prob, jnp.zeros(()), jnp.asarray(advantage), 0.2)
 

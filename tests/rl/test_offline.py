@@ -123,7 +123,7 @@ def test_expectiles_by_hand_and_against_a_root_finder():
         assert float(slope) == pytest.approx(float(differences), rel=1e-4)
 
 
-def test_advantage_weights():
+def test_advantage_weights_are_capped_and_have_no_gradient():
     # exp(0) = 1; exp(3 * 0.5) = 4.48; exp(3 * 2) = 403 is cut off at 100, and so is what overflows.
     advantage = jnp.array([0.0, 0.5, 2.0, 1e6])
     result = advantage_weights(advantage, 3.0, 100.0)
@@ -145,7 +145,7 @@ def test_scaled_policy_loss_is_invariant_to_reward_scale():
     assert np.isfinite(scaled(jnp.zeros(2))).all()
 
 
-def test_smoothing():
+def test_smoothing_clips_noise_and_action():
     # 0.5 + 0.1; 0.5 + 0.9 is 0.5 + 0.3; 0.9 + 0.3 stops at 1.
     action, noise = jnp.array([[0.5], [0.5], [0.9]]), jnp.array([[0.1], [0.9], [0.4]])
     np.testing.assert_allclose(smoothed_action(action, noise, 0.3), [[0.6], [0.8], [1.0]], rtol=1e-6)

@@ -119,7 +119,7 @@ def test_temperature_moves_toward_the_target_entropy(log_prob, falls):
     assert float(jax.grad(lambda x: temperature_loss(jnp.zeros(()), x, -2.0))(jnp.asarray(log_prob))) == 0.0
 
 
-def test_polyak():
+def test_polyak_shrinks_the_distance_by_the_rate():
     target, online = {"w": jnp.array([0.0, 4.0])}, {"w": jnp.array([1.0, 0.0])}
     np.testing.assert_allclose(polyak(target, online, 0.25)["w"], [0.25, 3.0])
     moved = target

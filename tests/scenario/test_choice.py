@@ -50,7 +50,7 @@ class Set:
         ({"filters": ["flag!=NO_FUTURE"], "limit": 9}, [0, 1, 2, 3, 4]),
     ],
 )
-def test_rows(options, rows):
+def test_options_select_the_expected_rows(options, rows):
     assert select_scenarios(Set(), **options) == rows
 
 

@@ -24,7 +24,7 @@ def recording():
     return make_recording(straight_road(), tracks)
 
 
-def test_all_recorded_steps_are_seen_by_default(recording):
+def test_all_logged_steps_are_seen_by_default(recording):
     scenario = assemble(recording)
     assert np.array_equal(scenario.agent_seen, scenario.agent_valid)
     assert np.array_equal(scenario.parked_seen, scenario.parked_valid)

@@ -33,7 +33,7 @@ def read(folder: Path) -> dict[str, list[tuple[str, str]]]:
 @pytest.mark.parametrize(
     ("text", "shares"), [("80/10/10", (80, 10, 10)), ("100/0/0", (100, 0, 0)), ("99.5/0.5/0", (99.5, 0.5, 0))]
 )
-def test_shares(text, shares):
+def test_shares_are_parsed_from_percentages(text, shares):
     assert parse_shares(text) == shares
 
 

@@ -22,6 +22,7 @@ from drivax.errors import DataError, UsageError
 from drivax.files import can_resume
 from drivax.scenario import manifest as manifest_module
 from drivax.scenario import store
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import (
     SCHEMA_VERSION,
     Capacity,
@@ -83,7 +84,7 @@ def edit_manifest(path: Path, **changes: object) -> None:
     seal(path, file.name)
 
 
-def test_round_trip(scenario_set: Path):
+def test_stored_scenarios_equal_the_written_ones(scenario_set: Path):
     opened = ScenarioSet.open(scenario_set)
     assert len(opened) == 7
     assert opened.capacity == SMALL
@@ -114,7 +115,7 @@ def as_earlier_version(path: Path) -> Path:
     return path
 
 
-def test_manifest(scenario_set: Path):
+def test_manifest_describes_shards_and_scenarios(scenario_set: Path):
     manifest = json.loads((scenario_set / "manifest.json").read_text())
     assert [shard["count"] for shard in manifest["shards"]] == [3, 3, 1]
     assert manifest["source"] == {"command": "test"}
@@ -137,6 +138,35 @@ def test_manifest(scenario_set: Path):
         assert hashlib.sha256((scenario_set / shard["file"]).read_bytes()).hexdigest() == shard["sha256"]
         crcs = scenario_set / shard["file"].replace(".npy", ".crc.npy")
         assert hashlib.sha256(crcs.read_bytes()).hexdigest() == shard["crc_sha256"]
+
+
+def test_sizes_of_a_set_are_those_of_its_records(scenario_set: Path):
+    opened = ScenarioSet.open(scenario_set)
+    assert all("sizes" in shard for shard in opened.manifest["shards"])
+    assert opened.sizes == Sizes.used(list(opened)) == Sizes.used(opened)
+    # Sets of earlier versions have none.
+    for shard in opened.manifest["shards"]:
+        del shard["sizes"]
+    assert ScenarioSet(scenario_set, opened.manifest).sizes == opened.sizes
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"agents": 10**9}, "size agents is 1000000000 of 3"),
+        ({"slots": -1}, "size slots is -1"),
+        ({"lanes": "8"}, "sizes are "),
+        ({"further": 1}, "sizes are "),
+    ],
+)
+def test_forged_sizes_are_refused(scenario_set: Path, changes: dict[str, Any], message: str):
+    manifest = json.loads((scenario_set / "manifest.json").read_text())
+    manifest["shards"][1]["sizes"].update(changes)
+    edit_manifest(scenario_set, **manifest)
+    with pytest.raises(DataError, match="manifest is damaged"):
+        ScenarioSet.open(scenario_set)
+    with pytest.raises(ValueError, match=message):
+        Sizes.read(manifest["shards"][1]["sizes"], SMALL)
 
 
 def test_files_are_plain_numpy(scenario_set: Path):
@@ -284,7 +314,7 @@ def test_an_exception_while_overwriting_keeps_the_old_set(scenario_set: Path):
     assert [path.name for path in scenario_set.parent.iterdir()] == ["set"]
 
 
-def test_overwrite(scenario_set: Path):
+def test_existing_set_is_replaced_only_with_overwrite(scenario_set: Path):
     with pytest.raises(UsageError, match="--overwrite"):
         ScenarioWriter(scenario_set, SMALL)
     with ScenarioWriter(scenario_set, SMALL, overwrite=True) as writer:
@@ -340,7 +370,7 @@ def flip_bit(file: Path, position: int) -> None:
     file.write_bytes(data)
 
 
-def test_flipped_bit(scenario_set: Path):
+def test_flipped_bit_is_found_by_the_checksum_of_its_record(scenario_set: Path):
     record_bytes = record_dtype(SMALL).itemsize
     file = scenario_set / "shard-00001.npy"
     flip_bit(file, file.stat().st_size - record_bytes - 100)  # in the second record of the shard
@@ -404,7 +434,7 @@ def test_check_compares_sha256(scenario_set: Path):
         opened.check()
 
 
-def test_truncated_shard(scenario_set: Path):
+def test_truncated_shard_is_refused_with_its_record(scenario_set: Path):
     file = scenario_set / "shard-00000.npy"
     file.write_bytes(file.read_bytes()[: -record_dtype(SMALL).itemsize - 1])
     with pytest.raises(
@@ -414,7 +444,7 @@ def test_truncated_shard(scenario_set: Path):
 
 
 @pytest.mark.parametrize("name", ["shard-00001.npy", "shard-00001.crc.npy"])
-def test_missing_shard(scenario_set: Path, name: str):
+def test_missing_shard_is_named(scenario_set: Path, name: str):
     (scenario_set / name).unlink()
     with pytest.raises(DataError, match=f"{name}: shard is missing; restore"):
         ScenarioSet.open(scenario_set)
@@ -422,7 +452,7 @@ def test_missing_shard(scenario_set: Path, name: str):
 
 @pytest.mark.parametrize("name", ["shard-00001.npy", "shard-00001.crc.npy"])
 @pytest.mark.parametrize("content", [b"", b"not numpy at all", b"\x93NUMPY\x01\x00\xff\xff"])
-def test_damaged_header(scenario_set: Path, name: str, content: bytes):
+def test_damaged_header_is_refused(scenario_set: Path, name: str, content: bytes):
     (as_earlier_version(scenario_set) / name).write_bytes(content)
     with pytest.raises(DataError, match=f"{name}: header is damaged"):
         ScenarioSet.open(scenario_set)[3]
@@ -536,13 +566,13 @@ def test_changed_tags_and_audit_are_refused_on_open(scenario_set: Path, old: str
     assert ScenarioSet.open(as_earlier_version(scenario_set)).hash == digest
 
 
-def test_another_layout(scenario_set: Path):
+def test_shard_of_another_layout_is_refused(scenario_set: Path):
     np.save(scenario_set / "shard-00001.npy", np.zeros(3, np.float32))
     with pytest.raises(DataError, match="layout"):
         ScenarioSet.open(scenario_set)
 
 
-def test_no_set(tmp_path: Path, scenario_set: Path):
+def test_paths_other_than_sets_are_refused(tmp_path: Path, scenario_set: Path):
     with pytest.raises(DataError, match=r"nowhere: folder not found; name the folder"):
         ScenarioSet.open(tmp_path / "nowhere")
     with pytest.raises(DataError, match="is not a scenario set"):
@@ -555,7 +585,7 @@ def test_no_set(tmp_path: Path, scenario_set: Path):
 @pytest.mark.parametrize(
     "content", ["", "{", "[]", "{}", f'{{"schema_version": {SCHEMA_VERSION}}}', "null", "\\x00\\xff"]
 )
-def test_damaged_manifest(scenario_set: Path, content: str):
+def test_damaged_manifest_is_refused_with_a_cure(scenario_set: Path, content: str):
     (scenario_set / "seal.json").unlink()
     (scenario_set / "manifest.json").write_text(content)
     with pytest.raises(DataError, match=r"manifest\.json: manifest is damaged.*; convert"):

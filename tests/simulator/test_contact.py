@@ -183,7 +183,7 @@ def test_a_pedestrian_who_walks_into_a_stopped_car_is_not_its_fault():
     assert CollisionType(int(kind)) == CollisionType.VULNERABLE
 
 
-def test_contact_memory():
+def test_contact_codes_follow_the_transition_table():
     c = Contact
     rows = [  # before, touching, valid, fault -> after
         (c.ABSENT, True, True, False, c.IGNORED),

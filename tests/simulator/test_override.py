@@ -164,6 +164,10 @@ def test_traffic_models_are_found_by_name(bank):
     assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
     assert isinstance(make_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)
     assert prepare_bank(LogTraffic(), bank) is bank
-    for name, words in (("idn", "there is no traffic"), ("drivax.tasks.task:Task", "makes no traffic")):
+    for name, words in (
+        ("idn", "unknown traffic 'idn'; did you mean 'idm'"),
+        ("trains", "unknown traffic 'trains'; use log, idm, or package.module:name"),
+        ("drivax.tasks.task:Task", "makes no traffic"),
+    ):
         with pytest.raises(UsageError, match=words):
             make_traffic(name)

@@ -30,7 +30,7 @@ def test_effect_sizes_by_hand():
     assert cohens_d_paired([2.0, 3.0], [1.0, 2.0]).d_z is None, "no spread of the differences"
 
 
-def test_textbook_numbers():
+def test_sample_sizes_equal_those_of_cohen():
     """Cohen 1988, table 2.4.1: 64 in each of two groups for d = 0.5; 34 and 199 pairs for 0.5 and 0.2."""
     assert scenarios_needed(0.5) == 34 and scenarios_needed(0.2) == 199
     assert scenarios_needed(0.5, share=0.5) == 128 and scenarios_needed(0.8, share=0.5) in (51, 52)

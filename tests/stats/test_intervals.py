@@ -57,7 +57,7 @@ def test_no_exposure_is_refused():
         per_event(0, 0.0)
 
 
-def test_effective_sizes():
+def test_effective_size_equals_kish_by_hand():
     assert effective_size(np.ones((4, 5))) == pytest.approx(20.0)
     assert effective_size(np.array([[3.0, 1.0, 0.0]])) == pytest.approx(16 / 10)
     assert effective_size(np.zeros((2, 2))) == 0.0

@@ -215,7 +215,7 @@ def test_impossible_confidence_and_power_are_refused():
             call(95)
 
 
-def test_seeds_interval():
+def test_seeds_interval_equals_the_crossed_mean_within_its_bounds():
     rng = np.random.default_rng(0)
     values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2
     values[0, 5] = np.nan

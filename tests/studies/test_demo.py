@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from drivax.errors import DataError
+from drivax.errors import DataError, UsageError
 from drivax.stats.intervals import Interval
-from drivax.studies.demo import Demo, run_demo
+from drivax.studies.demo import DemoResult, run_demo
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,19 @@ def test_demo_refuses_links_in_its_folder(tmp_path, name):
         run_demo(out, overwrite=True, log=pytest.fail)
 
 
+def test_demo_refuses_a_file_and_a_folder_with_content(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    for out, overwrite, text in (
+        (file, True, "file: output is a file; name a folder to write"),
+        (tmp_path, False, "output folder already exists; choose another or pass --overwrite"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            run_demo(out, overwrite=overwrite, log=pytest.fail)
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_difference_of_a_single_scenario_has_no_interval():
     difference = {"success": Interval(0.5, None, None, 1).as_dict()}
-    text = Demo(Path("report.html"), [], {"idm": difference}, {"report": 1.0}).text()
+    text = DemoResult(Path("report.html"), [], {"idm": difference}, {"report": 1.0}).text()
     assert "policy - idm: success +0.500 [–, –] over 1 scenarios" in text

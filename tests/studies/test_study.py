@@ -703,7 +703,7 @@ def test_invalid_studies_are_refused(data, tmp_path):
 def test_settings_out_of_range_are_refused(data, tmp_path):
     for settings_, words in (
         ({"seeds": 1}, "seeds is 1; use 2 or more"), ({"rare": 0.0}, "rare is 0.0; use a number between 0 and 1"),
-        ({"arms": ("bc", "baseline", "bc")}, "arm 'bc' is named twice"),
+        ({"arms": ("bc", "baseline", "bc")}, "duplicate arm 'bc'"),
     ):  # fmt: skip
         with pytest.raises(UsageError, match=words):
             StudyConfig(**settings_)

@@ -99,7 +99,7 @@ def junction(turning):
 def parked_row():
     """Parked cars every 9 m, 2.7 m to the right of ego's path."""
     poses = [Pose(60.0 + 9.0 * k, -2.7, 0.0) for k in range(30)]
-    return [ScriptedUser.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
+    return [ScriptedUser.from_pose(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
 
 
 def suitable(kind, rng):

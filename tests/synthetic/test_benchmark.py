@@ -74,14 +74,14 @@ def test_smaller_benchmark_is_a_prefix_of_a_larger_one(small, tmp_path):
 @pytest.mark.slow
 def test_command_names_benchmark_and_world(tmp_path, capsys):
     out = tmp_path / "sets"
-    assert run(Generate(out, benchmark=True, scenarios=1, workers=1)) == 0
+    assert run(Generate(out=out, benchmark=True, scenarios=1, workers=1)) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain grid\n")
     assert all(f"{out / name}: 1 scenarios" in printed for name in SPLITS)
     with pytest.raises(UsageError, match="a fixed world; leave out all of its settings but --domain"):
-        run(Generate(out, benchmark=True, workers=1), ["--rare_rate", "0.5"])
+        run(Generate(out=out, benchmark=True, workers=1), ["--rare_rate", "0.5"])
     with pytest.raises(UsageError, match="world is fixed but for its domain"):
         generate_benchmark(tmp_path / "other", Generation(world=WorldConfig(rare_rate=0.5)), train=1)
     for more in ({"seed": 1}, {"split": "80/10/10"}):
         with pytest.raises(UsageError, match="seeds and splits of its own"):
-            run(Generate(out, benchmark=True, workers=1, **more))
+            run(Generate(out=out, benchmark=True, workers=1, **more))

@@ -90,7 +90,7 @@ def test_shifted_and_reversed_curves():
     left = curve.parallel(3.0)
     assert np.hypot(*(left.xy - curve.xy).T) == pytest.approx(3.0)
     assert left.arc_m[-1] == pytest.approx(50.0 * (1 - 3 * 0.02), rel=1e-3)
-    back = left.reversed()
+    back = left.reverse()
     assert np.array_equal(back.xy[0], left.xy[-1])
     assert math.cos(back.heading[0] - left.heading[-1]) == pytest.approx(-1.0)
 
@@ -141,8 +141,8 @@ def test_smooth_step_has_no_slope_or_curvature_at_its_ends():
 def test_poses_move_ahead_and_aside_and_turn():
     pose = Pose(1.0, 2.0, math.pi / 2)
     assert pose.ahead(3.0).y == pytest.approx(5.0) and pose.ahead(3.0).x == pytest.approx(1.0)
-    assert pose.aside(3.0).x == pytest.approx(-2.0) and pose.aside(3.0).y == pytest.approx(2.0)
-    back = pose.turned()
+    assert pose.shift_left(3.0).x == pytest.approx(-2.0) and pose.shift_left(3.0).y == pytest.approx(2.0)
+    back = pose.reverse()
     assert (back.x, back.y) == (1.0, 2.0) and math.cos(back.heading - pose.heading) == pytest.approx(-1.0)
 
 

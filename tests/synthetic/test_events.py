@@ -13,7 +13,7 @@ from drivax.synthetic.events import SCRIPTS, SEVERITY_MPS2, EgoView, EventKind, 
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.placement import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Override, Roles, ScriptedUser, Staging, Tailgate
-from drivax.synthetic.traffic.simulation import Traffic
+from drivax.synthetic.traffic.simulation import WorldTraffic
 
 from .event_scenes import FIRST, STEPS, junction, road, scene, suitable
 
@@ -190,7 +190,7 @@ def test_queue_before_the_red_light_runner_is_removed():
     assert staged is not None and staged.staging.removed == (1, 2)
     table = draw_drivers(3, Density(), np.random.default_rng(0))
     roles = dataclasses.replace(roles, drivers=table)
-    simulated = Traffic(roles, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
+    simulated = WorldTraffic(roles, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
     assert simulated.valid[0].all() and not simulated.valid[1:].any()
 
 
@@ -205,8 +205,8 @@ def test_tailgater_keeps_a_short_gap():
     at, speed = np.array([70.0, 40.0]), np.array([10.0, 10.0])
     roles = Roles(road(lanes=1, limit=11.0), paths, table, at, speed, (0,))
     slower = Staging(overrides=(Override(0, 0, 150, 0.0),))
-    usual = Traffic(roles, np.arange(150) * 0.1).run(slower)
-    close = Traffic(roles, np.arange(150) * 0.1).run(
+    usual = WorldTraffic(roles, np.arange(150) * 0.1).run(slower)
+    close = WorldTraffic(roles, np.arange(150) * 0.1).run(
         dataclasses.replace(slower, tailgates=(Tailgate(1, 0.5),))
     )
     gaps = [float(m.distance_m[0, -1] - m.distance_m[1, -1]) for m in (usual, close)]

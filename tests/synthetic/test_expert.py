@@ -11,7 +11,7 @@ from drivax.synthetic.roads.families import CurvedRoad
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.style import GRID
 from drivax.synthetic.traffic.roles import Override, Staging
-from drivax.synthetic.traffic.simulation import Traffic
+from drivax.synthetic.traffic.simulation import WorldTraffic
 
 from .staged_scenes import CAR, TIMES, crossed, driven, road, scene, user
 
@@ -35,7 +35,7 @@ class Runs:
 
 def drive(roles, staging, first_step, runs, aware_step=0):
     """The motion of :func:`drive_ego` and its cause of rejection; ``runs`` answers its runs."""
-    task = drive_ego(Traffic(roles, TIMES), staging, first_step, aware_step)
+    task = drive_ego(WorldTraffic(roles, TIMES), staging, first_step, aware_step)
     run = next(task)
     while True:
         assert run.staging == staging

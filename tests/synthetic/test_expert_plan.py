@@ -103,7 +103,7 @@ def test_ego_lets_a_pedestrian_cross(ahead_m):
 
 
 @pytest.mark.parametrize(("required", "possible"), [(3.0, True), (5.0, True), (9.0, False)])
-def test_braking_limit(required, possible):
+def test_plan_stops_before_a_barrier_within_the_braking_limit(required, possible):
     """A barrier across the whole road is v^2 / (2 a) ahead of the bumper for the required a, and 1 m more."""
     ahead = 12.0**2 / (2 * required) + 1.0
     barrier = user((30.0 + CAR[0] / 2 + ahead + 0.5, 0.0), size=BARRIER)

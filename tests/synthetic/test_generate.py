@@ -279,7 +279,7 @@ def test_set_appears_together_with_its_lists(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PartialFolder, "publish", publish_and_stop)
     with pytest.raises(KeyboardInterrupt):
-        run(Generate(tmp_path / "set", scenarios=2, workers=0, split="0/100/0"))
+        run(Generate(out=tmp_path / "set", scenarios=2, workers=0, split="0/100/0"))
     lists = tmp_path / "set" / "splits"
     assert len((lists / "validation.txt").read_text().splitlines()) == 2
     assert {file.name for file in lists.iterdir()} == {"train.txt", "validation.txt", "test.txt", "seal.json"}
@@ -288,13 +288,13 @@ def test_set_appears_together_with_its_lists(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_command_prints_rate_and_rejections(tmp_path, capsys):
     out = tmp_path / "set"
-    assert run(Generate(out, scenarios=2, seed=2, workers=1)) == 0
+    assert run(Generate(out=out, scenarios=2, seed=2, workers=1)) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].startswith(f"{out}: 2 scenarios in ") and "/s)" in printed[0]
     assert all("of draws rejected" in line for line in printed[1:]) and len(printed) > 1
     with pytest.raises(UsageError, match="--overwrite"):
-        run(Generate(out, scenarios=1, workers=1))
-    assert run(Generate(out, scenarios=1, workers=1, overwrite=True)) == 0
+        run(Generate(out=out, scenarios=1, workers=1))
+    assert run(Generate(out=out, scenarios=1, workers=1, overwrite=True)) == 0
     assert len(ScenarioSet.open(out)) == 1
 
 
@@ -346,7 +346,10 @@ def test_flags_override_the_configuration_file(tmp_path):
     file, out = tmp_path / "world.yaml", tmp_path / "set"
     file.write_text("rare_rate: 0.25\nscenarios_per_map: 3\nnoise:\n  level: 0.5\n")
     assert (
-        run(Generate(out, scenarios=1, workers=1, config=file), ["--rare_rate", "0.75", "--domain", "ring"])
+        run(
+            Generate(out=out, scenarios=1, workers=1, config=file),
+            ["--rare_rate", "0.75", "--domain", "ring"],
+        )
         == 0
     )
     config = ScenarioSet.open(out).manifest["source"]["config"]
@@ -354,7 +357,7 @@ def test_flags_override_the_configuration_file(tmp_path):
     assert (config["scenarios_per_map"], config["noise"]["level"]) == (3, 0.5)
     file.write_text("rare_rat: 0.25\n")
     with pytest.raises(UsageError, match="rare_rate"):
-        run(Generate(tmp_path / "other", config=file))
+        run(Generate(out=tmp_path / "other", config=file))
 
 
 def test_signal_leaves_nothing(tmp_path):

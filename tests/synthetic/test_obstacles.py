@@ -16,7 +16,7 @@ from drivax.synthetic.traffic.lateral import (
     lane_change_path,
     quintic_step,
 )
-from drivax.synthetic.traffic.obstacles import Boxes, Leaders, StaticObstacles, extents
+from drivax.synthetic.traffic.obstacles import Boxes, LeaderSearch, StaticObstacles, extents
 from drivax.synthetic.traffic.path_arrays import PathTables, Worlds
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import ScriptedUser, Staging
@@ -36,7 +36,7 @@ def street(high=6.0):
 
 
 def parked(x, y, steps, speed=None):
-    one = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
+    one = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
     return one if speed is None else dataclasses.replace(one, speed=np.full(steps, speed))
 
 
@@ -200,7 +200,7 @@ def leaders(routes, at, table, active=None, **roads):
     worlds = Worlds([network], [len(routes)])
     tables = PathTables(worlds, [lane_path(network, route, Sway()) for route in routes], table)
     is_active = np.ones(len(at), bool) if active is None else np.array(active)
-    return Leaders(worlds, table).find(tables, np.array(at, float), is_active)
+    return LeaderSearch(worlds, table).find(tables, np.array(at, float), is_active)
 
 
 @pytest.mark.parametrize("seed", range(5))

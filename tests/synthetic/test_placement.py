@@ -34,7 +34,7 @@ def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     network, _ = road(600.0, lanes=2)
     lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
     network = dataclasses.replace(network, lanes=lanes)
-    obstacle = ScriptedUser.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
+    obstacle = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
     density = Density(spacing_m=(4.0, 6.0), vehicles=200, leader_share=0.0)
     places = [
         place

@@ -7,7 +7,13 @@ import shapely
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
 from drivax.synthetic.expert.violations import first_overlap_step
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, visible
+from drivax.synthetic.sensing import (
+    NoiseConfig,
+    SensorConfig,
+    add_perception_noise,
+    find_visible,
+    largest_shift_m,
+)
 
 SENSOR = SensorConfig()
 
@@ -25,7 +31,7 @@ def look(rows, heights, blocks=None, config=SENSOR):
     box = boxes(*rows)
     valid = np.ones(box.shape[:2], bool)
     mask = np.ones(len(rows), bool) if blocks is None else np.array(blocks)
-    return visible(box, np.array(heights, dtype=np.float64), valid, mask, config)[:, 0].tolist()
+    return find_visible(box, np.array(heights, dtype=np.float64), valid, mask, config)[:, 0].tolist()
 
 
 EGO = (0.0, 0.0, 0.0, 4.6, 1.9)
@@ -56,7 +62,7 @@ def test_range_is_to_the_centre_and_invalid_users_are_not_visible():
     assert look(rows, [1.5, 1.5, 1.5], config=SensorConfig(range_m=100.0))[2]
     valid = np.array([[True, True, False], [True, False, True]])
     box = np.repeat(boxes(*rows[:2]), 3, axis=1)
-    is_visible = visible(box, np.array([1.5, 1.5]), valid, np.ones(2, bool), SENSOR)
+    is_visible = find_visible(box, np.array([1.5, 1.5]), valid, np.ones(2, bool), SENSOR)
     assert is_visible.tolist() == [[True, True, False], [True, False, False]]
 
 
@@ -73,7 +79,7 @@ def test_visibility_agrees_with_shapely_in_crowds(seed):
     blocks = rng.random(users) < 0.7
     valid = rng.random((users, steps)) < 0.9
     valid[0] = True
-    is_visible = visible(box, np.full(users, 100.0), valid, blocks, SENSOR)
+    is_visible = find_visible(box, np.full(users, 100.0), valid, blocks, SENSOR)
     shapes = shapely.polygons(corners(box))
     eye = xy[0, 0]
     total = 0
@@ -115,7 +121,7 @@ def tracks(count=400, steps=91, speed=10.0):
 def test_noise_has_the_requested_size_and_correlation():
     plain = tracks()
     config = NoiseConfig()
-    result = noisy(plain, 0, np.random.default_rng(1), config)
+    result = add_perception_noise(plain, 0, np.random.default_rng(1), config)
     error = (result.xy - plain.xy)[1:, 3:]
     along = error @ np.array([np.cos(0.3), np.sin(0.3)])
     across = error @ np.array([-np.sin(0.3), np.cos(0.3)])
@@ -137,18 +143,18 @@ def test_noise_has_the_requested_size_and_correlation():
 
 def test_noise_keeps_ego_sizes_and_invalid_states():
     plain = tracks(5)
-    result = noisy(plain, 2, np.random.default_rng(1), NoiseConfig())
+    result = add_perception_noise(plain, 2, np.random.default_rng(1), NoiseConfig())
     for name in ("xy", "heading", "velocity"):
         assert np.array_equal(getattr(result, name)[2], getattr(plain, name)[2]), name
         assert np.array_equal(getattr(result, name)[~plain.valid], getattr(plain, name)[~plain.valid]), name
     assert np.array_equal(result.size, plain.size) and np.array_equal(result.valid, plain.valid)
-    off = noisy(plain, 2, np.random.default_rng(1), NoiseConfig(level=0.0))
+    off = add_perception_noise(plain, 2, np.random.default_rng(1), NoiseConfig(level=0.0))
     assert np.allclose(off.xy, plain.xy, atol=1e-12) and np.allclose(off.velocity, plain.velocity, atol=1e-12)
 
 
 def test_standing_users_stay_within_centimetres_and_keep_speed_zero():
     plain = tracks(300, speed=0.0)
-    result = noisy(plain, 0, np.random.default_rng(1), NoiseConfig())
+    result = add_perception_noise(plain, 0, np.random.default_rng(1), NoiseConfig())
     assert (result.velocity == 0.0).all()
     assert np.hypot(*np.moveaxis(result.xy - plain.xy, -1, 0)).max() < 0.02
     assert np.abs(result.heading - plain.heading).max() < 0.002
@@ -156,7 +162,7 @@ def test_standing_users_stay_within_centimetres_and_keep_speed_zero():
 
 def test_reversing_users_still_reverse():
     plain = tracks(50, speed=-0.1)
-    result = noisy(plain, 0, np.random.default_rng(1), NoiseConfig())
+    result = add_perception_noise(plain, 0, np.random.default_rng(1), NoiseConfig())
     along = result.velocity[..., 0] * np.cos(result.heading) + result.velocity[..., 1] * np.sin(
         result.heading
     )
@@ -182,7 +188,7 @@ def test_no_corner_moves_farther_than_the_bound(length, width):
     """Compare with the corners of boxes with the largest errors of all signs."""
     plain = tracks(300)
     plain.size[:] = (length, width, 1.5)
-    moved = noisy(plain, 0, Extreme(0), NoiseConfig())
+    moved = add_perception_noise(plain, 0, Extreme(0), NoiseConfig())
 
     def points(them):
         box = [them.xy, np.cos(them.heading)[..., None], np.sin(them.heading)[..., None], them.size[..., :2]]
@@ -225,7 +231,7 @@ def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
     plain.velocity[:] = 10.0 * np.stack([np.cos(plain.heading), np.sin(plain.heading)], axis=-1)
     room = shapely.Polygon(corners(ego))
     for seed in range(8):
-        moved = noisy(plain, 0, Extreme(seed), NoiseConfig())
+        moved = add_perception_noise(plain, 0, Extreme(seed), NoiseConfig())
         for k in range(count):
             pose = (*moved.xy[k + 1, 0], np.cos(moved.heading[k + 1, 0]), np.sin(moved.heading[k + 1, 0]))
             assert room.distance(shapely.Polygon(corners(np.array([*pose, length, width])))) > 0.0

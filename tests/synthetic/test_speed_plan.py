@@ -94,7 +94,7 @@ def test_search_stops_before_a_wall_until_it_opens():
 
 
 @pytest.mark.parametrize(("wall_m", "possible"), [(18.0, True), (10.0, False)])
-def test_braking_limit(wall_m, possible):
+def test_search_stops_before_a_wall_within_the_braking_limit(wall_m, possible):
     """From 12 m/s a stop takes 12 m with 6 m/s2, and 14.4 m with 5 m/s2."""
     occupied = occupancy()
     occupied.hard[:, int(wall_m / 0.5) :] = True

@@ -24,7 +24,7 @@ from drivax.synthetic.traffic.roles import (
     Staging,
     Tailgate,
 )
-from drivax.synthetic.traffic.simulation import Run, Traffic, run_all, simulate
+from drivax.synthetic.traffic.simulation import Run, WorldTraffic, run_all, simulate
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area
@@ -200,7 +200,7 @@ def test_cyclists_are_followed_on_narrow_lanes_and_passed_on_wide_ones():
         table.top_speed_mps[1] = 5.0
         scene = roles(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
         scene.paths[1] = lane_path(network, (0,), Sway((0.55 - width / 2,), (0.0,), (math.pi / 2,)))
-        motion = Traffic(scene, np.arange(200) / 10).run()
+        motion = WorldTraffic(scene, np.arange(200) / 10).run()
         assert (motion.xy[0, -1, 0] > motion.xy[1, -1, 0]) == passes
         assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.CYCLIST]
 
@@ -246,13 +246,13 @@ def test_cars_stop_for_pedestrians_on_a_crossing():
 def test_repeated_runs_are_equal_and_users_keep_their_order():
     network, _ = road(400.0)
     steps = 50
-    parked = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
-    extra = ScriptedUser.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
+    parked = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
+    extra = ScriptedUser.from_pose(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     pedestrians = (Pedestrian(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
     scene = roles(
         network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, pedestrians=pedestrians, parked=(parked,)
     )
-    traffic = Traffic(scene, np.arange(steps) / 10)
+    traffic = WorldTraffic(scene, np.arange(steps) / 10)
     staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(extra,))
     first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
     assert first.kind.tolist() == [1, 1, AgentKind.PEDESTRIAN, AgentKind.VEHICLE, AgentKind.CYCLIST]
@@ -287,7 +287,7 @@ def test_dense_traffic_has_no_overlaps(family, seed):
         lines = [span.begin_m - at[i] - 8.0 for span in path.spans if network.lanes[span.lane].connector]
         room = max(min((line for line in lines if line > -8.0), default=math.inf), 0.0)
         speed.append(min(0.8 * fastest[int(at[i] / path.step_m)], math.sqrt(3.0 * room)))
-    traffic = Traffic(Roles(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
+    traffic = WorldTraffic(Roles(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
     motion = traffic.run()
     assert len(first) > 8
     for t in range(0, 150, 3):
@@ -313,7 +313,7 @@ def draw_roles(seed):
 def staged_run(seed, world):
     """A run on drawn roads; every second one has a plan of ego, and every third one an event."""
     drawn, times = draw_roles(2 * seed + world % 2)
-    traffic = Traffic(drawn, times[: 131 - 7 * world])
+    traffic = WorldTraffic(drawn, times[: 131 - 7 * world])
     ego, staging = None, Staging()
     if world % 2:
         motion = traffic.run()
@@ -323,9 +323,9 @@ def staged_run(seed, world):
             len(traffic.times_s),
             [Pose(*drawn.paths[k].curve.xy[n], 0.0) for k, n in ((1, -80), (0, 300))],
         )
-        pedestrian = ScriptedUser.standing(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), poses[0], steps)
+        pedestrian = ScriptedUser.from_pose(AgentKind.PEDESTRIAN, (0.6, 0.6, 1.7), poses[0], steps)
         pedestrian.valid[:20] = False
-        car = ScriptedUser.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), poses[1], steps)
+        car = ScriptedUser.from_pose(AgentKind.VEHICLE, (4.5, 1.8, 1.5), poses[1], steps)
         staging = Staging((Override(1, 66, 90, -5.0),), (pedestrian, car), (Tailgate(2, 0.5),), (3,))
     return Run(traffic, staging, ego)
 
@@ -348,7 +348,7 @@ def test_tasks_return_results_in_order_however_many_runs_they_need():
     def task(number):
         motions = []
         for steps in range(2, 2 + (3 * number) % 5):
-            motions.append((yield Run(Traffic(scene, np.arange(steps) / 10))))
+            motions.append((yield Run(WorldTraffic(scene, np.arange(steps) / 10))))
         return number, [motion.xy.shape[1] for motion in motions]
 
     expected = [(number, list(range(2, 2 + (3 * number) % 5))) for number in range(20)]

@@ -13,7 +13,7 @@ from drivax.synthetic.roads.network import Draft, RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.placement import Density, draw_drivers
 from drivax.synthetic.traffic.roles import Roles
-from drivax.synthetic.traffic.simulation import Traffic
+from drivax.synthetic.traffic.simulation import WorldTraffic
 
 CARS = Density(van_share=0.0, truck_share=0.0, bus_share=0.0, cyclist_share=0.0)
 
@@ -38,7 +38,7 @@ def roles(network, routes, table, at, speed, **more):
 
 def run(network, routes, table, at, speed, seconds, staging=None, ego=None, **more):
     times = np.arange(round(seconds * 10)) / 10
-    return Traffic(roles(network, routes, table, at, speed, **more), times).run(staging, ego)
+    return WorldTraffic(roles(network, routes, table, at, speed, **more), times).run(staging, ego)
 
 
 def road(length_m=600.0, limit=15.0, lanes=1, sections=1, width_m=3.5):

@@ -210,7 +210,7 @@ def test_road_pieces_are_cut_into_equal_rows(obs):
     np.testing.assert_allclose(rows[one, :, 5:], np.broadcast_to(lanes[other, 5:], (5, 5)))
 
 
-def test_examples(obs):
+def test_example_features_equal_hand_computed_values(obs):
     own = obs["everything"]
     at = feature_names(EVERYTHING.features, {"agents": (13,)})["agents"].index("relative_velocity ahead")
     np.testing.assert_allclose(

@@ -26,7 +26,7 @@ def look(bank, preset="optimal"):
 
 
 @pytest.mark.parametrize("preset", ["maximal", "minimal", "optimal", "standard"])
-def test_layout(preset):
+def test_presets_have_the_declared_groups_and_shapes(preset):
     config = PRESETS[preset]
     obs = look(bank_of(straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)], light=RED)), preset)
     shapes = {name: value.shape for name, value in obs.items()}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import fields, replace
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -277,7 +278,9 @@ def random_facts(rng, count):
     return columns
 
 
-def test_terms_agree_with_numpy_on_random_facts():
+@cache
+def on_random_facts():
+    """Return the values of each term on random facts, and those of the NumPy version."""
     rng, count = np.random.default_rng(3), 400
     before, now, near = random_facts(rng, count), random_facts(rng, count), rng.random(count) < 0.5
     once = around()
@@ -291,11 +294,32 @@ def test_terms_agree_with_numpy_on_random_facts():
     as_facts = [
         Facts(**{name: jnp.asarray(column) for name, column in side.items()}) for side in (before, now)
     ]
-    found, expected = every(*as_facts, jnp.asarray(near)), in_numpy(before, now, near)
+    return every(*as_facts, jnp.asarray(near)), in_numpy(before, now, near)
+
+
+def test_terms_agree_with_numpy_on_random_facts():
+    found, expected = on_random_facts()
     assert set(found) == set(expected)
     for name, column in expected.items():
         np.testing.assert_allclose(found[name], column, atol=1e-5, err_msg=name)
         assert 0 < np.mean(column != column[0]) < 1, name  # both ways occurred
+
+
+def test_table_of_the_docs_has_each_term_with_its_range_and_option(repository):
+    section = (
+        (repository / "docs/guide/rewards.md").read_text().partition("\n## Terms\n")[2].partition("\n#")[0]
+    )
+    texts = dict(re.findall(r"^\| `(\w+)` \| (.+?) \|", section, re.MULTILINE))
+    assert sorted(texts) == sorted(TERMS)
+    for name, text in texts.items():
+        assert TERMS[name].function.__doc__
+        option = re.search(r"`(\w+)` \(([\d.]+)", text)
+        assert TERMS[name].option == (option and option[1])
+        assert option is None or getattr(RewardConfig(), option[1]) == float(option[2])
+        values, most = np.asarray(on_random_facts()[0][name]), re.search(r"(?:at most|0 to) (\d+)", text)
+        if re.match("1 (while|at|on) ", text):
+            assert set(values) == {0.0, 1.0}, name
+        assert (values >= 0).all() and (most is None or (values <= float(most[1])).all()), name
 
 
 @pytest.mark.parametrize("term", TERMS)
@@ -314,7 +338,7 @@ def test_terms_read_only_their_registered_facts(term):
     )
 
 
-def test_published_weights():
+def test_published_presets_have_the_published_weights():
     assert {"collision": -1, "offroad": -1, "red_light": -1}.items() <= PUBLISHED.items()
     rest = {"off_route": -0.2, "any_progress": 0.2, "comfort": 0.2, "any_speeding": -0.1}
     assert dict(PUBLISHED.items() - PRESETS["safety"].items()) == rest
@@ -432,7 +456,7 @@ def test_own_terms_have_factors():
     assert conditioned(rewards, {"alive": 0.25})["alive"] == pytest.approx(0.075)
 
 
-def test_configurations():
+def test_reward_weights_override_presets_and_are_checked():
     rewards = {"preset": "published", "collision_margin_m": 0.5, "ttc": -0.3, "ttc_s": 0.95}
     made = settings.load(TrainConfig, {"task": {"rewards": rewards}}).task.rewards
     assert made.weights() == PUBLISHED | {"ttc": -0.3} and made.ttc_s == 0.95

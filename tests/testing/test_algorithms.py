@@ -95,7 +95,7 @@ def test_custom_algorithm_passes():
 
 
 @pytest.mark.slow
-def test_ppo_passes():
+def test_ppo_passes_the_check_of_algorithms():
     network = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
     check_algorithm(PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2))
     with_own = replace(network, encoder=own_terms.MeanConfig())

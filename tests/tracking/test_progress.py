@@ -79,5 +79,5 @@ def test_bar_on_a_terminal():
         (7800, "2 h 10 min"), (90000, "25 h 0 min"),
     ],
 )  # fmt: skip
-def test_durations(seconds: float, text: str):
+def test_durations_are_printed_in_suitable_units(seconds: float, text: str):
     assert duration(seconds) == text

@@ -74,14 +74,14 @@ def test_note_does_not_write_through_symbolic_links_of_a_stranger(tmp_path: Path
         _ = run.checkpoints
 
 
-def test_notes(tmp_path: Path):
+def test_notes_are_stored_in_run_json(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config()).note(result=0.5)
     assert RunFolder.open(tmp_path / "run").info["result"] == 0.5
     assert run.info["result"] == 0.5
     assert sorted(path.name for path in run.path.iterdir()) == ["config.yaml", "run.json", "seal.json"]
 
 
-def test_existing_folders(tmp_path: Path):
+def test_existing_folder_is_replaced_only_by_a_run_of_its_kind(tmp_path: Path):
     run = RunFolder.create(tmp_path / "run", Config())
     (run.path / "metrics.jsonl").write_text("{}")
     with pytest.raises(UsageError, match="--overwrite"):
@@ -184,7 +184,9 @@ def test_a_run_of_seeds_without_seeds_is_refused(tmp_path: Path):
         runs.seed_folders(run.path)
 
 
-def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_git_state_is_the_commit_of_the_package_with_its_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """A temporary repository with a clean commit, a run next to it, a new file, and a change."""
 
     def git(*arguments: str) -> str:

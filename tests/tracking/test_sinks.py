@@ -87,7 +87,7 @@ def test_a_fresh_log_replaces_an_old_one(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("resume_step", "first"), [(None, 0), (5, 6)])
-def test_tensorboard_events(tmp_path: Path, resume_step, first):
+def test_tensorboard_events_start_after_the_resumed_step(tmp_path: Path, resume_step, first):
     """Earlier events are dropped from ``first`` on, also where no step is resumed."""
     pytest.importorskip("tensorboardX")
     from tensorboardX.proto.event_pb2 import Event, SessionLog

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
+from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_missing_package
 from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_metrics
 from drivax.report.pictures.drawing import draw_pixels
@@ -36,12 +36,10 @@ from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 
-try:
+with explain_missing_package():
     import gymnasium
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
-except ModuleNotFoundError as error:
-    raise missing_package(error) or error from error
 
 #: Bound to which observations are clipped (5 km, 1.5 km/s), user-defined groups too, so that spaces are bounded.
 LIMIT = 100.0
@@ -176,7 +174,7 @@ class _Backend:
             row = -1
         if not 0 <= row < len(self.ids):
             cure = f"use a row from 0 to {len(self.ids) - 1}"
-            raise UsageError(f"there is no scenario {scenario!r}", cure=cure)
+            raise UsageError(f"unknown scenario {scenario!r}", cure=cure)
         return row
 
     def convert_actions(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
@@ -414,7 +412,7 @@ def make(
     """
     if isinstance(task, str):
         if task not in TASKS:
-            raise UsageError(f"there is no task {task!r}", cure=did_you_mean(task, TASKS))
+            raise UsageError(f"unknown task {task!r}", cure=did_you_mean(task, TASKS))
         task = TASKS[task]
     if num_envs is None:
         return DrivingEnv(data, task, render_mode, traffic, trust)
@@ -423,7 +421,7 @@ def make(
 
 def _check_render_mode(render_mode: str | None) -> Any:
     if render_mode not in (None, "rgb_array"):
-        raise UsageError(f"there is no render mode {render_mode!r}", cure="the only one is 'rgb_array'")
+        raise UsageError(f"unknown render mode {render_mode!r}", cure="the only one is 'rgb_array'")
     return render_mode
 
 
@@ -432,7 +430,7 @@ def _option(options: Mapping[str, Any] | None, name: str) -> Any:
     options = options or {}
     unknown = sorted(set(options) - {name})
     if unknown:
-        raise UsageError(f"there is no reset option {unknown[0]!r}", cure=f"the only one is {name!r}")
+        raise UsageError(f"unknown reset option {unknown[0]!r}", cure=f"the only one is {name!r}")
     return options.get(name)
 
 

@@ -13,21 +13,19 @@ from typing import Any
 import numpy as np
 
 from drivax.adapters.gym import LIMIT, action_space, observation_space
-from drivax.errors import DataError, UsageError, missing_package
+from drivax.errors import DataError, UsageError, explain_missing_package
 from drivax.files import replace_folder
 from drivax.learning.recorded_episodes import StoredEpisode, StoredEpisodes, minari_folder
 from drivax.reading import explain_damage, read_json
 from drivax.tasks.task import Task
 
-try:
+with explain_missing_package():
     import h5py
     import minari
     from gymnasium import spaces
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
-except ModuleNotFoundError as error:
-    raise missing_package(error) or error from error
 
 _DATA_FILE = "main_data.hdf5"
 _CURE = "download or export the data set again"

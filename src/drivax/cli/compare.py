@@ -1,4 +1,4 @@
-"""``drivax compare``: is one planner better than another?"""
+"""``drivax compare``: compare two planners by their evaluations."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from drivax.cli import record_of
-from drivax.datasets.conversion import Conversion, Converted, Plan, convert
+from drivax.datasets.conversion import Conversion, ConversionPlan, Converted, convert
 from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
 from drivax.escaping import show
@@ -70,7 +70,7 @@ def run(args: Convert) -> int:
     return 0
 
 
-def _announce(plan: Plan) -> None:
+def _announce(plan: ConversionPlan) -> None:
     """Print the files by format, the estimated size, and where an interrupted conversion continues."""
     texts = [f"{name} ({count_text(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
     unknown = len(plan.data.inputs) - plan.data.formats.total()

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from drivax.curation.methods import MethodInputs, Request, check_combination, curate, find_method
 from drivax.errors import UsageError
 from drivax.escaping import escape_controls, show
 from drivax.files import check_output
-from drivax.learning.driving import Egos
 
 if TYPE_CHECKING:
-    from drivax.curation.methods import Request
     from drivax.curation.scores import ScoreTable
     from drivax.scenario.store import ScenarioSet
 
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
 _PRINTED_SCENARIOS = 10
 
 
-@dataclass(frozen=True)
-class Curate:
+@dataclass(frozen=True, kw_only=True)
+class Curate(MethodInputs):
     """Score how critical every scenario and step of a set is.
 
     kinematic: time to collision, post-encroachment time, required braking, volatility and position of the logged
@@ -78,22 +77,8 @@ class Curate:
     """Aggregation over steps: max, mean, std, p99, top10, ...; or one per component: urgency max braking p95."""
     again: Path | None = None
     """Scores of the same set and METHOD, to combine their components again without scoring."""
-    like: Path | None = None
-    """Scores of the same set, for random_matched to permute."""
-    tables: tuple[Path, ...] = ()
-    """Scores of the same set, for mixture to combine: --weights kinematic 0.7 ensemble 0.3."""
-    runs: tuple[Path, ...] = ()
-    """Evaluations of DATA, for failures."""
-    members: Path | None = None
-    """Folder of an ensemble: if it exists, its members score DATA; otherwise they are trained and written there. For
-    novelty and --diverse, the first member embeds the steps."""
-    actions: Path | None = None
-    """File of a histogram of actions: if it exists, action_rarity scores DATA by it; otherwise that of DATA is written
-    there."""
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
     """Run code of this module of yours that a saved ensemble names; repeat it to trust several."""
-    egos: Egos = "recorded"
-    """Vehicles to score: the recorded ego, or all egos of a set made with --egos (moving)."""
     seed: int | None = None
     """Seed of random_matched and of an ensemble (default: 0)."""
     config: Path | None = None
@@ -105,7 +90,6 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and print statistics of scores and weights."""
     from drivax import settings
-    from drivax.curation.methods import Request, check_combination, find_method
     from drivax.curation.scores import read_scores, write_scores
     from drivax.curation.subset import check_top
     from drivax.scenario.store import ScenarioSet
@@ -131,11 +115,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     source = args.members or args.actions
     has_source = source is not None and source.exists()
     if args.again is None:
-        request = Request(
-            data, args.like, args.seed or 0, args.tables, args.runs, config,
-            egos=args.egos, members=args.members, actions=args.actions,
-            trust=args.trust_code,
-        )  # fmt: skip
+        inputs = {field.name: getattr(args, field.name) for field in fields(MethodInputs)}
+        request = Request(data, args.seed or 0, config, trust=args.trust_code, **inputs)
         table = score_with_progress(args.method, request)
     else:
         table = read_scores(args.again, data)
@@ -155,7 +136,6 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
 
 def score_with_progress(method: str, request: Request) -> ScoreTable:
     """Score a set (:func:`~drivax.curation.methods.curate`) with a progress bar."""
-    from drivax.curation.methods import curate
     from drivax.tracking.progress import Progress
 
     with Progress("scoring", "scenarios", len(request.data)) as bar:
@@ -210,7 +190,7 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
 
 def _embedding(args: Curate, data: ScenarioSet, table: ScoreTable) -> Any:
     """Return an embedding of every scenario of the set."""
-    from drivax.curation.methods import Request, embedding_of
+    from drivax.curation.methods import embedding_of
     from drivax.curation.novelty import NoveltyConfig, scenario_embeddings
 
     egos = "recorded" if table.egos == 1 else "moving"

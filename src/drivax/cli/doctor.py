@@ -12,30 +12,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.table import Table
-from rich.text import Text
 
 from drivax import kernels
 from drivax.cli import console
 from drivax.datasets.doctor import Diagnosis, Part, diagnose
-from drivax.errors import UsageError
-from drivax.escaping import escape_controls
+from drivax.errors import EXTRAS, UsageError, not_installed
 from drivax.files import count_text, format_bytes, free_bytes
+from drivax.table import Cell, Column, Table
 from drivax.tracking.run_folder import zoo
 
-#: Modules and purpose of every extra.
-_EXTRAS = {
-    "womd": (("google.protobuf", "google_crc32c"), "Waymo, ScenarioMax"),
-    "av2": (("pyarrow",), "Argoverse 2"),
-    "maps": (("shapely", "pyproj"), "nuPlan, Argoverse 2, nuScenes"),
-    "show": (("matplotlib", "av"), "pictures and videos"),
-    "track": (("tensorboardX",), "TensorBoard"),
-    "gym": (("gymnasium",), "Gymnasium"),
-    "minari": (("minari", "h5py"), "Minari"),
-}
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
 #: Program that lists the devices; in a separate process, since a broken accelerator may hang or crash JAX.
 _LIST_DEVICES = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
 
@@ -80,10 +71,9 @@ def machine() -> Iterator[tuple[str, str]]:
     yield "jax", metadata.version("jax")
     yield "devices", devices()
     yield "native kernels", kernels.state()
-    for extra, (modules, purpose) in _EXTRAS.items():
+    for extra, (purpose, modules) in EXTRAS.items():
         missing = [module for module in modules if not _is_installed(module)]
-        state = "installed" if not missing else f"{', '.join(missing)} missing: pip install 'drivax[{extra}]'"
-        yield f"{extra} ({purpose})", state
+        yield f"{extra} ({purpose})", str(not_installed(extra, missing)) if missing else "installed"
     yield "policies", ", ".join(zoo())
     yield "cores", str(os.cpu_count())
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -176,10 +166,6 @@ def _part_rows(part: Part, files: int) -> Iterator[tuple[str, str]]:
     yield from (("missing", name) for name in description.missing)
 
 
-def _table(rows: Iterator[tuple[str, str]]) -> Table:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(name, Text(escape_controls(value)))
-    return table
+def _table(rows: Iterator[tuple[str, str]]) -> RichTable:
+    columns = (Column("", label=True), Column("", left=True))
+    return Table("doctor", columns, tuple((Cell(name), Cell(value)) for name, value in rows)).rich()

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from drivax.cli import record_of
+from drivax.datasets.export import writer
 from drivax.errors import UsageError
 from drivax.escaping import show
 
@@ -17,8 +18,8 @@ from drivax.escaping import show
 _EPISODE_FORMATS = ("npz", "minari")
 
 
-@dataclass(frozen=True)
-class Export:
+@dataclass(frozen=True, kw_only=True)
+class Export(writer.Export):
     """Write a scenario set, a part of it, or recorded episodes in another format.
 
     set: a scenario set with the selected records, bit for bit.
@@ -43,23 +44,13 @@ class Export:
     """Format to write."""
     data: Path | None = None
     """Scenario set of the episodes, if it has moved."""
-    filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated."""
-    ids: Path | None = None
-    """Only scenarios named in this file: one id per line, or data set, tab and id (a split file)."""
-    limit: int | None = None
-    """At most N scenarios."""
-    paths: Literal["vmax", "published"] = "vmax"
-    """Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m."""
-    shard_size: int = 500
-    """Scenarios per TFRecord shard."""
-    overwrite: bool = False
-    """Replace OUT if it is an earlier export (or a scenario set, for the format set)."""
+    filters: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="filter", metavar="NAME=VALUE")
+    ] = ()
 
 
 def run(args: Export, overrides: Sequence[str] = ()) -> int:
     """Export, and print the number of elements that did not fit the format."""
-    from drivax.datasets.export import writer
     from drivax.files import count_text
     from drivax.tracking.progress import Progress
 
@@ -69,7 +60,7 @@ def run(args: Export, overrides: Sequence[str] = ()) -> int:
         option = overrides[0] if overrides else "--data"
         cure = f"leave it out, or choose one of {', '.join(_EPISODE_FORMATS)}"
         raise UsageError(f"{option} is not for the format {args.format}", cure=cure)
-    options = record_of(writer.Export, args, filters=args.filter)
+    options = record_of(writer.Export, args)
     with Progress("exporting", "scenarios") as bar:
         result = writer.export(args.set, args.out, options, lambda done, total: bar.update(done, "", total))
     lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(result.lost.items()))
@@ -96,10 +87,9 @@ def _export_episodes(args: Export, overrides: Sequence[str]) -> int:
     from drivax.simulator.simulator import Simulator
     from drivax.tracking.run_folder import RunFolder
 
-    defaults = {field.name: field.default for field in fields(Export)}
-    for name in ("filter", "ids", "limit", "paths", "shard_size"):
-        if getattr(args, name) != defaults[name]:
-            option = f"--{name.replace('_', '-')}"
+    for field in fields(writer.Export):
+        if field.name not in ("format", "overwrite") and getattr(args, field.name) != field.default:
+            option = "--filter" if field.name == "filters" else f"--{field.name.replace('_', '-')}"
             raise UsageError(f"{option} is for scenario sets", cure=f"leave out {option}")
     check_output(args.out, args.overwrite, folder=args.format == "minari")
     if args.out.is_dir() and minari_folder(args.out) is None:

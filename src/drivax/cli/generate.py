@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,8 +31,8 @@ from drivax.tracking.progress import Progress
 _SCENARIOS = 256
 
 
-@dataclass(frozen=True)
-class Generate:  # noqa: D101
+@dataclass(frozen=True, kw_only=True)
+class Generate(Generation):  # noqa: D101
     __doc__ = f"""Generate scenarios of the built-in traffic world; no data set is needed.
 
     Many kinds of roads, other road users that follow, yield and stop, labelled rare events, and an expert log without
@@ -58,18 +58,10 @@ class Generate:  # noqa: D101
     """YAML file with settings of the world."""
     benchmark: bool = False
     """Write the fixed, versioned splits OUT/train, validation, test and test-rare."""
-    workers: int | None = None
+    workers: int = os.cpu_count() or 1
     """Processes; as many as there are CPU cores by default."""
     capacity: Annotated[str, tyro.conf.arg(metavar="|".join(CAPACITIES))] = "default"
-    """Padded sizes; sets that are used together need the same."""
-    future_s: float = 8.0
-    """Seconds of a scenario after its current step, 8 to 60; 15 in nuPlan's challenges."""
-    egos: int = 1
-    """Vehicles per scenario with a route and a goal, 1 to 8, which training with `egos: moving` drives."""
-    split: str | None = None
-    """Write lists for train/validation/test to OUT/splits, by map: percentages, such as 80/10/10."""
-    overwrite: bool = False
-    """Replace OUT if it is a scenario set."""
+    world: tyro.conf.Suppress[tyro.conf.Fixed[WorldConfig]] = field(default_factory=WorldConfig)
 
 
 def run(args: Generate, overrides: Sequence[str] = ()) -> int:
@@ -79,8 +71,7 @@ def run(args: Generate, overrides: Sequence[str] = ()) -> int:
         raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
     if args.benchmark and world != WorldConfig(domain=world.domain):
         raise UsageError("the benchmark has a fixed world", cure="leave out all of its settings but --domain")
-    workers = (os.cpu_count() or 1) if args.workers is None else args.workers
-    options = record_of(Generation, args, workers=workers, world=world)
+    options = record_of(Generation, args, world=world)
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
 

@@ -139,6 +139,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax import settings
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics
+    from drivax.files import atomic_write
     from drivax.learning.config import TrainConfig
     from drivax.learning.policies import find_traffic
     from drivax.report.pictures.observation import draw_log_observation
@@ -157,7 +158,9 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
         _print_observations(statistics)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
-        draw_log_observation(task, bank, title, step=int(scenarios[0].current_step)).savefig(args.draw)
+        figure = draw_log_observation(task, bank, title, step=int(scenarios[0].current_step))
+        with atomic_write(args.draw) as file:
+            figure.savefig(file, format=args.draw.suffix[1:] or "png")
         show(args.draw, sys.stderr if args.json else sys.stdout)
 
 

@@ -16,6 +16,7 @@ from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
 from drivax.escaping import show
+from drivax.files import parse_bytes
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Egos
 from drivax.learning.loop import train, usable_steps
@@ -46,6 +47,8 @@ class Train:
 
     Example: drivax train ppo --data sets/egos --out runs/all --egos moving
 
+    Example: drivax train ppo --data sets/womd --memory 2GB --out runs/ppo
+
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
@@ -75,6 +78,9 @@ class Train:
     """Conversion of scores to weights; with --scores or --arm."""
     seeds: int = 1
     """Number of consecutive seeds to train in one program; each of several seeds has a folder in OUT."""
+    memory: str | None = None
+    """Memory of a device for scenarios, like 2GB: a part of DATA is resident, and exchanged while training goes on. By
+    default, all of DATA is."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
     """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
     trust_code: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="MODULE")] = ()
@@ -89,6 +95,8 @@ class Train:
 def run(args: Train, overrides: Sequence[str] = ()) -> int:
     """Train, then print the run folder."""
     flags = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
+    if args.memory is not None:
+        flags += ["--memory", args.memory]
     if args.resume and flags:
         raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(flags))
     if args.seeds > 1 or args.resume:
@@ -105,6 +113,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
+        memory=None if args.memory is None else parse_bytes(args.memory),
         log=lambda line: show(line, sys.stderr),
         trust=args.trust_code,
     )

@@ -41,7 +41,8 @@ from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Distribution
 from drivax.reading import explain_damage
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import seal
 from drivax.simulator.simulator import Simulator

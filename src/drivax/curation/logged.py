@@ -15,7 +15,8 @@ from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import project_on_path
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.record import record
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.contact import overlaps

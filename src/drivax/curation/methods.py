@@ -81,38 +81,47 @@ _DEFAULT_AGGREGATOR = "top10"
 _SCALE_PERCENTILE = 99.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class MethodInputs:
+    """What methods read in addition to the scenario set DATA.
+
+    Attributes:
+        like: Scores of the same set, for random_matched to permute.
+        tables: Scores of the same set, for mixture to combine: --weights kinematic 0.7 ensemble 0.3.
+        runs: Evaluations of DATA, for failures.
+        members: Folder of an ensemble: if it exists, its members score DATA; otherwise they are trained and written
+            there. For novelty and --diverse, the first member embeds the steps.
+        actions: File of a histogram of actions: if it exists, action_rarity scores DATA by it; otherwise that of DATA
+            is written there.
+        egos: Vehicles to score: the recorded ego, or all egos of a set made with --egos (moving).
+    """
+
+    like: Path | None = None
+    tables: Sequence[Path] = ()
+    runs: Sequence[Path] = ()
+    members: Path | None = None
+    actions: Path | None = None
+    egos: Egos = "recorded"
+
+
 @dataclass(frozen=True)
-class Request:
+class Request(MethodInputs):
     """Arguments of a method.
 
     Attributes:
         data: The scenario set.
-        like, seed: Table to match, and seed of the permutation (only ``random_matched``; an ensemble has its own
-            seed).
-        tables: Tables of the set to combine (only ``mixture``).
-        runs: Run folders of evaluations on the set (only ``failures``).
+        seed: Seed of the permutation of ``random_matched``; an ensemble has its own.
         config: Settings of the method, of the type of ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while an ensemble is trained.
-        egos: Vehicles to score: the recorded ego of each scenario, or all egos of a set made with ``--egos`` (moving).
-        members: Folder of an ensemble. For ``ensemble``, it scores the set if it exists, and is written otherwise; for
-            ``novelty``, its first member embeds the steps.
-        actions: File of a histogram of actions. For ``action_rarity`` and ``action_rarity_published``, it scores the
-            set if it exists, and is written otherwise.
         trust: Modules outside drivax whose code the settings of a saved ensemble may name.
     """
 
     data: ScenarioSet
-    like: Path | None = None
     seed: int = 0
-    tables: Sequence[Path] = ()
-    runs: Sequence[Path] = ()
     config: Any = None
     progress: Progress | None = None
     training: Progress | None = None
-    egos: Egos = "recorded"
-    members: Path | None = None
-    actions: Path | None = None
     trust: Sequence[str] = ()
 
     @property

@@ -24,7 +24,8 @@ from drivax.learning.driving import Driving, Egos
 from drivax.networks.actor_critic import graph_of
 from drivax.networks.attention import EntityConfig
 from drivax.networks.encoders import EncoderConfig
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.stats.clusters import recordings_of

@@ -92,7 +92,7 @@ class QueryConfig:
 
 
 def evaluate(expression: str, quantities: Mapping[str, Numbers]) -> Bool[Numbers, "M T"]:
-    """Return where an expression holds.
+    """Evaluate an expression: return a mask of the steps at which it holds.
 
     Raises:
         UsageError: The expression is invalid, or names an unknown quantity.

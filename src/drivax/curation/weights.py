@@ -71,7 +71,7 @@ def sampling_weights(
     Raises:
         UsageError: No step is drawable, all weights are 0, or the table has egos that training does not drive.
     """
-    drawable = _drawable(table, usable)
+    drawable = _drawable_steps(table, usable)
     if not drawable.any():
         raise UsageError("no step can be drawn", cure="check the set")
     weights = np.zeros(drawable.shape)
@@ -89,7 +89,7 @@ def sampling_weights(
     return weights / weights[drawable].mean()
 
 
-def _drawable(table: ScoreTable, usable: Bool[Array, "L T"] | None) -> Bool[Array, "M T"]:
+def _drawable_steps(table: ScoreTable, usable: Bool[Array, "L T"] | None) -> Bool[Array, "M T"]:
     """Return the mask of drawable steps of the logs in a table."""
     if usable is None or len(usable) == len(table.steps):
         return table.drawable if usable is None else usable
@@ -187,7 +187,7 @@ def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "L T"] | No
         raise UsageError(f"seed is {seed}", cure="use 0 or more")
     rng = np.random.default_rng(seed)
     shape = (len(table.scenarios), -1)
-    drawable = _drawable(table, usable).reshape(shape)
+    drawable = _drawable_steps(table, usable).reshape(shape)
     original, scenarios = table.steps.reshape(shape), table.scenarios.copy()
     steps = original.copy()
     indices = np.flatnonzero(drawable.any(axis=1))

@@ -6,5 +6,6 @@ from .doctor import diagnose as diagnose
 from .export.writer import Export as Export
 from .formats import detect as detect
 from .formats import survey as survey
+from .gpudrive import GpuDrive as GpuDrive
 from .reader import BadRecord as BadRecord
 from .reader import Reader as Reader

@@ -25,10 +25,10 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 
-from drivax.datasets.doctor import Estimate, estimate
+from drivax.datasets.doctor import SizeEstimate, estimate
 from drivax.datasets.formats import AUTO, Survey, detect, find_reader, survey
 from drivax.datasets.reader import BadRecord, Reader, companion_files, with_steps
-from drivax.errors import DataError, DrivaxError, UsageError, explain_system
+from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean, explain_system
 from drivax.files import count_text
 from drivax.reading import check_regular, explain_damage
 from drivax.scenario.build.assemble import assemble
@@ -100,7 +100,7 @@ class Conversion:
             find_reader(self.format)
         for name, choices in (("capacity", tuple(CAPACITIES)), ("routes", get_args(RouteStyle))):
             if (value := getattr(self, name)) not in choices:
-                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(choices)}")
+                raise UsageError(f"unknown {name} {value!r}", cure=did_you_mean(value, choices))
         for name in ("limit", "stride", "workers", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -111,7 +111,7 @@ class Conversion:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of the scenarios."""
-        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+        return CAPACITIES[self.capacity].with_future(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:
@@ -191,11 +191,11 @@ def _attempt(function: Callable[[], _Result], path: Path, record: str) -> _Resul
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConversionPlan:
     """Files to convert, expected size, and number of scenarios that an interrupted conversion has written already."""
 
     data: Survey
-    estimate: Estimate
+    estimate: SizeEstimate
     written: int
 
 
@@ -232,7 +232,7 @@ def convert(
     options: Conversion | None = None,
     progress: Progress | None = None,
     audit: Audit | None = None,
-    announce: Callable[[Plan], None] | None = None,
+    announce: Callable[[ConversionPlan], None] | None = None,
 ) -> Converted:
     """Convert a file or folder of a public data set to a scenario set.
 
@@ -267,7 +267,7 @@ def convert(
         sink = _Sink(writer, data, options, audit)
         expected = estimate(data, Path(out), capacity, options.stride, options.limit)
         if announce is not None:
-            announce(Plan(data, expected, written))
+            announce(ConversionPlan(data, expected, written))
         if not options.filters:  # with filters the size is unknown
             expected.check(Path(out), written)
         done = _drain(data, options, sink, writer, progress)
@@ -293,9 +293,9 @@ def _source(data: Survey, options: Conversion) -> dict[str, Any]:
 
 
 def _identity(data: Survey, options: Conversion, has_audit: bool) -> dict[str, Any]:
-    """Return what must be equal for a conversion to resume an interrupted one.
+    """Return the properties that must be equal for a conversion to resume an interrupted one.
 
-    That is: versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
+    They are versions, options, whether there is an audit, and path, size, format and ends of each file that is read,
     companions (maps, poses, tables) included.
     """
     companions = {
@@ -318,7 +318,7 @@ def _digest(data: Survey, formats: Mapping[Path, str | None]) -> str:
     digest = hashlib.sha256()
     for path, name in formats.items():
         size, ends = _ends(path)
-        digest.update(f"{data.relative(path)}\t{size}\t{name}\t{ends}\n".encode())
+        digest.update(f"{data.relative_path(path)}\t{size}\t{name}\t{ends}\n".encode())
     return digest.hexdigest()
 
 
@@ -458,7 +458,7 @@ class _Sink:
 
 def _row(data: Survey, record: BadRecord) -> dict[str, Any]:
     """Return a bad record as JSON values."""
-    return {**vars(record), "file": data.relative(record.file)}
+    return {**vars(record), "file": data.relative_path(record.file)}
 
 
 def _drain(

@@ -120,7 +120,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
 
 
 def _seal_problems(folder: Path) -> Iterator[BadRecord]:
-    """Yield what is wrong with the seal of a scenario set or run folder; earlier versions wrote none."""
+    """Yield the problems of the seal of a scenario set or run folder; earlier versions wrote none."""
     for name, read in ((MANIFEST, read_manifest), ("run.json", _check_run)):
         file = folder / name
         if file.exists() and isinstance(problem := attempt(read, folder, file=file), BadRecord):
@@ -206,7 +206,7 @@ def gaps(paths: Sequence[Path]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SizeEstimate:
     """Size of a conversion and free space of the disk."""
 
     scenarios: int
@@ -223,7 +223,7 @@ class Estimate:
         check_space(out, size_bytes, "make room, choose another disk, or use --limit")
 
 
-def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
+def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> SizeEstimate:
     """Estimate a conversion without filters by counting scenarios, in a sample of the files where there are many.
 
     Args:
@@ -241,7 +241,7 @@ def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: in
         count = sum(_count(reader, path, stride, capacity.steps) for path in sample)
         total += _size(paths) / max(_size(sample), 1) * count
     scenarios = round(total) if limit is None else min(round(total), limit)
-    return Estimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out))
+    return SizeEstimate(scenarios, scenarios * record_dtype(capacity).itemsize, free_bytes(out))
 
 
 def _count(reader: Reader, path: Path, stride: int, length: int) -> int:

@@ -1,7 +1,7 @@
 """The formats that drivax reads, detected by content: data sets use the same file names for different things.
 
-Of data that it does not read (other forms of public data sets, archives, scenario sets), the beginning of a file, its
-first record or file names tell what to use instead.
+Also errors for unsupported data, with a cure: other forms of public data sets, archives, scenario sets. Detection reads
+the beginning of a file, its first record, or file names.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def find_reader(name: str) -> Reader:
     if name not in readers:
         choices = f"use one of {', '.join((AUTO, *readers))}"
         cure = did_you_mean(name, readers, otherwise=choices)
-        raise UsageError(f"there is no format {name!r}", cure=cure)
+        raise UsageError(f"unknown format {name!r}", cure=cure)
     return readers[name]
 
 
@@ -153,7 +153,7 @@ class Survey:
         """Return the files of some formats (None: of an unknown one); all without an argument."""
         return [entry.path for entry in self.inputs if not formats or entry.format in formats]
 
-    def relative(self, path: Path) -> str:
+    def relative_path(self, path: Path) -> str:
         """Return a file's name in messages and manifests: its path below the root, or its own name."""
         inside = self.root.is_dir() and path.is_relative_to(self.root)
         return path.relative_to(self.root).as_posix() if inside else path.name

@@ -99,7 +99,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str, rows_of: str = "track") -> tuple[int, ...]:
-    """Return row numbers as ints; refuse those outside 0 to ``count - 1``; ``rows_of`` says what they are rows of."""
+    """Return row numbers as ints; refuse those outside 0 to ``count - 1`` by an error that names ``rows_of``."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names {rows_of} {row}, there are {count}", cure="skip this record")

@@ -95,7 +95,7 @@ class Reader(Protocol):
 
     @property
     def companions(self) -> tuple[str, ...]:
-        """File-name patterns of what belongs to those files: maps and poses, which are read, and indices."""
+        """File-name patterns of companion files: maps and poses, which are read, and indices."""
         ...
 
     def recognise(self, path: Path) -> bool:

@@ -7,6 +7,7 @@ from .episode_table import EpisodeTable as EpisodeTable
 from .episode_table import Trajectories as Trajectories
 from .observation_statistics import observation_statistics as observation_statistics
 from .pairing import comparable as comparable
+from .rollout import drive as drive
 from .runner import EvaluationConfig as EvaluationConfig
 from .runner import evaluate as evaluate
 from .runner import format_summary as format_summary

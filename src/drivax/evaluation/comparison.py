@@ -85,7 +85,7 @@ class ComparisonPlan:
             problem = f"smallest_difference is {self.smallest_difference}"
             raise UsageError(problem, cure="use a number above 0, or null")
         if len(set(self.secondary)) < len(self.secondary):
-            raise UsageError("a metric is named twice", cure="name each metric once")
+            raise UsageError("duplicate secondary metric", cure="name each metric once")
         # The primary metric may be one of the default secondary ones.
         secondary = tuple(name for name in self.secondary if name != self.primary)
         object.__setattr__(self, "secondary", secondary)

@@ -156,7 +156,7 @@ class Road:
     outside_m: Callable[[EgoMotion], Float64[np.ndarray, "t 4"]]
     intersection: Callable[[Points], Bool[np.ndarray, " n"]] = lambda points: np.zeros(len(points), bool)
 
-    def containing(self, points: Points) -> Bool[np.ndarray, "n o"]:
+    def contains(self, points: Points) -> Bool[np.ndarray, "n o"]:
         """Return a mask of the objects that contain each point."""
         inside = [shapely.contains_xy(lane.polygon, points[:, 0], points[:, 1]) for lane in self.objects]
         return np.stack(inside, axis=1) if inside else np.zeros((len(points), 0), bool)
@@ -336,7 +336,7 @@ def _angle_deg(
 
 def _in_one_lane(ego: EgoMotion, road: Road) -> Bool[np.ndarray, " t"]:
     """Return whether all corners are in one lane, or in lanes that follow each other (``ego_lane_change``)."""
-    inside = road.containing(ego.corners[:, _DEVKIT_ORDER].reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
+    inside = road.contains(ego.corners[:, _DEVKIT_ORDER].reshape(-1, 2)).reshape(len(ego.xy), 4, -1)
     result, candidates = np.zeros(len(ego.xy), bool), set[int]()
     for sample, inside_by_corner in enumerate(inside):
         lanes_by_corner: list[set[int]] = []
@@ -459,7 +459,7 @@ def _stays_on_road(ego: EgoMotion, road: Road, route: Sequence[Sequence[int]]) -
     A corner in a lane, or within 0.3 m of a lane of ego's centre, counts as inside.
     """
     for sample, corner in np.argwhere(road.outside_m(ego) >= _OUTSIDE_M):
-        if road.containing(ego.corners[sample, corner][None]).any():
+        if road.contains(ego.corners[sample, corner][None]).any():
             continue
         point = shapely.points(ego.corners[sample, corner])
         lanes = [road.objects[index].polygon for index in route[sample]]
@@ -470,7 +470,7 @@ def _stays_on_road(ego: EgoMotion, road: Road, route: Sequence[Sequence[int]]) -
 
 def _route(road: Road, points: Points) -> list[list[int]]:
     """Return the lane or the connectors of each point, given the previous points (``get_route``)."""
-    containing, in_intersection = road.containing(points), road.intersection(points)
+    containing, in_intersection = road.contains(points), road.intersection(points)
     route: list[list[int]] = []
     current: list[int] = []
     for sample, inside in enumerate(containing):

@@ -79,7 +79,7 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
     tables = (*a, *b)
     runs = [id(table) if table.folder is None else table.folder.resolve() for table in tables]
     if duplicates := [table for index, table in enumerate(tables) if runs[index] in runs[:index]]:
-        problem = "A and B are the same run" if len(tables) == 2 else "is named twice"
+        problem = "A and B are the same run" if len(tables) == 2 else "duplicate run"
         raise UsageError(problem, file=duplicates[0].folder, cure="name different runs")
     for side in (a, b):
         # A name ends with the seed's number and the checkpoint. Another checkpoint is another planner.

@@ -26,7 +26,8 @@ from drivax.files import write_text
 from drivax.geometry.boxes import corners
 from drivax.planners.nuplan.map import lane_lines, roadblocks
 from drivax.scenario.bank.queries import LEVEL_M, around_lanes, offroad_distance
-from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank, Sizes
+from drivax.scenario.bank.scenario_bank import DEFAULT_LANE_WIDTH_M, ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.seal import edited_files
@@ -268,7 +269,7 @@ def _road(scenario: Scenario, steps: slice, sizes: Sizes) -> Road:
 def _corner_distances(
     bank: ScenarioBank, boxes: Float[Array, "t 6"], z: Float[Array, " t"]
 ) -> Float[Array, "t 4"]:
-    """Return how far each corner of ego's boxes is beyond the road edges, m, at ground heights ``z``."""
+    """Return the distance of each corner of ego's boxes beyond the road edges, m, at ground heights ``z``."""
     index = jnp.zeros((), jnp.int32)
 
     def box_distances(box: Float[Array, " 6"], ground: Float[Array, ""]) -> Float[Array, " 4"]:

@@ -25,14 +25,16 @@ from drivax.escaping import escape_controls
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
 from drivax.evaluation.memory import free_memory, report_out_of_memory, scenarios_at_a_time
+from drivax.evaluation.result_tables import metric_label
 from drivax.evaluation.rollout import Episodes, check_actions, drive, episode_keys, evaluation_task
 from drivax.files import check_space, explain_full_disk, replace_folder
-from drivax.metrics.catalogue import METRICS, Metric, metric_specs, select_metrics
+from drivax.metrics.catalogue import METRICS, Metric, headline, metric_specs, select_metrics
 from drivax.planners.catalogue import PLANNERS
 from drivax.planners.functions import collect_errors
 from drivax.planners.planner import Planner, add_noise, hold, limit_speed
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities, too_short
+from drivax.scenario.bank.scenario_bank import ScenarioBank, identities, too_short
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import CURRENT_STEP, LEAST_STEPS, Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
@@ -56,12 +58,8 @@ CPU_WIDTH, ACCELERATOR_WIDTH = 16, 256
 _EGO_BYTES, _AGENT_BYTES = 22, 3
 #: Maximum number of scenarios in an error message, and of crashes in a list.
 _MAX_NAMED = _MAX_LISTED = 5
-#: Columns of the headline table, with their short names.
-HEADLINE = {
-    "success": "success", "accuracy": "accuracy", "at_fault_collision": "at fault", "collision": "collision",
-    "offroad": "off-road", "red_light": "red light", "progress_ratio": "progress", "comfortable": "comfort",
-    "vmax_score": "vmax",
-}  # fmt: skip
+#: Maximum number of planners in a table of headline metrics.
+_MAX_PLANNERS = 5
 #: End of the name of a planner in the action space ``route``, in all tables: it plans along the route, and does not
 #: steer.
 ROUTE_MARK = " (route)"
@@ -129,7 +127,7 @@ def run_evaluation(
     scenarios = data.take(select_scenarios(data, config.filter, config.scenarios, config.limit))
     RunFolder.check(Path(out), overwrite, "evaluation")
     # Only evaluated scenarios need verification; the others only contribute their sizes.
-    sizes = sizes or Sizes.used(ScenarioSet.open(data.path, verify=False))
+    sizes = sizes or ScenarioSet.open(data.path, verify=False).sizes
     needed_bytes = len(scenarios) * _episode_bytes(config.traffic, sizes, data.capacity.steps)
     check_space(Path(out), needed_bytes)
     with ProgressBar(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
@@ -166,14 +164,21 @@ def with_metrics(task: Task, extra: tuple[str, ...]) -> Task:
 
 
 def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Format headline metrics of planners as a table; undefined means are empty cells."""
-    rows = []
-    for summary in summaries:
-        means = (summary["metrics"][name]["mean"] for name in HEADLINE)
-        texts = ("" if mean is None else f"{mean:.3f}" for mean in means)
-        rows.append((Cell(summary["planner"]), *map(Cell, texts)))
-    columns = (Column("planner", label=True), *map(Column, HEADLINE.values()))
-    return Table("summary", columns, tuple(rows)).text()
+    """Format headline metrics (rows) of planners (columns); undefined means are empty cells.
+
+    Further planners follow in tables of their own, so that columns stay readable.
+    """
+    parts = [summaries[i : i + _MAX_PLANNERS] for i in range(0, len(summaries), _MAX_PLANNERS)]
+    texts = []
+    for part in parts:
+        columns = (Column("metric", label=True), *(Column(summary["planner"]) for summary in part))
+        rows = []
+        for name in headline(METRICS):
+            means = (summary["metrics"][name]["mean"] for summary in part)
+            cells = (Cell("" if mean is None else f"{mean:.3f}") for mean in means)
+            rows.append((Cell(metric_label(name).text), *cells))
+        texts.append(Table("summary", columns, tuple(rows)).text())
+    return "\n\n".join(texts)
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
@@ -337,7 +342,7 @@ class _Evaluation:
         """Return the evaluation after checking that planner, task and start are compatible."""
         task = simulator.task
         if not isinstance(task, Task):
-            raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
+            raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.Task")
         if not 0 <= start_step < steps - 1:
             raise UsageError(f"no episode can start at step {start_step}", cure=f"use 0 to {steps - 2}")
         check_actions(planner, task)

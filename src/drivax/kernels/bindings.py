@@ -108,7 +108,7 @@ def look_ahead(
     maps: Maps, agents: Agents, lights: Int[Array, " L"], numbers: Sequence[Int[Array, ""]],
     route_m: Float[Array, ""], speed: Float[Array, ""], min_gap_m: Float[Array, ""], rules: Mapping[str, float],
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """Return what a car-following driver needs: gap to the nearest obstacle (m), its speed, desired speed (m/s).
+    """Return the inputs of a car-following driver: gap to the nearest obstacle (m), its speed, desired speed (m/s).
 
     Args:
         maps: Routes, numbers of their points, and stop lines of all scenarios.

@@ -2,6 +2,16 @@ from .algorithm import Agent as Agent
 from .algorithm import AlgorithmConfig as AlgorithmConfig
 from .algorithm import AuxiliaryLoss as AuxiliaryLoss
 from .algorithm import Learner as Learner
+from .algorithm import training_data as training_data
+from .algorithms.awac import AwacConfig as AwacConfig
+from .algorithms.behaviour_cloning import BcConfig as BcConfig
+from .algorithms.cql import CqlConfig as CqlConfig
+from .algorithms.iql import IqlConfig as IqlConfig
+from .algorithms.ppo import PpoConfig as PpoConfig
+from .algorithms.sac import SacConfig as SacConfig
+from .algorithms.td3_bc import Td3BcConfig as Td3BcConfig
+from .algorithms.warm_start import BcPpoConfig as BcPpoConfig
+from .algorithms.warm_start import BcSacConfig as BcSacConfig
 from .config import TrainConfig as TrainConfig
 from .driving import Driving as Driving
 from .environment import Environment as Environment
@@ -9,6 +19,7 @@ from .environment import Rollout as Rollout
 from .environment import collect as collect
 from .experience import Experience as Experience
 from .experience import sample_steps as sample_steps
+from .experience import sampler as sampler
 from .loop import TrainOptions as TrainOptions
 from .loop import make_agent as make_agent
 from .loop import train as train
@@ -17,6 +28,8 @@ from .policies import export_policy as export_policy
 from .policies import find_traffic as find_traffic
 from .policies import load_policy as load_policy
 from .policies import policy_traffic as policy_traffic
+from .program import use_all_cores as use_all_cores
+from .program import widen_pool as widen_pool
 from .replay import ReplayBuffer as ReplayBuffer
 from .replay import ReplayConfig as ReplayConfig
 from .training_set import TrainingSet as TrainingSet

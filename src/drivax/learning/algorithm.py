@@ -1,4 +1,4 @@
-"""Protocols of algorithms: what the training loop needs from a built-in algorithm or from your own."""
+"""Protocols of the training loop, which built-in and user-defined algorithms implement."""
 
 from __future__ import annotations
 
@@ -119,10 +119,10 @@ class HeldOutMetrics(Protocol):
 
 @runtime_checkable
 class HasCritics(Protocol):
-    """A learner that can tell at the end of a run whether its critics are healthy."""
+    """A learner that checks the health of its critics at the end of a run."""
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
-        """Return what is wrong with the critics, given the rows of ``metrics.jsonl`` up to the loaded checkpoint.
+        """Return the problems of the critics, given the rows of ``metrics.jsonl`` up to the loaded checkpoint.
 
         None if the run did not check them.
         """

@@ -45,6 +45,27 @@ _ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
+class Residency:
+    """Scenarios on the device at a time, and how they are exchanged (:mod:`drivax.learning.residency`).
+
+    Attributes:
+        scenarios: Number of resident scenarios, a multiple of ``block``.
+        block: Scenarios that are exchanged together.
+        every: Iterations between two exchanges.
+    """
+
+    scenarios: int
+    block: int = 32
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "scenarios", "block", "every")
+        if self.scenarios % self.block or self.scenarios <= self.block:
+            problem = f"residency.scenarios is {self.scenarios}, residency.block {self.block}"
+            raise UsageError(problem, cure=f"use a multiple of {self.block} above it")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Settings of ``drivax train``; every preset in ``configs/`` is one of these, except ``studies/``.
 
@@ -63,6 +84,7 @@ class TrainConfig:
         earliest_start, latest_start: Training episodes begin at a random step of the log between the two (exceptions:
             :class:`~drivax.learning.driving.Driving`). The first episodes of a run may also begin later, so that they
             end at different times.
+        residency: Scenarios on the device at a time; None: all of them.
         begin_from: Another run to fine-tune (``RUN``, its best checkpoint, or ``RUN@STEP``): its networks are loaded,
             the rest of the state is fresh. All other settings may differ as long as the networks fit.
         evaluate_every: Iterations between validations; 0: only at the end.
@@ -83,6 +105,7 @@ class TrainConfig:
     egos: Egos = "recorded"
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
+    residency: Residency | None = None
     begin_from: str | None = None
     evaluate_every: int = 0
     checkpoint_every: int = 20

@@ -46,7 +46,7 @@ def large_logs(row: Mapping[str, float]) -> dict[str, str]:
 
 
 def divergence_cure(problem: str, checkpoint: str | None) -> str:
-    """Return what to do about a divergence, given the last healthy checkpoint as ``RUN@STEP``."""
+    """Return the cure of a divergence, given the last healthy checkpoint as ``RUN@STEP``."""
     name = problem.split(" ")[0]
     term = name.removeprefix("reward/")
     change = "lower the learning rate" if term == name else f"correct the reward term {term}"

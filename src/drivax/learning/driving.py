@@ -12,19 +12,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environments, Outcome, any_across_learners
-from drivax.learning.experience import ExpertActions, ExpertSteps, StepIndex
+from drivax.learning.environment import Environment, Environments, Outcome, any_across_learners
+from drivax.learning.experience import (
+    ExpertActions,
+    ExpertSteps,
+    StepIndex,
+    draw_positions,
+    expert_steps,
+    require_log,
+)
 from drivax.learning.program import map_over_devices
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.settings.structure import kind_of
 from drivax.simulator.simulator import Simulator, Step, map_where
 from drivax.simulator.starts import LogStart
-from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.bank_data import TrafficData, find_data, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import AgentContext, Frame, SimState
 from drivax.tasks.actions import ActionSpace, DirectState, Discrete, Route, Trajectory
@@ -53,6 +61,18 @@ def check_learnable(actions: ActionSpace) -> None:
     if isinstance(actions, DirectState | Trajectory):
         problem = f"policies cannot learn in {kind_of(type(actions))}"
         raise UsageError(problem, cure="choose a space in [-1, 1]")
+
+
+@record
+class LoggedSteps(TrafficData):
+    """The expert's steps in the scenarios of a bank."""
+
+    steps: ExpertSteps
+
+
+def with_expert_steps(environment: Environment, bank: ScenarioBank) -> ScenarioBank:
+    """Return the bank with the expert's steps, which :meth:`Driving.expert_steps` then need not compute."""
+    return with_data(bank, LoggedSteps(expert_steps(require_log(environment), bank)))
 
 
 @dataclass(frozen=True)
@@ -261,8 +281,12 @@ class Driving:
     def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """Return the log as a rollout of the expert from the current step on, with the simulator's rewards and ends.
 
-        All agents follow the log, because only then is the outcome of the expert's actions known.
+        All agents follow the log, because only then is the outcome of the expert's actions known. Those of
+        :func:`with_expert_steps` are returned unchanged.
         """
+        known = find_data(data, LoggedSteps)
+        if known is not None:
+            return known.steps
         egos = count_egos(self.egos, data.most_egos)
         rows = jnp.arange(len(data) * egos)
         rollouts = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(rows), BATCH))
@@ -303,7 +327,10 @@ class Driving:
         are the recorded ones.
         """
         index_key, step_key = jax.random.split(key)
-        index = jax.random.randint(index_key, (count,), 0, len(bank))
+        if bank.chances is None:
+            index = jax.random.randint(index_key, (count,), 0, len(bank))
+        else:
+            index = draw_positions(bank.chances, index_key, (count,))
         slot, row = None, index * bank.most_egos
         if self.egos == "moving":
             ego_number = jax.random.randint(

@@ -120,7 +120,7 @@ class PastPolicy(NamedTuple):
 
 
 def past_policy(environment: Environment, count: int) -> PastPolicy | None:
-    """Return which of ``count`` environments an older copy of the policy drives, None if it drives none."""
+    """Return those of ``count`` environments that an older copy of the policy drives; None if it drives none."""
     find: Callable[[int], PastPolicy] | None = getattr(environment, "past", None)
     past = None if find is None else find(count)
     return past if past is not None and len(past.environments) else None

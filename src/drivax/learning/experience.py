@@ -57,20 +57,32 @@ def sampler(weights: np.ndarray) -> Sampler:
     Raises:
         DataError: All weights are 0.
     """
+    cumulative = jnp.asarray(cumulative_probability(weights))
+    return Sampler(cumulative, jnp.asarray(effective_size(weights), jnp.float32), weights.shape[1])
+
+
+def cumulative_probability(weights: np.ndarray) -> UInt[np.ndarray, " n"]:
+    """Return the cumulative probability of weights, in units of ``1 / (2^32 - 1)``.
+
+    Raises:
+        DataError: All weights are 0.
+    """
     sums = np.cumsum(weights.reshape(-1), dtype=np.float64)
     if not sums[-1] > 0.0:
         raise DataError("all weights of usable steps are 0", cure="give one a weight above 0")
-    cumulative = np.floor(sums / sums[-1] * _MAX_UINT32).astype(np.uint32)
-    effective = jnp.asarray(effective_size(weights), jnp.float32)
-    return Sampler(jnp.asarray(cumulative), effective, weights.shape[1])
+    return np.floor(sums / sums[-1] * _MAX_UINT32).astype(np.uint32)
 
 
 def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
     """Draw step indices with replacement."""
-    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_MAX_UINT32 - 1))
-    # The first step whose cumulative probability exceeds the number never has weight zero.
-    position = jnp.searchsorted(sampler.cumulative, number, side="right").astype(jnp.int32)
+    position = draw_positions(sampler.cumulative, key, shape)
     return position // sampler.steps, position % sampler.steps
+
+
+def draw_positions(cumulative: UInt[Array, " n"], key: Array, shape: tuple[int, ...]) -> Int[Array, "..."]:
+    """Draw positions with replacement, given their cumulative probability; those of probability 0 are never drawn."""
+    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_MAX_UINT32 - 1))
+    return jnp.searchsorted(cumulative, number, side="right").astype(jnp.int32)
 
 
 def check_weights(weights: np.ndarray, scenarios: int, steps: int, egos: int) -> np.ndarray:
@@ -202,7 +214,7 @@ class ExperienceConfig:
             UsageError: There is no expert, or the weights do not fit the data.
             DataError: No step is usable, or all weights of usable steps are 0.
         """
-        expert = _expert_steps(require_log(environment), data)
+        expert = expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)
         if not usable.any():
             if not expert.usable.any():
@@ -261,7 +273,8 @@ def environment_data(data: Any) -> Any:
 
 
 @partial(jax.jit, static_argnums=0)
-def _expert_steps(environment: LoggedEnvironment, data: Any) -> ExpertSteps:
+def expert_steps(environment: LoggedEnvironment, data: Any) -> ExpertSteps:
+    """Return the expert's steps in an environment's data."""
     return environment.expert_steps(data)
 
 

@@ -18,8 +18,6 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.memory import report_out_of_memory
 from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, LearnerState, training_data
-from drivax.learning.algorithms.behaviour_cloning import BcConfig
-from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving, count_egos
@@ -28,12 +26,8 @@ from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import find_traffic
 from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
-from drivax.learning.recorded_episodes import (
-    RecordedDriving,
-    StoredDriving,
-    StoredEpisodes,
-    match_observations,
-)
+from drivax.learning.recorded_episodes import RecordedDriving, StoredEpisodes
+from drivax.learning.residency import Residents
 from drivax.learning.training_log import (
     Preempted,
     StopSignal,
@@ -41,16 +35,11 @@ from drivax.learning.training_log import (
     Validation,
     validate,
 )
-from drivax.learning.training_set import (
-    TrainingSet,
-    episodes_digest,
-    prepare_episodes,
-    recorded_environment,
-)
+from drivax.learning.training_set import Source, TrainingSet, episodes_digest, prepare_episodes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.select.splits import HoldOut, hold_out
-from drivax.scenario.store import ScenarioSet, check_lengths
+from drivax.scenario.store import ScenarioSet, Subset, check_lengths
 from drivax.seal import note_edits
 from drivax.settings import modules_of
 from drivax.tracking.checkpoints import Checkpoints
@@ -94,6 +83,8 @@ class TrainOptions:
         resume: Continue the run in ``out`` from its newest healthy checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder; no effect with ``resume``.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several write ``out/seed-<seed>``.
+        memory: Bytes of scenarios that are resident at a time (``config.residency`` is chosen by it); None: all are, or
+            as many as configured.
         log: Called with lines about held-out scenarios, memory, pretrained networks and early stops, and with warnings.
         trust: Modules, besides drivax and those that the configuration names, whose code the run to resume and policies
             in the traffic may name.
@@ -102,6 +93,7 @@ class TrainOptions:
     resume: bool = False
     overwrite: bool = False
     seeds: int = 1
+    memory: int | None = None
     log: Callable[[str], None] = lambda line: None
     trust: Sequence[str] = ()
 
@@ -148,28 +140,28 @@ def train(
         if config.begin_from is not None:  # with its step, so that resuming finds the same checkpoint
             config = replace(config, begin_from=str(PretrainedRun.of(config.begin_from)))
     scenarios, weights, validation_scenarios = _divide(config, data, training.weights, validation_set)
-    environment, environment_data = _environment(config, scenarios, trust, training)
-    learner = config.algorithm.build(environment, environment_data, config.iterations)
-    held_out = _held_out(config, environment, learner, validation_scenarios, episodes)
+    source = Source.of(config, scenarios, weights, episodes, trust)
+    residents = Residents.of(source, opts.memory)
+    config, bank = residents.config, residents.load()
+    learner = config.algorithm.build(source.environment, bank, config.iterations)
+    held_out = _held_out(config, source.environment, learner, validation_scenarios, episodes)
     seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
-    experience = training_data(config.algorithm, environment, environment_data, weights)
-    program = Program(Seeds(learner, tuple(seeds)), experience, config.devices)
-    if opts.resume:
-        warn_of_other_bits(folders[0].info, len(program.devices), opts.log)
+    program = Program(Seeds(learner, tuple(seeds)), residents.complete(bank), config.devices)
+    warn_of_other_bits([folder.info for folder in folders], len(program.devices), opts.log)
     (memory := program.account(None if held_out is None else held_out.bank)).check()
-    if isinstance(validation_set, HoldOut):
-        opts.log(validation_set.text())
-    opts.log(memory.text())
+    notice = validation_set.text() if isinstance(validation_set, HoldOut) else ""
+    for line in filter(None, (notice, residents.text(bank), memory.text())):
+        opts.log(line)
     # Read before folders are created, because an error must leave none.
     networks = {} if opts.resume else pretrained_networks(config.begin_from, program, opts.log)
     rules = (config.checkpoint_rule, config.keep, config.patience)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(explain_full_disk(out))
+    use = f"in training; {memory.text()}"
+    with contextlib.ExitStack() as stack, explain_full_disk(out), report_out_of_memory(use, memory.cure):
         notes["devices"] = len(program.devices)
         folders = folders or _create_folders(config, data, notes, out, seeds, opts.overwrite)
         logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
-        stack.enter_context(report_out_of_memory(f"in training; {memory.text()}", memory.cure))
-        _Training(config, program, logs, held_out, networks, opts.log, trust).run()
+        stack.callback(residents.close)
+        _Training(config, program, logs, held_out, networks, opts.log, trust, residents).run()
     return RunFolder.open(out)
 
 
@@ -190,7 +182,7 @@ def _divide(
     data: ScenarioSet,
     weights: np.ndarray | None,
     validation: ScenarioSet | HoldOut | None,
-) -> tuple[Sequence[Scenario], np.ndarray | None, Sequence[Scenario] | None]:
+) -> tuple[ScenarioSet | Subset, np.ndarray | None, Sequence[Scenario] | None]:
     """Return the scenarios to train on, their weights, and the scenarios to validate on (None: no validation).
 
     Raises:
@@ -201,7 +193,7 @@ def _divide(
             egos = count_egos(config.egos, data.capacity.egos)
             weights = check_weights(weights, len(data), data.capacity.steps, egos)[validation.training]
             weights = weights.reshape(-1, data.capacity.steps)
-        return data.take(validation.training), weights, data.take(validation.validation)
+        return Subset(data, validation.training), weights, data.take(validation.validation)
     if isinstance(validation, ScenarioSet):
         check_lengths(data, validation)
         return data, weights, validation
@@ -224,9 +216,8 @@ def usable_steps(
     training = data if isinstance(data, TrainingSet) else TrainingSet(data)
     scenarios, steps = training.scenarios, training.scenarios.capacity.steps
     uniform = np.ones((len(scenarios), steps))
-    weighted = replace(training, weights=uniform)
-    environment, environment_data = _environment(config, scenarios, trust, weighted)
-    experience = training_data(config.algorithm, environment, environment_data, uniform)
+    source = Source.of(config, scenarios, uniform, training.episodes, trust)
+    experience = source.complete(source.load())
     usable, scenario = np.asarray(experience.usable), experience.expert.scenario
     if scenario is None:
         return usable
@@ -287,39 +278,6 @@ def _held_out(
         if data is None:
             return held_out
     return replace(held_out, data=training_data(config.algorithm, environment, data))
-
-
-def _environment(
-    config: TrainConfig, data: Sequence[Scenario], trust: Sequence[str], training: TrainingSet
-) -> tuple[Driving | Mixture, Any]:
-    """Return the environment of a training run, and its data: the bank, or episodes in it.
-
-    Raises:
-        UsageError: ``egos`` is moving, but the set has no further egos; or the training cannot use the episodes.
-    """
-    environment, bank = training_environment(config, trust), ScenarioBank.from_scenarios(data)
-    count_egos(config.egos, bank.most_egos)
-    bank, episodes = environment.prepare(bank), training.episodes
-    if not episodes:
-        return environment, bank
-    if not isinstance(config.algorithm, OfflineConfig | BcConfig):
-        problem = f"{type(config.algorithm).__name__} does not learn from recorded episodes"
-        raise UsageError(problem, cure="leave out the episodes, or use bc, cql, iql, awac or td3_bc")
-    if not isinstance(environment, Driving) or config.egos != "recorded":
-        problem = "recorded episodes are those of the recorded ego, in one kind of traffic"
-        raise UsageError(problem, cure="leave out egos, and use one traffic")
-    if isinstance(episodes, StoredEpisodes):
-        if training.weights is not None:
-            raise UsageError("weights of scenarios do not fit stored episodes", cure="leave out one of both")
-        stored = match_observations(episodes, environment.shapes(bank), environment.action_size)
-        return StoredDriving(environment.simulator), stored
-    environment = recorded_environment(environment, episodes)
-    recorded = prepare_episodes(environment, bank, data, episodes)
-    if recorded is None:
-        raise DataError(
-            "no recorded episode is in the scenarios to train on", cure="record some: drivax record"
-        )
-    return environment, recorded
 
 
 def _create_folders(
@@ -383,6 +341,7 @@ class _Training:
     networks: Mapping[str, Any]
     log: Callable[[str], None]
     trust: Sequence[str]
+    residents: Residents
 
     def run(self) -> None:
         """Run the remaining iterations.
@@ -393,6 +352,7 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
+        self.residents.resume(program, done)
         total_steps, done_steps = self._steps(config.iterations), self._steps(done)
         with Progress("training", "steps", total_steps, done=done_steps) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
@@ -401,11 +361,12 @@ class _Training:
                 started = time.perf_counter()
                 state, values, finite = program.step(state)
                 values, finite = jax.device_get((values, finite))
+                state, exchanged = self.residents.exchange(program, state, iteration)
                 rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
                 # Read once, so that all seeds write a checkpoint of the same iteration.
                 preempted = stop.received and iteration < config.iterations
                 means = (mean_logs(program.seeds.member(values, number)) for number in range(len(self.logs)))
-                rows = [row | {"steps_per_second": rate} for row in means]
+                rows = [row | exchanged | {"steps_per_second": rate} for row in means]
                 self._check(iteration, state, rows, np.atleast_1d(finite))
                 self._record(iteration, state, rows, preempted)
                 success = [row["rollout/success"] for row in rows if "rollout/success" in row]

@@ -106,7 +106,7 @@ class Mixture:
         return tuple(block.cache(data, states) for (_, block), states in pairs)
 
     def draw(self, data: ScenarioBank, key: Array, count: int) -> list[Any]:
-        """Draw where new episodes of every block start."""
+        """Draw the starts of new episodes of every block."""
         keys = jax.random.split(key, len(self.blocks))
         blocks = zip(self.blocks, keys, self.sizes(count), strict=True)
         return [block.draw(data, key, size) for (_, block), key, size in blocks]

@@ -151,7 +151,7 @@ class PolicyTraffic(PlannerTraffic):
         return f"driven_by_{run}{name}{base}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """Return the bank with the policy, and with what ``base`` needs."""
+        """Return the bank with the policy and the data of ``base``."""
         bank = super().prepare(bank)
         return with_driver(bank, load_policy(self.run, bank, samples=self.samples, trust=self.trust)[0])
 

@@ -38,7 +38,7 @@ _AXIS, _SEEDS = "devices", "seeds"
 _NETWORKS = "networks and optimiser"
 #: Settings are named without their path, which begins with ``algorithm.`` and, in a warm start, ``ppo.`` or ``sac.``.
 _CURES = {
-    "scenarios": "train on fewer scenarios",
+    "scenarios": "hold fewer scenarios at a time: --memory",
     "validation": "validate on fewer scenarios",
     "replay": "lower replay.capacity, or set replay.store to state",
     "environments": "lower environments",
@@ -116,6 +116,7 @@ class Seeds:
 class Program:
     """An iteration of all seeds on some data, compiled before any array of the state is allocated.
 
+    ``data`` may be replaced by others of the same shapes between two iterations (:meth:`place`).
     ``devices`` is passed to :func:`choose_devices`, whose errors are raised.
     """
 
@@ -134,16 +135,15 @@ class Program:
             self._init = jax.jit(seeds.init, out_shardings=self._layout)
             if self.devices[0].platform == "cpu":  # devices share the memory of NumPy arrays, not of JAX's
                 data = jax.tree.map(np.asarray, data)
-            data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
                 lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
                 shapes, self._layout,
             )  # fmt: skip
-        self.data, self.shapes = data, shapes
+        self.data, self.shapes = self.place(data), shapes
         outputs = None if self._layout is None else (self._layout, None, None)
         iterate = jax.jit(self._iterate, donate_argnums=1, out_shardings=outputs)
         with contextlib.nullcontext() if self._layout is None else jax.set_mesh(self._mesh):
-            self.compiled = iterate.lower(data, shapes).compile()
+            self.compiled = iterate.lower(self.data, shapes).compile()
 
     def _iterate(self, data: Any, state: Any) -> tuple[Any, Any, Bool[Array, "*seeds"]]:
         """Iterate whole seeds on each device; learners divide their work themselves if seeds cannot be divided."""
@@ -157,6 +157,12 @@ class Program:
     def account(self, validation: Any = None) -> MemoryAccount:
         """Return the memory of the fullest device, with ``validation`` held next to the data."""
         return account(self.data, validation, self.shapes, self.compiled, self.devices)
+
+    def place(self, data: Any) -> Any:
+        """Return data of the iterations on every device."""
+        if self._layout is None:
+            return data
+        return jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
 
     def initial_state(self) -> Any:
         """Return the initial state of all seeds."""
@@ -238,13 +244,17 @@ def former_devices(info: Mapping[str, Any]) -> int:
     return int(info.get("devices") or 1)  # Runs of version 0.1.0 lack it; those on a CPU used one.
 
 
-def warn_of_other_bits(info: Mapping[str, Any], devices: int, log: Callable[[str], None]) -> None:
-    """Warn if a run, given its ``run.json``, used other native kernels or another number of devices."""
-    differences = [kernels_difference(info)]
-    if (former := former_devices(info)) != devices:
-        differences.append(f"the run used {former} devices, this process {devices}")
-    for difference in filter(None, differences):
-        log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
+def warn_of_other_bits(infos: Sequence[Mapping[str, Any]], devices: int, log: Callable[[str], None]) -> None:
+    """Warn if a run to resume used other native kernels or another number of devices.
+
+    ``infos`` are the ``run.json`` of its folders, of which the first is read; none for a new run.
+    """
+    for info in infos[:1]:
+        differences = [kernels_difference(info)]
+        if (former := former_devices(info)) != devices:
+            differences.append(f"the run used {former} devices, this process {devices}")
+        for difference in filter(None, differences):
+            log(f"warning: {difference}: the result differs in bits from that of an uninterrupted run")
 
 
 def shard_axis(tree: Any, axis: int) -> Any:

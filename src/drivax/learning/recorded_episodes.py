@@ -70,7 +70,7 @@ class RecordedDriving(Driving):
         return data.steps
 
     def observe_recorded(self, data: Any, index: StepIndex) -> dict[str, Array]:
-        """Observe recorded steps."""
+        """Observe steps of the episodes."""
         row, step = index
         values = jax.tree.map(lambda leaf: leaf[row, step], data.contexts)
         history = data.motion[row[..., None], step[..., None] + jnp.arange(HISTORY)]

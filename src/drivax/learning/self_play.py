@@ -99,7 +99,7 @@ class SelfPlay(Driving):
         return state, ~is_driven(data, state)
 
     def draw(self, data: ScenarioBank, key: Array, count: int) -> Any:
-        """Draw where new episodes of groups start, for ``count`` environments."""
+        """Draw the starts of new episodes of groups, for ``count`` environments."""
         return self._draw_groups(data, key, count // self.config.vehicles, self.latest_start)
 
     def _step_or_reset(

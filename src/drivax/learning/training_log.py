@@ -212,7 +212,7 @@ class TrainingLog:
         self.folder = self.folder.note(divergence={"step": step, "problem": problem})
 
     def retry(self) -> None:
-        """Forget that the seed diverged."""
+        """Remove the note of a divergence from ``run.json``."""
         self.folder = self.folder.note(divergence=None)
 
     def new_warnings(self, row: Mapping[str, float]) -> list[str]:

@@ -6,30 +6,42 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import inside
-from drivax.learning.driving import Driving
+from drivax.learning.algorithm import training_data
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.offline import OfflineConfig
+from drivax.learning.config import TrainConfig
+from drivax.learning.driving import Driving, count_egos
+from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.recorded_episodes import (
     RecordedDriving,
     RecordedEpisodes,
+    StoredDriving,
     StoredEpisodes,
+    match_observations,
     replay_episodes,
 )
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import Scenario
-from drivax.scenario.store import ScenarioSet
+from drivax.scenario.store import ScenarioSet, Subset
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder
+
+#: Numbers of scenarios in a set.
+Rows = Int[np.ndarray, " n"]
 
 _RECORD = "record them again: drivax record"
 
@@ -48,6 +60,88 @@ class TrainingSet:
     scenarios: ScenarioSet
     weights: np.ndarray | None = None
     episodes: tuple[EpisodeTable, ...] | StoredEpisodes = ()
+
+
+@dataclass(frozen=True)
+class Source:
+    """The scenarios of a training run as data of its environment, and of the iterations of its algorithm.
+
+    Attributes:
+        config: Settings of the run.
+        environment: Environment of the run; for episodes, that of recorded or stored ones.
+        scenarios, weights, episodes: Those of the training set that are not held out for validation.
+    """
+
+    config: TrainConfig
+    environment: Driving | Mixture
+    scenarios: ScenarioSet | Subset
+    weights: np.ndarray | None
+    episodes: tuple[EpisodeTable, ...] | StoredEpisodes
+
+    @classmethod
+    def of(
+        cls, config: TrainConfig, scenarios: ScenarioSet | Subset, weights: np.ndarray | None,
+        episodes: tuple[EpisodeTable, ...] | StoredEpisodes, trust: Sequence[str],
+    ) -> Source:  # fmt: skip
+        """Return the source of a run; ``trust`` is that of :func:`~drivax.learning.loop.train`.
+
+        Raises:
+            UsageError: The training cannot use the episodes.
+        """
+        environment = training_environment(config, trust)
+        if not episodes:
+            return cls(config, environment, scenarios, weights, ())
+        if not isinstance(config.algorithm, OfflineConfig | BcConfig):
+            problem = f"{type(config.algorithm).__name__} does not learn from recorded episodes"
+            raise UsageError(problem, cure="leave out the episodes, or use bc, cql, iql, awac or td3_bc")
+        if not isinstance(environment, Driving) or config.egos != "recorded":
+            problem = "recorded episodes are those of the recorded ego, in one kind of traffic"
+            raise UsageError(problem, cure="leave out egos, and use one traffic")
+        if not isinstance(episodes, StoredEpisodes):
+            return cls(config, recorded_environment(environment, episodes), scenarios, weights, episodes)
+        if weights is not None:
+            raise UsageError("weights of scenarios do not fit stored episodes", cure="leave out one of both")
+        return cls(config, StoredDriving(environment.simulator), scenarios, None, episodes)
+
+    def bank(self, scenarios: Iterable[Scenario], sizes: bool | Sizes = True) -> ScenarioBank:
+        """Return the bank of some scenarios, prepared for the environment; ``sizes`` as in ``from_scenarios``.
+
+        Raises:
+            UsageError: ``egos`` is moving, but the set has no further egos.
+        """
+        bank = ScenarioBank.from_scenarios(scenarios, trim=sizes)
+        count_egos(self.config.egos, bank.most_egos)
+        return self.environment.prepare(bank)
+
+    def load(self) -> Any:
+        """Return the data of the environment: a bank of all scenarios, or the episodes in it.
+
+        Raises:
+            UsageError: ``egos`` is moving, but the set has no further egos; or stored observations do not fit the task.
+            DataError: No recorded episode is in these scenarios.
+        """
+        bank, environment, episodes = self.bank(self.scenarios), self.environment, self.episodes
+        if isinstance(episodes, StoredEpisodes):
+            shapes = Driving.shapes(cast(Driving, environment), bank)
+            return match_observations(episodes, shapes, environment.action_size)
+        if not isinstance(environment, RecordedDriving):
+            return bank
+        recorded = prepare_episodes(environment, bank, self.scenarios, episodes)
+        if recorded is None:
+            cure = "record some: drivax record"
+            raise DataError("no recorded episode is in the scenarios to train on", cure=cure)
+        return recorded
+
+    def complete(self, data: Any, rows: Rows | None = None) -> Any:
+        """Return the data of the algorithm's iterations, given those of the environment.
+
+        ``rows`` are the numbers of the scenarios that these contain; None: all.
+        """
+        weights = self.weights
+        if weights is not None and rows is not None:
+            weights = weights.reshape(len(self.scenarios), -1, weights.shape[-1])[rows]
+            weights = weights.reshape(-1, weights.shape[-1])
+        return training_data(self.config.algorithm, self.environment, data, weights)
 
 
 def recorded_environment(environment: Driving, episodes: Sequence[EpisodeTable]) -> RecordedDriving:

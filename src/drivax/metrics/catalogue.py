@@ -46,7 +46,7 @@ class Column:
         definition: One line for tables and reports.
         label: Heading; by default the name of the metric with spaces for underscores.
         kind: Scale of the values.
-        headline: Position in the first table of a report; None if it is not in that table.
+        headline: Position in printed summaries and the first table of a report; None if it is in neither.
         summarised: Whether the mean over episodes is reported.
         fails_on_crash: Whether the value is 0 if the planner crashed.
 
@@ -455,7 +455,7 @@ def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
 def _user_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
     metric = find_named(entry)
     if not isinstance(metric, Metric):
-        raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.catalogue.Metric")
+        raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.Metric")
     if name in METRICS or name in others:
         raise UsageError(f"{entry!r}: the metric {name!r} already exists", cure="choose another name")
     for input_name in metric.inputs:

@@ -207,7 +207,7 @@ class TokenRows(NamedTuple):
     value: Float[Array, "*batch rows time width"]
     mask: Bool[Array, "*batch rows time"]
 
-    def flat(self) -> tuple[Float[Array, "*batch tokens width"], Bool[Array, "*batch tokens"]]:
+    def flatten(self) -> tuple[Float[Array, "*batch tokens width"], Bool[Array, "*batch tokens"]]:
         """Return all tokens along one axis."""
         *lead, rows, times, width = self.value.shape
         return self.value.reshape(*lead, rows * times, width), self.mask.reshape(*lead, rows * times)

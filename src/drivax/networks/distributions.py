@@ -229,7 +229,7 @@ class Grid:
 
 
 @record
-class Mixture(_SquashedActions):
+class SquashedMixture(_SquashedActions):
     """``tanh`` of a mixture of diagonal Gaussians (mixture density network; Bishop 1994), which can have several modes.
 
     Samples have no gradient in the logits.
@@ -239,7 +239,7 @@ class Mixture(_SquashedActions):
     components: SquashedGaussian
 
     @classmethod
-    def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> Mixture:
+    def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> SquashedMixture:
         """Split a head's output into logits and components (:meth:`SquashedGaussian.from_parameters`)."""
         logits, flat = jnp.split(parameters, [_COMPONENTS], axis=-1)
         return cls(logits, SquashedGaussian.from_parameters(flat.reshape(*flat.shape[:-1], _COMPONENTS, -1)))
@@ -337,7 +337,7 @@ def distribution(
     """Return the distribution with a head's output as parameters."""
     if kind == "grid":
         return Grid(parameters, _levels(actions))
-    kinds = {"gaussian": SquashedGaussian, "beta": Beta, "mixture": Mixture}
+    kinds = {"gaussian": SquashedGaussian, "beta": Beta, "mixture": SquashedMixture}
     return kinds[kind].from_parameters(parameters)
 
 

@@ -248,7 +248,7 @@ class LatentEncoder(nnx.Module):
         """Return the embedding of an observation or a batch; float32."""
         tokens = []
         for name, rows in self.embedding(groups).items():
-            x, mask = (self.before[name](rows) if name in self.before else rows).flat()
+            x, mask = (self.before[name](rows) if name in self.before else rows).flatten()
             if name in self.local:
                 x = self.local[name](x, mask)
                 mask = jnp.ones(x.shape[:-1], bool)
@@ -291,7 +291,7 @@ class MtrEncoder(nnx.Module):
         tokens = self.embedding(groups)
         movers = {name: self._mover_tokens(name, tokens[name]) for name in self.mover_groups}
         x, mask = concatenate_groups(list(movers.values()))
-        map_groups = [tokens[name].flat() for name in self.map_groups]
+        map_groups = [tokens[name].flatten() for name in self.map_groups]
         map_tokens = concatenate_groups(map_groups) if map_groups else None
         for number, layer in enumerate(self.feed_forward):
             x = self.among[number](x, mask=mask)
@@ -305,5 +305,5 @@ class MtrEncoder(nnx.Module):
     def _mover_tokens(self, name: str, rows: TokenRows) -> tuple[Array, Array]:
         """Return one token per row and its mask; a series gives the mean over its times after self-attention."""
         if not self.embedding.group_shapes[name].series:
-            return rows.flat()
+            return rows.flatten()
         return masked_mean(self.time(rows.value, rows.mask), rows.mask), rows.mask.any(axis=-1)

@@ -85,5 +85,5 @@ def _adapt(candidate: Any, name: str) -> Planner:
     if is_nuplan(candidate):
         return NuplanPlanner(Host(candidate, name))
     if not isinstance(candidate, Planner):
-        raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.planner.Planner")
+        raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.Planner")
     return candidate

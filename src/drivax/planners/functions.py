@@ -32,7 +32,7 @@ _collectors: list[dict[tuple[int, int], str]] = []
 
 
 class PlannerError(Exception):
-    """A failure of a planner; its text needs no location in the user's code."""
+    """A failure of a planner, shown without a location in the user's code."""
 
 
 @record

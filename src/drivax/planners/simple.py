@@ -91,7 +91,7 @@ class ConstantVelocity(RuleBased):
 
 @record
 class ConstantSpeed(RuleBased):
-    """Keep the speed and follow the route by pure pursuit: what an untrained policy does in the space ``route``."""
+    """Keep the speed and follow the route by pure pursuit, as an untrained policy does in the space ``route``."""
 
     actions: ActionSpace = static(default=Physical())
     name: str = static(default="constant_speed")

@@ -17,7 +17,7 @@ from drivax.geometry.vectors import wrap
 from drivax.metrics import comfort
 from drivax.metrics.comfort import WINDOW, savgol_matrix
 from drivax.report.pictures.palette import Stroke, stroke
-from drivax.report.runs import Training
+from drivax.report.runs import TrainingCurves
 from drivax.scenario.schema import DT_S
 
 #: Size of a chart, and its margins other than the left one, pixels.
@@ -30,7 +30,7 @@ _MAX_POINTS = 150
 _VISIBLE = ("validation", "evaluation", "rollout")
 
 
-def curve_sections(runs: Sequence[Training]) -> str:
+def curve_sections(runs: Sequence[TrainingCurves]) -> str:
     """Return a chart of each quantity that was logged more than once.
 
     The policy's results (:data:`_VISIBLE`), or else the first six quantities, are visible, all others collapsed.
@@ -60,7 +60,7 @@ def chart(
     y_ticks = [0.0, 0.25, 0.5, 0.75, 1.0] if share and low >= 0 and high <= 1 else ticks(low, high, 5)
     last = max(float(values[:, 0].max()), x_ticks[0] + 1e-9)  # an axis needs a length above 0
     axes = Axes(x_ticks[0], last, y_ticks[0], y_ticks[-1], left=52)
-    shapes = [axes.grid_line(value, compact(value)) for value in y_ticks]
+    shapes = [axes.grid_line(value, format_compact(value)) for value in y_ticks]
     shapes += [axes.tick_label(value) for value in x_ticks if value <= axes.x1 + 1e-9]
     shapes += [
         f'<polyline {style.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
@@ -77,7 +77,7 @@ def _bin_points(points: Points) -> Float[np.ndarray[Any, Any], "bin 2"]:
     return np.stack([bin_points.mean(axis=0) for bin_points in np.array_split(points, _MAX_POINTS)])
 
 
-def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
+def _charts(names: Sequence[str], runs: Sequence[TrainingCurves]) -> str:
     """Return a chart of each quantity, with a line per run that logged it."""
     charts = []
     for name in names:
@@ -120,7 +120,7 @@ class Axes:
     def tick_label(self, value: float) -> str:
         """Return a label of the horizontal axis."""
         y = HEIGHT - _BOTTOM + 15
-        return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
+        return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{format_compact(value)}</text>'
 
     def figure(self, title: str, shapes: Iterable[str], x_label: str, subtitle: str = "") -> str:
         """Return the chart with its caption, shapes and label of the horizontal axis; ``subtitle`` is HTML."""
@@ -147,7 +147,7 @@ def ticks(low: float, high: float, maximum: int) -> list[float]:
     return [step * index for index in range(first, last + 1)]
 
 
-def compact(value: float) -> str:
+def format_compact(value: float) -> str:
     """Format a number compactly: ``1.5M``, ``20k``, ``0.25``."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
@@ -214,7 +214,7 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     levels = ticks(0.0, max(float(share.max()) for share in shares.values()), 4)
     low, high = float(edges[0]), float(edges[-1])
     axes = Axes(low, high, 0.0, levels[-1], left=44)
-    shapes = [axes.grid_line(value, f"{compact(100 * value)} %") for value in levels]
+    shapes = [axes.grid_line(value, f"{format_compact(100 * value)} %") for value in levels]
     are_integers = bool((values == np.round(values)).all())
     x_ticks = [value for value in ticks(low, high, 5) if low <= value <= high]
     shapes += [axes.tick_label(value) for value in x_ticks if not are_integers or value == round(value)]
@@ -244,7 +244,7 @@ def bins(values: Values, maximum: int = BINS) -> Values:
     return np.append(edges, edges[-1] + width) if edges[-1] <= high else edges
 
 
-def short(value: Any) -> str:
+def format_short(value: Any) -> str:
     """Format a number with three significant digits, but at most two decimals and all digits before the point."""
     value = float(value)
     if abs(value) >= 100 or value == round(value):
@@ -262,7 +262,7 @@ def _summary(values: Values) -> str:
     """Return median, maximum and number of values as text."""
     if not len(values):
         return "n 0"
-    return f"median {short(np.median(values))}, max {short(values.max())}, n {len(values):,}"
+    return f"median {format_short(np.median(values))}, max {format_short(values.max())}, n {len(values):,}"
 
 
 def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
@@ -270,7 +270,7 @@ def _bars(axes: Axes, edges: Values, shares: Values, style: Stroke) -> str:
     return "".join(
         f'<rect x="{axes.x(a) + 0.5:.1f}" y="{axes.y(share):.1f}" width="{axes.x(b) - axes.x(a) - 1:.1f}" '
         f'height="{axes.y(0) - axes.y(share):.1f}" fill="{style.colour}">'
-        f"<title>{compact(a)} to {compact(b)}: {100 * share:.3g} %</title></rect>"
+        f"<title>{format_compact(a)} to {format_compact(b)}: {100 * share:.3g} %</title></rect>"
         for a, b, share in zip(edges[:-1], edges[1:], shares, strict=True)
         if share > 0
     )

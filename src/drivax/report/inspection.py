@@ -18,7 +18,7 @@ from jaxtyping import Float
 from drivax.errors import DataError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
 from drivax.files import path_end
-from drivax.report.charts import short
+from drivax.report.charts import format_short
 from drivax.scenario.schema import DT_S, NAMES, AgentKind, Scenario
 from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
@@ -287,7 +287,8 @@ def finding_text(values: Sequence[Any]) -> str:
     if all(isinstance(value, str) for value in values):
         return _counts_text({value: values.count(value) for value in sorted(set(values))}, len(values))
     numbers = np.array(values, np.float64)
-    return f"mean {short(numbers.mean())}, median {short(np.median(numbers))}, max {short(numbers.max())}"
+    mean, median, largest = map(format_short, (numbers.mean(), np.median(numbers), numbers.max()))
+    return f"mean {mean}, median {median}, max {largest}"
 
 
 def scenarios_table(inspection: Inspection) -> Table:
@@ -333,7 +334,9 @@ def content_table(inspections: Sequence[Inspection], extra: Sequence[Row] = (), 
     for quantity in QUANTITIES:
         values_by_set = [inspection.values(quantity.read) for inspection in inspections]
         label = f"{quantity.label}, {quantity.unit}" if quantity.unit else quantity.label
-        rows.append((label, [short(values.mean()) if len(values) else MISSING for values in values_by_set]))
+        rows.append(
+            (label, [format_short(values.mean()) if len(values) else MISSING for values in values_by_set])
+        )
     names = ["", *(inspection.name for inspection in inspections)]
     return _table("sets", names, [*rows, *extra], **options)
 
@@ -415,7 +418,7 @@ def _count_text(inspection: Inspection) -> str:
 
 def _hours_text(inspection: Inspection) -> str:
     hours = inspection.hours
-    return f"{short(hours)} h" if hours >= 1 else f"{short(60 * hours)} min"
+    return f"{format_short(hours)} h" if hours >= 1 else f"{format_short(60 * hours)} min"
 
 
 def _rate_text(inspection: Inspection) -> str:

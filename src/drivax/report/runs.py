@@ -24,7 +24,7 @@ _MOST_CURVES = 10_000
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingCurves:
     """Learning curves of one training run: points (environment steps, value) by quantity.
 
     ``info`` is the content of ``run.json``.
@@ -36,7 +36,7 @@ class Training:
     curves: Mapping[str, Float[Array, "point 2"]]
 
 
-def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
+def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[TrainingCurves]]:
     """Read evaluation and training runs, with every seed of a run.
 
     An evaluation is named after its planner, a training run after its folder (a seed ``RUN/seed-N``). A repeated name
@@ -51,7 +51,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
     if not folders:
         raise UsageError("no run folder is given", cure="drivax report RUN [RUN ...]")
     if repeated := [folder for row, folder in enumerate(folders) if paths[row] in paths[:row]]:
-        raise UsageError("is named twice", file=repeated[0], cure="name each run once")
+        raise UsageError("duplicate run", file=repeated[0], cure="name each run once")
     evaluations, trainings = [], []
     # A training and the evaluation of its policy may share a name: no table holds both.
     tables, charts = dict[str, list[Path]](), dict[str, list[Path]]()
@@ -62,7 +62,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Trainin
             label = f"{path.parent.name}/{path.name}" if path.name.startswith("seed-") else path.name
             name = mark_edited(label, edited_files(folder) or run.info.get("edited"))
             name = _unique_name(name, path, charts)
-            trainings.append(Training(folder, name, run.info, curves))
+            trainings.append(TrainingCurves(folder, name, run.info, curves))
         elif run.kind == "evaluation":
             table = EpisodeTable.read(folder)
             _ = table.trajectories  # reads the file, to report damage before any work

@@ -2,8 +2,10 @@ from .arrays import recording_from_arrays as recording_from_arrays
 from .arrays import resample as resample
 from .arrays import scenario_from_arrays as scenario_from_arrays
 from .bank.scenario_bank import ScenarioBank as ScenarioBank
-from .bank.scenario_bank import Sizes as Sizes
+from .bank.sizes import Sizes as Sizes
 from .build.assemble import assemble as assemble
+from .record import record as record
+from .record import static as static
 from .recording import Event as Event
 from .recording import Light as Light
 from .recording import MapFeature as MapFeature

@@ -15,6 +15,7 @@ import numpy as np
 from drivax.errors import DataError
 from drivax.files import restore_folder
 from drivax.reading import MOST_TEXT, explain_damage, parse_json, read_bytes
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import NAMES, SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
 from drivax.seal import check_seal, require_entries
 
@@ -89,8 +90,12 @@ def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
     check_entries(manifest["shards"], manifest["scenarios"])
     if any(type(manifest[name]) is not kind for name, kind in _MANIFEST.items()):
         raise ValueError(f"{', '.join(_MANIFEST)} are missing or of another type")
-    if manifest["fields"] != field_table(Capacity(**manifest["capacity"])):
+    capacity = Capacity(**manifest["capacity"])
+    if manifest["fields"] != field_table(capacity):
         raise DataError("field table is not this version's", file=file, cure=AGAIN)
+    for shard in manifest["shards"]:
+        if "sizes" in shard:  # Sets of earlier versions have none.
+            Sizes.read(shard["sizes"], capacity)
 
 
 def check_entries(shards: Sequence[Mapping[str, Any]], scenarios: Sequence[Mapping[str, Any]]) -> None:

@@ -337,7 +337,7 @@ def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
 
 
 def is_even(timestamps_s: Float[Array, " time"]) -> bool:
-    """Whether no step differs from the median by more than 20 ms."""
+    """Return whether no step differs from the median by more than 20 ms."""
     return step_seconds(timestamps_s)[1] <= LATE_S
 
 
@@ -420,7 +420,7 @@ def _ego_position(recording: Recording) -> Float[Array, "3"]:
 def _check_extent(recording: Recording) -> Finding:
     """Refuse implausible ego and lights, which exhaust memory or float32 precision; other tracks lose such steps."""
     ego, row = _ego_position(recording), recording.ego
-    steps = np.flatnonzero(recording.tracks.valid[row] & ~plausible(recording, slice(row, row + 1))[0])
+    steps = np.flatnonzero(recording.tracks.valid[row] & ~plausible_steps(recording, slice(row, row + 1))[0])
     if len(steps):
         when = f"between steps {steps[0]} and {steps[-1]}" if len(steps) > 1 else f"at step {steps[0]}"
         return f"the ego jumps or is faster than {SPEED_MPS:.0f} m/s {when}", _UNIT_CURE
@@ -430,7 +430,7 @@ def _check_extent(recording: Recording) -> Finding:
     return None
 
 
-def plausible(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarray, "track time"]:
+def plausible_steps(recording: Recording, rows: slice = slice(None)) -> Bool[np.ndarray, "track time"]:
     """Mask of the valid steps of tracks within ``EXTENT_M`` and ``SPEED_MPS`` and without jumps.
 
     A track jumps between two observations that it could not connect at ``SPEED_MPS``. Of the pieces between jumps, the

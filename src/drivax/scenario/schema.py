@@ -159,7 +159,7 @@ class Capacity:
     lane_run: int = 160
     egos: int = 1
 
-    def lasting(self, future_s: float) -> Capacity:
+    def with_future(self, future_s: float) -> Capacity:
         """Return the capacity of scenarios with ``future_s`` seconds after the current step, 2 to 60.
 
         Each second beyond 8 s adds 40 m to the room for routes (144 km/h).
@@ -270,7 +270,7 @@ _DIGEST_DIGITS = 16
 
 
 def stored_name(text: str, size: int) -> bytes:
-    """Return a name as its field of ``size`` bytes holds it: long names end in ``~`` and digits of their SHA-256."""
+    """Encode a name in at most ``size`` bytes; a longer name is cut and ends in ``~`` and digits of its SHA-256."""
     name = text.encode()
     if len(name) <= size:
         return name
@@ -311,7 +311,7 @@ def _float_names(dtype: np.dtype[Any]) -> tuple[str, ...]:
 
 
 def find_impossible(record: Any) -> str | None:
-    """Return why a record cannot be that of a scenario, or None.
+    """Return the reason why a record cannot be a scenario, or None.
 
     Integers that size or index arrays must be within bounds, and all floating-point numbers finite.
     """

@@ -18,15 +18,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import mmap
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, reduce
 from importlib import metadata
 from io import BufferedIOBase
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any, Self, cast
 
 import numpy as np
 
@@ -45,6 +47,7 @@ from drivax.files import (
     write_json,
 )
 from drivax.reading import DAMAGE, explain_damage, read_array_header
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.manifest import (
     AGAIN,
     MANIFEST,
@@ -120,6 +123,8 @@ class ScenarioWriter:
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
         self._shards: list[dict[str, Any]] = []
+        #: Sizes of the records of the open shard.
+        self._sizes: Sizes | None = None
         self._crcs: list[int] = []
         self._file: IO[bytes] | None = None
         self._partial = PartialFolder(self.path, identity)
@@ -190,6 +195,8 @@ class ScenarioWriter:
         for name in self._buffer.dtype.names or ():
             self._buffer[name][0] = scenario.record[name]
         data = self._buffer.tobytes()
+        sizes = Sizes.of_record(self.capacity, self._buffer.reshape(()))
+        self._sizes = sizes if self._sizes is None else self._sizes.join(sizes)
         if self._file is None:
             self._file = (self._partial.content / shard_name(len(self._shards))).open("wb")
             write_header(self._file, self._buffer.dtype, 0)
@@ -210,10 +217,11 @@ class ScenarioWriter:
             sync_and_close(file)
         shard = {"file": name, "count": count, "sha256": file_digest(folder / name)}
         shard["crc_sha256"] = file_digest(folder / crc_name(name))
+        shard["sizes"] = dataclasses.asdict(cast(Sizes, self._sizes))
         summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
         self._partial.note(len(self._shards), summary)
         self._shards.append(shard)
-        self._crcs = []
+        self._crcs, self._sizes = [], None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         try:
@@ -332,6 +340,14 @@ class ScenarioSet(Sequence[Scenario]):
     def __reduce__(self) -> tuple[Any, ...]:
         return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
 
+    @cached_property
+    def sizes(self) -> Sizes:
+        """Sizes that a bank of any of the scenarios fits, from the manifest; older sets are read for them."""
+        shards = self.manifest["shards"]
+        if all("sizes" in shard for shard in shards):
+            return reduce(Sizes.join, (Sizes(**shard["sizes"]) for shard in shards))
+        return Sizes.used(iter(ScenarioSet(self.path, self.manifest, verify=False)))
+
     @property
     def hash(self) -> str:
         """SHA-256 (hex) of the digests of all shards; it does not cover the entries of the manifest (tags, audit)."""
@@ -360,6 +376,11 @@ class ScenarioSet(Sequence[Scenario]):
             data[row] = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         return out
 
+    def release(self) -> None:
+        """Unload what was read from the files, so that a pass through a large set takes little memory."""
+        for shard in self._shards:
+            shard.release()
+
     def check(self) -> None:
         """Test the CRC of every record and the SHA-256 of every shard.
 
@@ -370,6 +391,41 @@ class ScenarioSet(Sequence[Scenario]):
             for row in range(shard.count):
                 shard.record(row, verify=True)
             shard.check_digest()
+
+
+class Subset(Sequence[Scenario]):
+    """Some scenarios of a set, by their indices, read when they are used."""
+
+    def __init__(self, data: ScenarioSet, indices: Sequence[int]) -> None:
+        self.data, self.indices = data, indices
+
+    @property
+    def sizes(self) -> Sizes:
+        """Sizes that a bank of any scenario of the set fits."""
+        return self.data.sizes
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[Scenario]:
+        for first in range(0, len(self), _BATCH):
+            yield from self[first : first + _BATCH]
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return a scenario, or a list for a slice."""
+        return (
+            self.data.take(self.indices[index])
+            if isinstance(index, slice)
+            else self.data[self.indices[index]]
+        )
+
+    def take(self, rows: Iterable[int]) -> list[Scenario]:
+        """Return scenarios by their numbers in this subset, as :meth:`ScenarioSet.take`."""
+        return self.data.take(self.indices[row] for row in rows)
+
+    def release(self) -> None:
+        """Unload what was read: :meth:`ScenarioSet.release`."""
+        self.data.release()
 
 
 def check_lengths(first: ScenarioSet, *others: ScenarioSet) -> None:
@@ -394,6 +450,7 @@ class Shard:
         self.count = int(entry["count"])
         self._entry, self._scenarios, self._dtype = entry, scenarios, dtype
         self._data: _Bytes | None = None
+        self._memory: mmap.mmap | None = None
         self._crcs = np.zeros(0, np.uint32)
         self._intact = np.zeros(self.count, bool)
 
@@ -469,11 +526,17 @@ class Shard:
         if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
             raise self._checksum_file_error()
         self._crcs = np.frombuffer(crcs, np.uint32)
+        with self.path.open("rb") as file:
+            self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        data = np.frombuffer(self._memory, np.uint8, self.count * self._dtype.itemsize, offset)
         # A plain view: indexing a memmap costs Python time. Set last, since several threads may read.
-        self._data = np.asarray(
-            np.memmap(self.path, np.uint8, "r", offset, (self.count, self._dtype.itemsize))
-        )
+        self._data = data.reshape(self.count, self._dtype.itemsize)
         return self._data
+
+    def release(self) -> None:
+        """Unload the pages that were read; they are read again when they are used."""
+        if self._memory is not None:
+            self._memory.madvise(mmap.MADV_DONTNEED)
 
     def _checksum_file_error(self) -> DataError:
         return DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)

@@ -48,7 +48,7 @@ class _Problem(ValueError):
         self.cure = cure
 
 
-class Flag(str):
+class FlagText(str):
     """The text of a command-line value, parsed by the type of its setting."""
 
     __slots__ = ()
@@ -89,7 +89,7 @@ def kind_of(cls: type) -> str:
 
 def _parse_flag(value: Any) -> Any:
     """Parse the text of a command-line flag; return any other value unchanged."""
-    if not isinstance(value, Flag):
+    if not isinstance(value, FlagText):
         return value
     try:
         return parse_yaml(str(value))
@@ -98,7 +98,7 @@ def _parse_flag(value: Any) -> Any:
 
 
 def _refusal(value: Any, expected: str) -> ValueError:
-    return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {expected}")
+    return ValueError(f"{str(value) if isinstance(value, FlagText) else value!r} is not {expected}")
 
 
 def _to_scalar(value: Any, cls: Any) -> Any:
@@ -127,7 +127,7 @@ def _to_literal(value: Any, cls: Any) -> Any:
     options = get_args(cls)
     for candidate in (value, _parse_flag(value)):
         for literal in options:
-            if type(candidate) in (type(literal), Flag) and candidate == literal:
+            if type(candidate) in (type(literal), FlagText) and candidate == literal:
                 return literal
     names = [str(option) for option in options]
     quotes = "without quotes" if isinstance(value, str) else "in quotes"
@@ -173,7 +173,7 @@ def _to_union(value: Any, cls: Any) -> Any:
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
     # A flag may hold a section, {kind: ...}. Without records, leave it to the members, so that text stays text.
-    value = _parse_flag(value) if isinstance(value, Flag) and records else value
+    value = _parse_flag(value) if isinstance(value, FlagText) and records else value
     for member in members:
         if _accepts_user_objects(member) and is_dotted(_kind(value)):
             return _to_user_object(value, member)

@@ -7,6 +7,7 @@ from .potentials import collision_potential as collision_potential
 from .potentials import fault_potential as fault_potential
 from .potentials import offroad_potential as offroad_potential
 from .simulator import Simulator as Simulator
+from .simulator import is_driven as is_driven
 from .simulator import slots_of as slots_of
 from .starts import LogStart as LogStart
 from .starts import NoisyStart as NoisyStart

@@ -21,7 +21,14 @@ from drivax.simulator.contact import others_on_level
 from drivax.simulator.dynamics import pursuit
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.lights import is_red, is_yellow
-from drivax.simulator.traffic.corridor import CLOSEST, FREE_M, LEAST_GAP_M, SLOT_BITS, closest, reaching
+from drivax.simulator.traffic.corridor import (
+    CLOSEST,
+    FREE_M,
+    LEAST_GAP_M,
+    SLOT_BITS,
+    closest,
+    overlaps_rectangles,
+)
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, AgentContext, Frame
 
 #: Points ahead on the route: spacing (m), number, and number of rectangles around them.
@@ -119,7 +126,7 @@ def _leader(
     nodes = jnp.where(on_route[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
     half_m = (ego[WIDTH : WIDTH + 1] / 2 + _NEAR_M)[None]
-    is_near = reaching(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
+    is_near = overlaps_rectangles(boxes, nodes, half_m, 2.0 * _STEP_M, 2.0 * _STEP_M, _RECTANGLES)
     slots, valid = closest(is_near & others_on_level(frame, slot), ego[None], boxes)
     box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
     along, lateral, cos, sin = project(path, on_route, offsets, box[:, X:COS], box[:, COS:LENGTH])

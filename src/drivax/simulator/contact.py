@@ -109,7 +109,7 @@ def next_contacts(
     return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
 
 
-def relative(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
+def relative_poses(frame: Frame, slot: Integer) -> tuple[Array, Array, Array, Array]:
     """Return every slot's centre (ahead, left, m), and cosine and sine of its heading, in the agent's frame."""
     ego = frame.box[slot]
     dx, dy = frame.box[:, X] - ego[X], frame.box[:, Y] - ego[Y]
@@ -122,14 +122,14 @@ def classify_contacts(
     frame: Frame, slot: Integer, begins: Bool[Array, " S"], speed: Scalar, others_speed: Float[Array, " S"],
     unlawful: Bool[Array, ""],
 ) -> tuple[Bool[Array, " S"], Integer]:  # fmt: skip
-    """Return which contacts that begin at this step (mask ``begins``) are at fault, and the type of the nearest one.
+    """Return a mask of the at-fault contacts among those of ``begins``, and the type of the nearest one of ``begins``.
 
     As in nuPlan, the agent is not at fault if it is stopped. Otherwise it is at fault if the other is stopped, or if
     the other is not behind and the agent hits it with its front or is ``unlawful``: in several lanes or off the road.
     Speeds are the larger of those before and after the step.
     """
     ego = frame.box[slot]
-    ahead, left, cos, _ = relative(frame, slot)
+    ahead, left, cos, _ = relative_poses(frame, slot)
     # Behind: at a bearing of more than 150 degrees from the rear axle.
     behind = jnp.abs(left) < -_TAN_30 * (ahead + REAR_AXLE * ego[LENGTH])
     x, y = ego[X] + ego[LENGTH] / 2 * ego[COS], ego[Y] + ego[LENGTH] / 2 * ego[SIN]
@@ -159,7 +159,7 @@ def time_to_collision(frame: Frame, slot: Integer, ignored: Bool[Array, " S"]) -
     horizon is ahead or comes into the lane that the agent sweeps.
     """
     ego = frame.box[slot]
-    ahead, _, cos, sin = relative(frame, slot)
+    ahead, _, cos, sin = relative_poses(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
     is_relevant = others_on_level(frame, slot) & ~ignored & (ahead + reach > -REAR_AXLE * ego[LENGTH])
     times = time_to_overlap(ego, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)

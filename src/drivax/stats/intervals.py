@@ -233,7 +233,7 @@ def _seed_totals(
 
 
 def _draw_counts(count: int, rng: np.random.Generator) -> Labels:
-    """Return how often each of ``count`` units is drawn in ``count`` draws with replacement."""
+    """Return the number of draws of each of ``count`` units, in ``count`` draws with replacement."""
     return np.bincount(rng.integers(0, count, count), minlength=count)
 
 

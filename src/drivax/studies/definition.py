@@ -237,7 +237,7 @@ class StudyConfig:
         if not 0 < self.rare < 1:
             raise UsageError(f"rare is {self.rare}", cure="use a number between 0 and 1")
         if duplicates := [name for number, name in enumerate(self.arms) if name in self.arms[:number]]:
-            raise UsageError(f"arm {duplicates[0]!r} is named twice", cure="name each arm once")
+            raise UsageError(f"duplicate arm {duplicates[0]!r}", cure="name each arm once")
 
 
 @dataclass(frozen=True)

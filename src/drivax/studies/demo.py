@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from drivax import settings
-from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.evaluation.result_tables import paired_difference
 from drivax.evaluation.runner import EvaluationConfig, format_summary, run_evaluation
-from drivax.files import inside, write_json
+from drivax.files import check_output, inside, write_json
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -57,7 +56,7 @@ class DemoConfig:
 
 
 @dataclass(frozen=True)
-class Demo:
+class DemoResult:
     """Result of the demo: the report, a summary of each planner, the policy's paired differences, seconds by stage."""
 
     report: Path
@@ -109,7 +108,7 @@ class _Stages:
 def run_demo(
     out: Path, config: DemoConfig | None = None, log: Callable[[str], None] = lambda _: None, *,
     overwrite: bool = False,
-) -> Demo:  # fmt: skip
+) -> DemoResult:  # fmt: skip
     """Generate both sets, train, evaluate all planners and write the report.
 
     Args:
@@ -119,14 +118,12 @@ def run_demo(
         overwrite: Replace the output of an earlier demo in ``out``.
 
     Raises:
-        UsageError: ``out`` is not empty, and ``overwrite`` is false.
+        UsageError: ``out`` is a file; or it is not empty, and ``overwrite`` is false.
         DataError: A name in ``out`` is a symbolic link.
     """
     config = config or DemoConfig()
-    if out.exists() and any(out.iterdir()) and not overwrite:
-        raise UsageError(
-            "output folder already exists", file=out, cure="choose another --out or pass --overwrite"
-        )
+    is_empty = out.is_dir() and not any(out.iterdir())
+    check_output(out, overwrite or is_empty, folder=True)
     out.mkdir(parents=True, exist_ok=True)
     training_set, held_out_set = inside(out, "sets", "train"), inside(out, "sets", "held_out")
     run_folder, report_file = inside(out, "training", "policy"), inside(out, "report.html")
@@ -162,7 +159,7 @@ def run_demo(
         for name in REFERENCES
     }
     summaries = [result.summary() for result in results.values()]
-    demo = Demo(report, summaries, differences, stages.seconds())
+    demo = DemoResult(report, summaries, differences, stages.seconds())
     write_json(result_file, demo.as_json())
     return demo
 

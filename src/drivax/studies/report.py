@@ -185,7 +185,7 @@ def events_table(results: Results) -> Table:
 
 
 def critics_table(results: Results) -> Table:
-    """Return the number of seeds with healthy critics of each arm that has any, and what is wrong with the others."""
+    """Return the number of seeds with healthy critics of each arm with critics, and the problems of the others."""
     checked = {
         arm: [problems for problems in seeds if problems is not None]
         for arm, seeds in results.get("critics", {}).items()

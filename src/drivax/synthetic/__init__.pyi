@@ -1,1 +1,10 @@
+from .domains import DOMAINS as DOMAINS
+from .domains import Domain as Domain
+from .generate import FamilyCount as FamilyCount
+from .generate import GeneratedSet as GeneratedSet
 from .generate import Generation as Generation
+from .generate import generate_benchmark as generate_benchmark
+from .world import GeneratedRecording as GeneratedRecording
+from .world import WorldConfig as WorldConfig
+from .world import generate_many as generate_many
+from .world import generate_recording as generate_recording

@@ -74,11 +74,11 @@ class Generation:
     Attributes:
         workers: Number of worker processes. With 0 this process draws the scenarios, and their last bits depend on the
             processor: only workers write the same bytes on any x86-64 processor.
-        capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
-        future_s: Seconds of a scenario after its current step, 8 to 60; events are staged in the first 8.
-        egos: Largest number of vehicles per scenario with a route and a goal, 1 to 8 (``scenario.build.assemble``).
-        split: Percentages of train/validation/test, such as 80/10/10, for lists in ``splits/``, by map; None: no lists.
-        overwrite: Replace an existing scenario set.
+        capacity: Padded sizes; sets that are used together need the same.
+        future_s: Seconds of a scenario after its current step, 8 to 60; 15 in nuPlan's challenges.
+        egos: Vehicles per scenario with a route and a goal, 1 to 8, which training with `egos: moving` drives.
+        split: Write lists for train/validation/test to OUT/splits, by map: percentages, such as 80/10/10.
+        overwrite: Replace OUT if it is a scenario set.
         world: Settings of the world.
     """
 
@@ -110,7 +110,7 @@ class Generation:
     @property
     def sizes(self) -> Capacity:
         """Padded sizes of a scenario with these options."""
-        return CAPACITIES[self.capacity].lasting(self.future_s).with_egos(self.egos)
+        return CAPACITIES[self.capacity].with_future(self.future_s).with_egos(self.egos)
 
     @property
     def shares(self) -> Shares | None:
@@ -318,7 +318,7 @@ def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, N
 
 
 @dataclass(frozen=True)
-class Split:
+class BenchmarkSplit:
     """One of the benchmark's sets; without a ``rare_rate`` it has the configuration's share of events."""
 
     scenarios: int
@@ -326,12 +326,12 @@ class Split:
     rare_rate: float | None = None
 
 
-SPLITS: Mapping[str, Split] = MappingProxyType(
+SPLITS: Mapping[str, BenchmarkSplit] = MappingProxyType(
     {
-        "train": Split(4096, RESERVED_SEED),
-        "validation": Split(512, RESERVED_SEED + 1),
-        "test": Split(1024, RESERVED_SEED + 2),
-        "test-rare": Split(512, RESERVED_SEED + 3, rare_rate=1.0),
+        "train": BenchmarkSplit(4096, RESERVED_SEED),
+        "validation": BenchmarkSplit(512, RESERVED_SEED + 1),
+        "test": BenchmarkSplit(1024, RESERVED_SEED + 2),
+        "test-rare": BenchmarkSplit(512, RESERVED_SEED + 3, rare_rate=1.0),
     }
 )
 

@@ -87,7 +87,7 @@ _Pairs = Int64[np.ndarray, " pair"]
 
 
 def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
-    """Return the visibility mask of tracks (:func:`visible`); vehicles occlude other users."""
+    """Return the visibility mask of tracks (:func:`find_visible`); vehicles occlude other users."""
     order = np.concatenate(([ego], np.delete(np.arange(len(tracks.kind)), ego)))
     heading, size = tracks.heading[order], tracks.size[order]
     box = np.concatenate(
@@ -95,11 +95,11 @@ def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "t
     )
     blocks = tracks.kind[order] == AgentKind.VEHICLE
     is_visible = np.empty(tracks.valid.shape, bool)
-    is_visible[order] = visible(box, size[..., 2].max(axis=1), tracks.valid[order], blocks, config)
+    is_visible[order] = find_visible(box, size[..., 2].max(axis=1), tracks.valid[order], blocks, config)
     return is_visible
 
 
-def visible(
+def find_visible(
     box: _Boxes, height_m: _PerUser, valid: _Visible, blocks: Bool[np.ndarray, " user"], config: SensorConfig
 ) -> _Visible:
     """Mask of users in the sensor's range with a clear line of sight to the centre or a corner; ego sees itself.
@@ -177,14 +177,14 @@ def _cuts(
 
 
 def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
-    """Return the largest distance by which :func:`noisy` can move a corner of a box, m (for small heading errors)."""
+    """Return the largest shift of a box corner by :func:`add_perception_noise`, m (for small heading errors)."""
     maximum = _MAX_SIGMA * config.level
     turn = maximum * config.heading_rad
     along = maximum * config.along_m + turn * width_m / 2
     return float(np.hypot(along, maximum * config.across_m + turn * length_m / 2))
 
 
-def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
+def add_perception_noise(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
     """Add perception noise to all tracks but ego's.
 
     Errors are zero-mean AR(1) processes, clipped at three standard deviations. Below 2 m/s they shrink linearly, to a

@@ -37,11 +37,11 @@ from drivax.synthetic.expert.violations import EGO_SKIN_M
 from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, add_perception_noise, largest_shift_m, sight
 from drivax.synthetic.traffic.placement import LARGEST_VEHICLE_M
 from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
-from drivax.synthetic.traffic.simulation import Run, Traffic, run_all
+from drivax.synthetic.traffic.simulation import Run, WorldTraffic, run_all
 
 #: Increased when the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
@@ -235,7 +235,7 @@ def _attempt(
     times = (np.arange(_WARM_UP + inputs.steps + _MAX_DELAY_STEPS * critical) - _WARM_UP) * DT_S
     shares = config.lane_change_share, config.signal_timing
     roles = assign_roles(inputs.network, domain, times, *shares, rng, inputs.destinations, critical)
-    traffic = Traffic(roles, times)
+    traffic = WorldTraffic(roles, times)
     if inputs.event:
         result = yield from _stage_event(inputs, traffic, rng)
     else:
@@ -244,7 +244,7 @@ def _attempt(
 
 
 def _drive_without_event(
-    traffic: Traffic, steps: int, critical: bool, rng: np.random.Generator
+    traffic: WorldTraffic, steps: int, critical: bool, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
     """Return a recording without perception noise, or the cause of its rejection.
 
@@ -261,9 +261,9 @@ def _drive_without_event(
 
 
 def _stage_event(
-    inputs: _AttemptInputs, traffic: Traffic, rng: np.random.Generator
+    inputs: _AttemptInputs, traffic: WorldTraffic, rng: np.random.Generator
 ) -> Generator[Run, Motion, Recording | str]:
-    """Return a recording of the event without perception noise, or why none was staged or the last was rejected."""
+    """Return a recording of the event without perception noise, or the reason for none: no occasion, or a rejection."""
     view, cause = EgoView(traffic.roles, (yield Run(traffic)), _WARM_UP), _NO_OCCASION
     for _ in range(_STAGINGS):
         staged = stage(inputs.event, view, inputs.severity_mps2, rng)
@@ -281,10 +281,10 @@ def _add_perception(recording: Recording, config: WorldConfig, rng: np.random.Ge
     """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
     is_visible = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=is_visible)
+    return replace(recording, tracks=add_perception_noise(tracks, ego, rng, config.noise), seen=is_visible)
 
 
-def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
+def _critical_step(traffic: WorldTraffic, motion: Motion, rng: np.random.Generator) -> int | None:
     """Draw one of the candidate first steps that are critical (:func:`critical_steps`), if there is one."""
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):

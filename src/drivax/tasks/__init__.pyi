@@ -8,6 +8,7 @@ from .actions import Trajectory as Trajectory
 from .conditions import Condition as Condition
 from .features import Features as Features
 from .features import View as View
+from .features import feature_names as feature_names
 from .observations import ObservationConfig as ObservationConfig
 from .observations import OwnGroup as OwnGroup
 from .observations import observe as observe

@@ -100,7 +100,7 @@ class Physical:
         """Return the motion one step later."""
         return bicycle(motion, *self.command(action, length_m))
 
-    def sharpest(self, length_m: Any) -> Any:
+    def max_curvature(self, length_m: Any) -> Any:
         """Return the largest curvature, 1/m."""
         return self._curvature(jnp.asarray(self.steering), length_m)
 
@@ -295,7 +295,7 @@ class DeltaLocal:
         shift = action[:2] * jnp.array([self.ahead_m, self.left_m])
         return displace(motion, shift, action[2] * self.turn_rad)
 
-    def sharpest(self, length_m: Any) -> Any:
+    def max_curvature(self, length_m: Any) -> Any:
         """Return infinity: the curvature is unlimited."""
         return jnp.inf
 
@@ -336,7 +336,7 @@ class DirectState:
         """Return the motion one step later."""
         return self.actuate(motion, action, action, length_m)
 
-    def sharpest(self, length_m: Any) -> Any:
+    def max_curvature(self, length_m: Any) -> Any:
         """Return infinity: the curvature is unlimited."""
         return jnp.inf
 
@@ -419,7 +419,7 @@ class Trajectory:
             motion, action[:3], jnp.maximum(length_m, _LEAST_LENGTH_M), self.controller
         )
 
-    def sharpest(self, length_m: Any) -> Any:
+    def max_curvature(self, length_m: Any) -> Any:
         """Return the largest curvature of the rear axle, 1/m."""
         return math.tan(self.controller.most_steering) / (
             self.controller.wheelbase * jnp.maximum(length_m, _LEAST_LENGTH_M)

@@ -111,14 +111,14 @@ def fix_conditions(conditions: Conditions, values: Mapping[str, float] | None = 
     """Return the conditions fixed at ``values`` by name, or else at their own value.
 
     Raises:
-        UsageError: A value is out of range, or there is no condition of its name.
+        UsageError: A value is out of range, or its name is unknown.
     """
     values = values or {}
     names = [condition.name for condition in conditions]
     for name in values:
         if name not in names:
             cure = did_you_mean(name, names) if names else "this planner has no conditions"
-            raise UsageError(f"there is no condition {name!r}", cure=cure)
+            raise UsageError(f"unknown condition {name!r}", cure=cure)
     return tuple(replace(c, value=values.get(c.name, c.value), fixed=True) for c in conditions)
 
 

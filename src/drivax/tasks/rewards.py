@@ -92,9 +92,14 @@ def _event(condition: Bool[Array, ""]) -> Scalar:
     return condition.astype(jnp.float32)
 
 
-def _event_term(name: str, fact: str) -> None:
-    """Register a term that is 1 at the steps at which a boolean fact holds."""
-    TERMS[name] = RewardTerm(lambda before, now, around: _event(getattr(now, fact)), frozenset({fact}))
+def _event_term(name: str, fact: str, documentation: str) -> None:
+    """Register a term with a docstring that is 1 at the steps at which a boolean fact holds."""
+
+    def term(before: Facts, now: Facts, around: Surroundings) -> Scalar:
+        return _event(getattr(now, fact))
+
+    term.__name__, term.__doc__ = name, documentation
+    reward_term(fact)(term)
 
 
 @reward_term("collision", option="collision_margin_m")
@@ -103,10 +108,9 @@ def collision(before: Facts, now: Facts, around: Surroundings, collision_margin_
     return _event(now.collision | (now.gap_m < collision_margin_m) if collision_margin_m else now.collision)
 
 
-# 1 while a corner is off the road, at a step that runs a red light, and while off the corridor of the route.
-_event_term("offroad", "offroad")
-_event_term("red_light", "red_light")
-_event_term("off_route", "off_route")
+_event_term("offroad", "offroad", "1 while a corner is off the road.")
+_event_term("red_light", "red_light", "1 at a step that runs a red light.")
+_event_term("off_route", "off_route", "1 while off the corridor of the route.")
 
 
 @reward_term("routed", "progress_m")
@@ -173,8 +177,7 @@ def close(before: Facts, now: Facts, around: Surroundings, close_m: float = 1.0)
     return _event(now.gap_m < close_m)
 
 
-# 1 while in a lane against its direction.
-_event_term("wrong_way", "wrong_way")
+_event_term("wrong_way", "wrong_way", "1 while in a lane against its direction.")
 
 
 @reward_term("straddling")
@@ -208,10 +211,14 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Scalar:
     return _event(now.routed & (now.goal_distance_m <= _GOAL_M) & (before.goal_distance_m > _GOAL_M))
 
 
-# 1 at a step that enters a neighbouring lane of the same direction, and 1 at a step that leaves a lane which, within
-# 100 m, ends or joins the new lane (``scenario.bank.queries.lane_passage``).
-_event_term("lane_change", "lane_changed")
-_event_term("merge", "merged")
+_event_term(
+    "lane_change", "lane_changed", "1 at a step that enters a neighbouring lane of the same direction."
+)
+_event_term(
+    "merge", "merged",
+    "1 at a step that leaves a lane which, within 100 m, ends or joins the new lane "
+    "(``scenario.bank.queries.lane_passage``).",
+)  # fmt: skip
 
 
 @reward_term("late_m", "early_m", softened=True)
@@ -258,8 +265,9 @@ def time_gap_shortfall(before: Facts, now: Facts, around: Surroundings, time_gap
     return now.ttc_defined * shortfall
 
 
-# 1 at a step at which a collision begins that is the agent's fault.
-_event_term("at_fault_collision", "at_fault")
+_event_term(
+    "at_fault_collision", "at_fault", "1 at a step at which a collision begins that is the agent's fault."
+)
 
 #: Terms that lower a softened term, and the share by which each lowers it at 1; at least 0.358 of the term remains.
 SOFT_FACTORS = {"urgency": 0.3, "discomfort": 0.2, "speeding": 0.2, "route_offset": 0.2}

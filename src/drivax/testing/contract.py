@@ -92,7 +92,7 @@ def result_shapes(what: str, function: Callable[..., Any], *arguments: Any) -> A
         return jax.eval_shape(function, *arguments)
 
 
-class Program:
+class BatchedFunction:
     """A compiled and batched function, called ``what`` in messages; ``in_axes`` as in ``jax.vmap``."""
 
     def __init__(
@@ -111,7 +111,7 @@ class Program:
         what, results = self.what, self(*arguments)
         repeated_results = program(what, self._batched)(*arguments)
         cure = "use no random numbers but those of a fixed key, and keep no state between calls"
-        expect(same(results, repeated_results, 0.0), f"{what} is not deterministic", cure)
+        expect(are_same(results, repeated_results, 0.0), f"{what} is not deterministic", cure)
         first_row = [
             argument if axis is None else jax.tree.map(lambda leaf: leaf[0], argument)
             for argument, axis in zip(arguments, self.in_axes, strict=True)
@@ -119,10 +119,10 @@ class Program:
         first_result = jax.tree.map(lambda leaf: leaf[0], results)
         single_result = program(what, self.function)(*first_row)
         cure = "write it for one agent in one scenario; vmap adds the batch"
-        expect(same(first_result, single_result, TOLERANCE), f"{what} differs in a batch", cure)
+        expect(are_same(first_result, single_result, TOLERANCE), f"{what} differs in a batch", cure)
         eager_result = jax.device_get(self.function(*first_row))
         cure = "let the result depend on the arguments only"
-        expect(same(first_result, eager_result, TOLERANCE), f"{what} differs when compiled", cure)
+        expect(are_same(first_result, eager_result, TOLERANCE), f"{what} differs when compiled", cure)
         return results
 
 
@@ -146,7 +146,7 @@ def check_variants(
 
 def check_same(what: str, result: Any, other: Any, cause: str, cure: str) -> None:
     """Check that two results agree at all moments; ``cause`` completes the message "changes when"."""
-    expect(same(result, other, TOLERANCE), f"{what} changes when {cause}", cure)
+    expect(are_same(result, other, TOLERANCE), f"{what} changes when {cause}", cure)
 
 
 def check_rotated(what: str, result: Any, rotated: Any) -> None:
@@ -163,7 +163,7 @@ def check_rotated(what: str, result: Any, rotated: Any) -> None:
     )
 
 
-def same(left: Any, right: Any, tolerance: float) -> bool:
+def are_same(left: Any, right: Any, tolerance: float) -> bool:
     """Return whether two trees have the same structure and shapes, and values within a tolerance or both NaN."""
     if jax.tree.structure(left) != jax.tree.structure(right):
         return False

@@ -20,12 +20,12 @@ from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     TOLERANCE,
+    are_same,
     check_numbers,
     expect,
     instance,
     layout,
     program,
-    same,
 )
 
 #: Groups with up to two row axes, with and without masks; one group of the second specification has no rows.
@@ -96,7 +96,7 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
         "keep nnx.Param only: no dropout, no running means",
     )
     rebuilt = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
-    is_repeatable = same(jax.device_get(parameters), jax.device_get(rebuilt), 0.0)
+    is_repeatable = are_same(jax.device_get(parameters), jax.device_get(rebuilt), 0.0)
     expect(is_repeatable, f"{what} has other initial parameters every time", "draw them from rngs")
 
 
@@ -109,7 +109,7 @@ def _check_batches(
     """
     single, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), encoders
     for result in (encoder(single), run(jax.tree.map(lambda leaf: leaf[None, None], single))[0, 0]):
-        valid = same(embedding[0], jax.device_get(result), tolerance)
+        valid = are_same(embedding[0], jax.device_get(result), tolerance)
         expect(valid, f"{what} differs in a batch", "use the last axes; any axes may lead")
     spread = np.abs(embedding - embedding[:1]).max()
     expect(spread > 0, f"{what} embeds all observations equally", "let it read the groups")
@@ -121,7 +121,7 @@ def _check_masks(what: str, run: Any, batch: Any, embedding: Any, tolerance: flo
         for name, rows in batch.items()
         if f"{name}_mask" in batch
     }
-    is_unchanged = same(embedding, run(batch | garbage), tolerance)
+    is_unchanged = are_same(embedding, run(batch | garbage), tolerance)
     cure = "use jnp.where(mask[..., None], rows, 0) first, and mask after each bias"
     expect(is_unchanged, f"{what} changes with masked rows", cure)
     check_numbers(f"{what} without rows", run(_without_rows(batch)), "a mean or softmax over no rows")
@@ -150,7 +150,9 @@ def _check_effects(what: str, run: Any, batch: Any, embedding: Any, others: Any)
         if rows.size and not name.endswith("_mask"):
             mask = batch.get(f"{name}_mask", jnp.ones(rows.shape[:-1], bool))
             result = run(batch | {name: jnp.where(mask[..., None], others[name], rows)})
-            expect(not same(embedding, result, 0.0), f"{what} ignores the group {name!r}", "read all groups")
+            expect(
+                not are_same(embedding, result, 0.0), f"{what} ignores the group {name!r}", "read all groups"
+            )
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:
@@ -186,12 +188,12 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     second, logs = iterate(data, first)
     before, after = int(stored_state.iteration), int(second.iteration)
     expect(after == before + 1, f"{what} counts from iteration {before} to {after}", "add one")
-    is_unchanged = same(jax.device_get(second.parameters), jax.device_get(stored_state.parameters), 0.0)
+    is_unchanged = are_same(jax.device_get(second.parameters), jax.device_get(stored_state.parameters), 0.0)
     cure = "return the new parameters, and set any warm-up to 0 for the check"
     expect(not is_unchanged, f"{what} learns nothing in an iteration", cure)
     _check_logs(what, logs)
     repeated_state, _ = iterate(data, jax.tree.map(jnp.copy, stored_state))
-    valid = same(_host_arrays(repeated_state), _host_arrays(second), 0.0)
+    valid = are_same(_host_arrays(repeated_state), _host_arrays(second), 0.0)
     cure = "keep keys and all other inputs of an iteration in the state"
     expect(valid, f"{what} does not repeat an iteration bit for bit", cure)
     third, logs = iterate(data, second)
@@ -230,7 +232,7 @@ def _check_planner(
     keys = jax.random.key(0), jax.random.key(1)
     for samples in (False, True):
         planner = learner.planner(parameters, "checked", samples)
-        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see planners.planner.Planner")
+        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see drivax.planners.Planner")
         first, second = (np.asarray(act(planner, bank, key)) for key in keys)
         valid = first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all()
         expect(valid, f"{what} returns action {first}", "return two numbers in [-1, 1]")

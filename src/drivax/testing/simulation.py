@@ -27,7 +27,8 @@ from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
     TOLERANCE,
-    Program,
+    BatchedFunction,
+    are_same,
     array_type,
     check_numbers,
     check_rotated,
@@ -37,7 +38,6 @@ from drivax.testing.contract import (
     layout,
     program,
     result_shapes,
-    same,
 )
 from drivax.testing.worlds import ANGLE
 
@@ -67,20 +67,22 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
     """
     planner = make_planner(planner) if isinstance(planner, str) else planner
     valid = isinstance(planner, Planner) and not isinstance(planner, type)
-    cure = "give it name, replays, init and act (planners.planner.Planner)"
+    cure = "give it name, replays, init and act (drivax.planners.Planner)"
     expect(valid, f"{planner!r} is not a planner", cure)
     what = f"planner {planner.name!r}"
     simulator, bank = Simulator(evaluation_task(task or Task())), worlds.worlds()
     _check_layout(what, simulator, planner, bank)
     index, step = (axis.ravel() for axis in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     act = _two_actions(simulator, planner)
-    run = Program(what, act, (None, 0, 0))
+    run = BatchedFunction(what, act, (None, 0, 0))
     actions = run(bank, index, step)
     check_numbers(what, actions)
     check_numbers(what, run(worlds.without_others(bank), index, step))
     result = program(what, act)(bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
     cure = "write it for one agent in one scenario, take randomness from the key, and keep no state between calls"
-    expect(same(actions[0], result, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure)
+    expect(
+        are_same(actions[0], result, TOLERANCE), f"{what} differs in a batch or is not deterministic", cure
+    )
     check_variants(what, actions, worlds.BANK_VARIANTS, lambda change: run(change(bank), index, step))
     check_rotated(what, actions, run(worlds.worlds(ANGLE), index, step))
     if not privileged:
@@ -152,7 +154,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     what = f"traffic {traffic.name!r}"
     bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
-    index, run = jnp.arange(len(bank)), Program(what, _roll_out(traffic), (None, 0))
+    index, run = jnp.arange(len(bank)), BatchedFunction(what, _roll_out(traffic), (None, 0))
     rollout: _Rollout = run.check_pure(bank, index)
     _check_rows(what, rollout)
 

@@ -22,7 +22,7 @@ from drivax.tasks.rewards import Term
 from drivax.tasks.task import Task
 from drivax.testing import worlds
 from drivax.testing.contract import (
-    Program,
+    BatchedFunction,
     array_type,
     check_numbers,
     check_rotated,
@@ -111,7 +111,7 @@ def check_feature(feature: Feature | str) -> None:
         _check_form(what, function(bank, context, frames))
         return group.observe(bank, context, frames)
 
-    program = Program(what, observe, (None, 0))
+    program = BatchedFunction(what, observe, (None, 0))
     bank, contexts = worlds.worlds(), worlds.moments().situation.context
     results = program.check_pure(bank, contexts)
     check_numbers(what, results)
@@ -147,7 +147,7 @@ def _check_form(what: str, rows: Any) -> None:
 
 
 def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = False) -> None:
-    moments, program = worlds.moments(), Program(what, value)
+    moments, program = worlds.moments(), BatchedFunction(what, value)
     results = program.check_pure(moments)
     number = np.asarray(results[0] if isinstance(results, tuple) else results)
     if delayed:
@@ -172,7 +172,7 @@ def _check_moments(what: str, value: Callable[[Moments], Any], delayed: bool = F
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
     """Check that a value can be computed from its declared facts alone."""
     try:
-        Program(what, value)(worlds.without_facts(worlds.moments(), reads))
+        BatchedFunction(what, value)(worlds.without_facts(worlds.moments(), reads))
     except (AttributeError, TypeError, ValueError) as error:
         expect(False, f"{what} reads a fact that 'reads' does not declare ({error})", "add it to reads")
 
@@ -188,13 +188,13 @@ def _check_computed(what: str, metric: Metric) -> None:
         step_value = Value(number, defined)
         return compute(end, step_value, dict.fromkeys(metric.inputs, step_value))
 
-    program = Program(what, value, (0, 0, 0))
+    program = BatchedFunction(what, value, (0, 0, 0))
     for defined in (True, False):
         rows = (jnp.arange(12) % len(bank), jnp.linspace(0.0, 1.0, 12), jnp.full(12, defined))
         result = program.check_pure(*rows) if defined else program(*rows)
         valid = isinstance(result, Value) and result.value.shape == result.defined.shape == (12,)
         valid = valid and result.defined.dtype == bool
-        cure = "return drivax.metrics.steps.Value(number, defined)"
+        cure = "return drivax.metrics.Value(number, defined)"
         expect(valid, f"{what} does not compute a Value of one number and one boolean", cure)
         check_numbers(what, jax.tree.map(lambda leaf, d=result.defined: np.where(d, leaf, 0.0), result.value))
 
@@ -226,7 +226,7 @@ def check_criticality(method: Callable[[ScenarioBank, LoggedScenario], dict[str,
             expect(is_right, problem, "return a number for every step of the log")
         return values
 
-    program, bank = Program(what, components, (None, 0)), worlds.worlds()
+    program, bank = BatchedFunction(what, components, (None, 0)), worlds.worlds()
     rows = jnp.arange(len(bank))
     result = program.check_pure(bank, rows)
     check_numbers(what, result)

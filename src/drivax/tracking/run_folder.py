@@ -377,7 +377,7 @@ def machine() -> dict[str, Any]:
 
 
 def kernels_difference(info: Mapping[str, Any]) -> str | None:
-    """Return which native kernels a run (by its ``run.json``) and this process use; None if they are the same."""
+    """Describe the native kernels of a run (by its ``run.json``) and of this process; None if they are the same."""
     run_machine = info.get("machine")
     run_state = run_machine.get("kernels", "none") if isinstance(run_machine, dict) else "none"
     before, now = (

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int
 from drivax.datasets import parsing
 from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import Kind, Table, Words, read_table
+from drivax.datasets.argoverse.tables import ArrowTable, Kind, Words, read_table
 from drivax.datasets.parsing import lift, place_tags
 from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
@@ -141,7 +141,7 @@ def _per_track(values: Array, names: Words) -> Array:
     return values[first]
 
 
-def _tracks(table: Table) -> tuple[Tracks, int]:
+def _tracks(table: ArrowTable) -> tuple[Tracks, int]:
     """Return all tracks in order of appearance, with z = 0, and the row of the ego."""
     names, step = table.texts["track_id"], table.numbers["timestep"]
     if EGO not in names.words:
@@ -191,7 +191,7 @@ def _track_ids(names: tuple[str, ...]) -> Int[Array, " track"]:
     return np.arange(len(names), dtype=np.int64)
 
 
-def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
+def _timestamps(table: ArrowTable, steps: int) -> Float64[Array, " step"]:
     """Return evenly spaced times of all steps, seconds, from the file's first and last time and their number."""
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1

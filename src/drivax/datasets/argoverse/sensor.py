@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from drivax.datasets import parsing
 from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import Kind, Table, read_table
+from drivax.datasets.argoverse.tables import ArrowTable, Kind, read_table
 from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description, attempt, read_head
 from drivax.errors import DataError
@@ -149,7 +149,7 @@ def decode(path: Path) -> Recording:
     )
 
 
-def _frame_times(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
+def _frame_times(boxes: ArrowTable, poses: ArrowTable) -> tuple[Int[Array, " step"], int]:
     """Return the timestamps of frames that have a pose, and the number of frames without one."""
     frames = np.unique(boxes.numbers["timestamp_ns"])
     has_pose = np.isin(frames, poses.numbers["timestamp_ns"])
@@ -158,7 +158,7 @@ def _frame_times(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
     return frames[has_pose], int((~has_pose).sum())
 
 
-def _tracks(boxes: Table, poses: Table, times_ns: Int[Array, " step"]) -> tuple[Tracks, int]:
+def _tracks(boxes: ArrowTable, poses: ArrowTable, times_ns: Int[Array, " step"]) -> tuple[Tracks, int]:
     """Return all tracks, ego in row 0 and valid at every step, and the number of repeated boxes.
 
     Positions are in the city's frame. Of several boxes of a track at the same time, the last one counts.
@@ -193,7 +193,7 @@ def _tracks(boxes: Table, poses: Table, times_ns: Int[Array, " step"]) -> tuple[
     return tracks, repeated
 
 
-def _poses(poses: Table, times_ns: Int[Array, " step"]) -> Float[Array, "step 7"]:
+def _poses(poses: ArrowTable, times_ns: Int[Array, " step"]) -> Float[Array, "step 7"]:
     """Return the pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
     stamps, rows = np.unique(poses.numbers["timestamp_ns"], return_index=True)
     pose = poses.stack(_POSE)[rows[np.searchsorted(stamps, times_ns)]]
@@ -202,7 +202,7 @@ def _poses(poses: Table, times_ns: Int[Array, " step"]) -> Float[Array, "step 7"
     return pose
 
 
-def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
+def _boxes(boxes: ArrowTable, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
     """Return boxes in the city's frame: x, y, z, heading, length, width, height."""
     table = boxes.stack((*_POSE, *_SIZE))[rows]
     parsing.check_within(tables.FARTHEST_M, table[:, 4:7])
@@ -212,7 +212,7 @@ def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) 
     return np.column_stack((rotate(pose[:, :4], table[:, 4:7]) + pose[:, 4:], heading, table[:, 7:]))
 
 
-def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
+def _ego(boxes: ArrowTable, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
     """Return the ego's boxes with the columns of :func:`_boxes`."""
     # Some logs hold boxes of the ego: use only their sizes, because their centres are at the rear axle, too.
     size = np.median(boxes.stack(_SIZE)[rows], axis=0) if len(rows) else np.array(tables.EGO_SIZE)

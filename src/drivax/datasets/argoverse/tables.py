@@ -68,7 +68,7 @@ class Words:
 
 
 @dataclass(frozen=True)
-class Table:
+class ArrowTable:
     """Columns of a table by name: float64 or int64 arrays, and texts; ``unread`` names the other columns."""
 
     rows: int
@@ -81,7 +81,7 @@ class Table:
         return np.stack([self.numbers[name] for name in names], axis=1).astype(np.float64)
 
 
-def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
+def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] = ()) -> ArrowTable:
     """Read columns of a parquet or feather file; ``columns`` gives the kind of each by name.
 
     ``optional`` columns, which not every version of the format has, may be missing from the file.
@@ -109,7 +109,7 @@ def read_table(path: Path, columns: Mapping[str, Kind], optional: Sequence[str] 
         if isinstance(error, OSError) and (failure := explain_system(error, path)):
             raise failure from error
         raise DataError(f"is not a valid table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
-    return Table(table.num_rows, numbers, texts, unread)
+    return ArrowTable(table.num_rows, numbers, texts, unread)
 
 
 def _load(path: Path, columns: Mapping[str, Kind], optional: Sequence[str]) -> tuple[Any, frozenset[str]]:

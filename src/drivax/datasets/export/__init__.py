@@ -1,1 +1,5 @@
 """Writers of other programs' formats, and subsets of scenario sets."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -69,7 +69,7 @@ PATHS = {"vmax": Paths(10, 300, 1.0), "published": Paths(10, 500, 0.5)}
 def tf_example(
     scenario: Scenario, paths: Paths = PATHS["vmax"]
 ) -> tuple[dict[str, bytes | _Array], Counter[str]]:
-    """Return the features of a scenario and counts of what did not fit, both by name.
+    """Return the features of a scenario, and the counts of elements that did not fit, both by name.
 
     Coordinates are the source's (float32, as in the data set) where all are below 16,384 m, else relative to ego at the
     current step: UTM coordinates would be rounded to half a metre. ``scenario/origin`` then holds that position as

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_set_space
@@ -32,15 +32,15 @@ class Export:
 
     Attributes:
         format: ``set`` (a scenario set), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
-        filters: Conditions that must all hold (``scenario.select.selection``).
-        ids: File of scenario ids, one per line, or ``dataset<TAB>id``; None: all.
-        limit: Write only the first N of the selected scenarios; None: all.
-        paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
+        filters: Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); can be repeated.
+        ids: Only scenarios named in this file: one id per line, or data set, tab and id (a split file).
+        limit: At most N scenarios.
+        paths: Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m.
         shard_size: Scenarios per TFRecord shard.
-        overwrite: Replace an existing set (by a set) or export (by another format); other folders are never replaced.
+        overwrite: Replace OUT if it is an earlier export (or a scenario set, for the format set).
     """
 
-    format: Literal["set", "tfexample", "gpudrive"] = "set"
+    format: str = "set"
     filters: tuple[str, ...] = ()
     ids: Path | None = None
     limit: int | None = None
@@ -52,7 +52,7 @@ class Export:
         """Check the options."""
         for name, choices in (("format", ("set", *_WRITERS)), ("paths", tuple(PATHS))):
             if (value := getattr(self, name)) not in choices:
-                raise UsageError(f"there is no {name} {value!r}", cure=f"use one of {', '.join(choices)}")
+                raise UsageError(f"unknown {name} {value!r}", cure=did_you_mean(value, choices))
         for name in ("limit", "shard_size"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -61,7 +61,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Exported:
-    """The written folder, numbers of scenarios and of their files, and nonzero counts of what did not fit by name."""
+    """Result of an export: folder, numbers of scenarios and files, and counts of elements that did not fit, by name."""
 
     path: Path
     scenarios: int
@@ -121,7 +121,7 @@ def write_part(
         further: Called with the folder of the complete set before it gets its name, to add files.
 
     Raises:
-        UsageError: ``out`` exists and may not be replaced, or is the set that is read.
+        UsageError: ``out`` exists and may not be replaced, or is the input set.
     """
     refuse_part(scenarios, out)
     part = {"set": scenarios.path.name, "hash": scenarios.hash, **(selection or {})}
@@ -136,9 +136,9 @@ def write_part(
 
 
 def refuse_part(scenarios: ScenarioSet, out: Path) -> None:
-    """Raise a UsageError if ``out`` is the set that is read."""
+    """Raise a UsageError if ``out`` is the input set."""
     if out.exists() and out.resolve() == scenarios.path.resolve():
-        raise UsageError("is the set that is read", file=out, cure="choose another name")
+        raise UsageError("is the input set", file=out, cure="choose another output")
 
 
 @dataclass(frozen=True)

@@ -338,7 +338,7 @@ class _MapDecoder:
         if layer is None:
             return []
         forward = _transformer(layer.epsg, self.city.epsg, self.city.path)
-        return layer.touching(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
+        return layer.query_box(forward.transform_bounds(*self._box, direction="INVERSE")).tolist()
 
     def types(self, name: str) -> dict[int, int | None]:
         """Return the type of each feature around the drive by row, from the only column of the layer."""

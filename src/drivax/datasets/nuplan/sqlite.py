@@ -168,7 +168,7 @@ class Layer:
     bounds: Float64[np.ndarray, "feature 4"]
     columns: Mapping[str, tuple[Any, ...]]
 
-    def touching(self, box: tuple[float, float, float, float]) -> Int64[np.ndarray, " row"]:
+    def query_box(self, box: tuple[float, float, float, float]) -> Int64[np.ndarray, " row"]:
         """Return the rows whose bounds touch a box (west, south, east, north)."""
         west, south, east, north = box
         low, high = self.bounds[:, :2], self.bounds[:, 2:]

@@ -174,7 +174,7 @@ class _Machine:
 
 def _fill(container: dict[Any, Any], items: Sequence[Any]) -> dict[Any, Any]:
     """Add alternating keys and values to a dictionary."""
-    container.update((_hashable(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
+    container.update((_check_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
     return container
 
 
@@ -188,13 +188,14 @@ _MAKE_OPERATIONS: dict[str, tuple[int | None, Callable[[list[Any]], Any]]] = {
     "NONE": (0, lambda items: None), "NEWTRUE": (0, lambda items: True), "NEWFALSE": (0, lambda items: False),
     "EMPTY_LIST": (0, list), "EMPTY_TUPLE": (0, tuple), "EMPTY_DICT": (0, dict), "EMPTY_SET": (0, set),
     "TUPLE1": (1, tuple), "TUPLE2": (2, tuple), "TUPLE3": (3, tuple), "TUPLE": (None, tuple), "LIST": (None, list),
-    "DICT": (None, lambda items: _fill({}, items)), "FROZENSET": (None, lambda items: frozenset(map(_hashable, items))),
+    "DICT": (None, lambda items: _fill({}, items)),
+    "FROZENSET": (None, lambda items: frozenset(map(_check_key, items))),
 }  # fmt: skip
 #: Operations that add items to a container of a type.
 _ADD_OPERATIONS: dict[str, tuple[int | None, type[Any], Callable[[Any, list[Any]], Any]]] = {
     "APPEND": (1, list, list.extend), "APPENDS": (None, list, list.extend),
     "SETITEM": (2, dict, _fill), "SETITEMS": (None, dict, _fill),
-    "ADDITEMS": (None, set, lambda members, items: members.update(map(_hashable, items))),
+    "ADDITEMS": (None, set, lambda members, items: members.update(map(_check_key, items))),
 }  # fmt: skip
 _OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
     "MARK": _Machine._mark, "POP": _Machine._pop, "POP_MARK": lambda machine, _: machine._take(None),
@@ -206,8 +207,8 @@ _OPERATIONS: dict[str, Callable[[_Machine, Any], Any]] = {
 _SKIPPED_OPERATIONS = frozenset(("PROTO", "FRAME", "STOP"))
 
 
-def _hashable(key: Any) -> Any:
-    """Return a key or a member of a set: a plain value or a short flat tuple of them.
+def _check_key(key: Any) -> Any:
+    """Check a key or a member of a set, which must be a plain value or a short flat tuple of them; return it.
 
     Hashing deep tuples ends the process. Keys of one hash take quadratic time: large integers, tuples of many parts
     or of floats.
@@ -231,7 +232,7 @@ def _members(items: Any = ()) -> list[Any]:
 def _new_dictionary(*arguments: Any) -> dict[Any, Any]:
     """Return a plain dictionary for an ordered or a default one, whose factory (the first argument) is dropped."""
     pairs = [argument for argument in arguments if not isinstance(argument, _Global) and argument is not None]
-    return {_hashable(key): value for items in pairs for key, value in _members(items)}
+    return {_check_key(key): value for items in pairs for key, value in _members(items)}
 
 
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
@@ -310,8 +311,8 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _array_type,
     "collections.defaultdict": _new_dictionary,
     "collections.OrderedDict": _new_dictionary,
-    "builtins.set": lambda items=(): set(map(_hashable, _members(items))),
-    "builtins.frozenset": lambda items=(): frozenset(map(_hashable, _members(items))),
+    "builtins.set": lambda items=(): set(map(_check_key, _members(items))),
+    "builtins.frozenset": lambda items=(): frozenset(map(_check_key, _members(items))),
     "builtins.bytearray": lambda content=b"", encoding="latin1": _content(content),
     "builtins.bytes": lambda content=b"": _content(content),
     "_codecs.encode": _encode,

@@ -111,17 +111,17 @@ def unknown_fields(message: Any, payload: bytes) -> set[tuple[str, int]]:
     """Drop the undeclared fields of a message, nested ones too; return message and number of each in ``payload``."""
     size = message.ByteSize()
     message.DiscardUnknownFields()
-    return set() if message.ByteSize() == size else set(_undeclared(message.FromString(payload)))
+    return set() if message.ByteSize() == size else set(_undeclared_fields(message.FromString(payload)))
 
 
-def _undeclared(message: Any) -> Iterator[tuple[str, int]]:
+def _undeclared_fields(message: Any) -> Iterator[tuple[str, int]]:
     """Yield message and number of each undeclared field of a message and of the messages inside it."""
     fields = import_extra("google.protobuf.unknown_fields").UnknownFieldSet(message)
     yield from ((message.DESCRIPTOR.name, field.field_number) for field in fields)
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in (value,) if hasattr(value, "ListFields") else value:
-                yield from _undeclared(inner)
+                yield from _undeclared_fields(inner)
 
 
 @cache

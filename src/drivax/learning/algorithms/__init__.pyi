@@ -1,8 +1,11 @@
+from .awac import AwacConfig as AwacConfig
 from .behaviour_cloning import BcConfig as BcConfig
 from .behaviour_cloning import Cloning as Cloning
 from .cql import CqlConfig as CqlConfig
 from .iql import IqlConfig as IqlConfig
+from .off_policy_evaluation import FittedQ as FittedQ
 from .off_policy_evaluation import FittedQConfig as FittedQConfig
+from .off_policy_evaluation import estimate_return as estimate_return
 from .offline import OfflineConfig as OfflineConfig
 from .ppo import PpoConfig as PpoConfig
 from .sac import SacConfig as SacConfig

@@ -13,7 +13,7 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
-from drivax.checks import MOST_SAMPLES, check_above_zero, check_at_least, check_at_most
+from drivax.checks import check_above_zero, check_at_least, check_at_most, check_counts
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import check_decay_share, clipped_adam
@@ -77,8 +77,7 @@ class Cloning:
     renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "batch", "updates")
-        check_at_most(self, MOST_SAMPLES, "batch", "updates")
+        check_counts(self, "batch", "updates")
         check_at_least(self, 0, "learning_rate", "last_rate")
         check_above_zero(self, "gradient_norm")
         check_decay_share(self.decay_share)

@@ -21,14 +21,7 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float, Int
 
-from drivax.checks import (
-    MOST_RETURN_STEPS,
-    MOST_SAMPLES,
-    check_above_zero,
-    check_at_least,
-    check_at_most,
-    check_shares,
-)
+from drivax.checks import MOST_RETURN_STEPS, check_above_zero, check_at_least, check_counts, check_shares
 from drivax.errors import UsageError
 from drivax.learning.algorithms.off_policy import (
     Carry,
@@ -134,9 +127,8 @@ class OfflineConfig:
     renamed: ClassVar[dict[str, str]] = {"falling": "decay_share"}
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "batch", "updates", "steps")
-        check_at_most(self, MOST_SAMPLES, "batch", "updates")
-        check_at_most(self, MOST_RETURN_STEPS, "steps")
+        check_counts(self, "batch", "updates")
+        check_counts(self, "steps", most=MOST_RETURN_STEPS)
         check_at_least(self, 0, "policy_rate", "critic_rate", "last_rate")
         check_shares(self, "gamma", "tau", "min_q_weight")
         check_above_zero(self, "gradient_norm")
@@ -333,7 +325,7 @@ class Offline(OffPolicy[Config]):
         return metrics
 
     def critic_problems(self, rows: Sequence[Mapping[str, float]]) -> list[str] | None:
-        """Return what is wrong with the critics of a finished run, given the rows of its log; None if not checked."""
+        """Return the problems of the critics of a finished run, given the rows of its log; None if not checked."""
         return critic_problems(rows, getattr(self, "target_entropy", None), self.config.needs_failures)
 
     def q_value(
@@ -478,7 +470,7 @@ def returns_to_go(steps: ExpertSteps, final_value: Float[Array, " M"], gamma: fl
 def critic_problems(
     rows: Sequence[Mapping[str, float]], entropy: float | None = None, needs_failures: bool = False
 ) -> list[str] | None:
-    """Return what is wrong with the critics of a run, given its rows of ``metrics.jsonl`` up to the loaded policy.
+    """Diagnose the critics of a run from its rows of ``metrics.jsonl`` up to the loaded policy; return the problems.
 
     None if Q was not compared with returns, as in runs without validation. ``entropy`` is the policy's target entropy,
     None for a policy without one; ``needs_failures`` is the setting of the algorithm.

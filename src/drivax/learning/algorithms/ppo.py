@@ -15,11 +15,10 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.checks import (
-    MOST_SAMPLES,
     MOST_STEPS_PER_ITERATION,
     check_above_zero,
     check_at_least,
-    check_at_most,
+    check_counts,
     check_shares,
 )
 from drivax.errors import UsageError, did_you_mean
@@ -106,9 +105,8 @@ class PpoConfig:
             if not limit >= 0.0:
                 raise UsageError(f"the limit of constraint {name!r} is {limit}", cure="use 0 or more")
         check_average(self.average)
-        check_at_least(self, 1, "environments", "unroll", "epochs", "minibatches")
-        check_at_most(self, MOST_SAMPLES, "environments", "unroll", "epochs", "minibatches")
-        check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
+        check_counts(self, "environments", "unroll", "epochs", "minibatches")
+        check_counts(self, "steps_per_iteration", most=MOST_STEPS_PER_ITERATION)
         check_at_least(self, 0, "learning_rate", "last_rate", "clip", "value_coefficient", "multiplier_rate")
         check_shares(self, "gamma", "lambda_")
         check_above_zero(self, "target_kl", "gradient_norm")

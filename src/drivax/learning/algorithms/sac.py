@@ -17,11 +17,10 @@ from jaxtyping import Array, Bool
 
 from drivax.checks import (
     MOST_RETURN_STEPS,
-    MOST_SAMPLES,
     MOST_STEPS_PER_ITERATION,
     check_above_zero,
     check_at_least,
-    check_at_most,
+    check_counts,
     check_shares,
 )
 from drivax.errors import UsageError
@@ -116,10 +115,9 @@ class SacConfig:
 
     def __post_init__(self) -> None:
         check_average(self.average)
-        check_at_least(self, 1, "environments", "unroll", "updates_per_step", "batch", "steps")
-        check_at_most(self, MOST_SAMPLES, "environments", "unroll", "updates_per_step", "batch")
-        check_at_most(self, MOST_STEPS_PER_ITERATION, "steps_per_iteration")
-        check_at_most(self, MOST_RETURN_STEPS, "steps")
+        check_counts(self, "environments", "unroll", "updates_per_step", "batch")
+        check_counts(self, "steps_per_iteration", most=MOST_STEPS_PER_ITERATION)
+        check_counts(self, "steps", most=MOST_RETURN_STEPS)
         check_at_least(self, 0, "policy_rate", "critic_rate", "temperature_rate")
         check_above_zero(self, "temperature", "gradient_norm")
         check_shares(self, "gamma", "tau")

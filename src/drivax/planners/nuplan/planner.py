@@ -25,7 +25,8 @@ from drivax.planners.nuplan import interface as nuplan
 from drivax.planners.nuplan.map import MapApi
 from drivax.planners.nuplan.poses import BUFFER
 from drivax.scenario.bank.columns import SizeColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank, last_used
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import last_used
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S, AgentKind, LightState, Scenario
 from drivax.simulator.types import HISTORY, MOTION_SPEED, SimState, Situation
@@ -96,7 +97,7 @@ class _Episode:
     """An instance of a planner in a scenario, with its history and its last plan."""
 
     planner: Any
-    view: View
+    view: ScenarioView
     egos: deque[nuplan.EgoState]
     observations: deque[nuplan.DetectionsTracks]
     step: int
@@ -173,7 +174,7 @@ class Host:
             )
         self._episodes = {key: episode for key, episode in self._episodes.items() if episode.step <= step}
         self._failures.pop(identity, None)
-        view, planner = View(self.scenario_of(identity)), self._make()
+        view, planner = ScenarioView(self.scenario_of(identity)), self._make()
         past_steps, size = range(step - BUFFER, step), BUFFER + 1
         egos = [view.ego(past, history[: HISTORY - step + past]) for past in past_steps]
         observations = [view.logged_tracks(past) for past in past_steps]
@@ -196,7 +197,7 @@ class Host:
         return view.poses(_call(getattr(episode.planner, _PLAN_METHOD), planner_input), step, steps)
 
 
-class View:
+class ScenarioView:
     """A scenario in nuPlan's terms; poses are in the source's frame."""
 
     def __init__(self, scenario: Scenario) -> None:

@@ -35,7 +35,7 @@ _OVERSHOOT = 1.1
 
 @dataclass(frozen=True)
 class BrakeConfig:
-    """When to brake, and how hard; defaults as published.
+    """Thresholds and gains of the emergency brake; defaults as published.
 
     Attributes:
         within_s: Largest time to an at-fault collision that triggers the brake.
@@ -67,7 +67,7 @@ def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConf
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 
 
-def braking(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConfig()) -> Scalar:
+def braking_acceleration(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConfig()) -> Scalar:
     """Return the acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped."""
     (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
     fast, slow = -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
@@ -143,7 +143,9 @@ class EmergencyBrake:
         is_unlawful = jnp.broadcast_to(situation.surroundings.lanes.leaving_lane, path.shape[:1])
         fault_s = jnp.min(Contacts.along(path, box[LENGTH : WIDTH + 1], others).fault_times(is_unlawful))
         speed = motion[MOTION_SPEED]
-        acceleration = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
+        acceleration = braking_acceleration(
+            speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config
+        )
         brake_action = stop(self.actions, motion, acceleration, box[LENGTH], self.config)
         brake_action = space.unsteer(bank, context, brake_action) if space else brake_action
         return jnp.where(is_emergency(fault_s, speed, self.config), brake_action, action), carry

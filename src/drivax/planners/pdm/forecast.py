@@ -68,7 +68,7 @@ def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]
     return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), length, width], axis=-1)
 
 
-def overlapping(
+def predict_overlaps(
     motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float = 0.0
 ) -> Bool[Array, "T K"]:
     """Return the mask of agents that ego overlaps within a horizon of each step of a motion, at constant velocities."""
@@ -80,7 +80,7 @@ def overlapping(
 
 @record
 class Contacts:
-    """First contact of ego's motion with each agent, and whose fault it is."""
+    """First contact of ego's motion with each agent, and whether ego is at fault."""
 
     touches: Bool[Array, "*batch K"]  # Mask of the agents that ego touches
     step: Int[Array, "*batch K"]  # Step of the motion; 0 without a contact
@@ -89,9 +89,9 @@ class Contacts:
 
     @classmethod
     def along(cls, motion: Float[Array, "T 4"], size: Vector, others: Forecast) -> Contacts:
-        """Find the first overlap with each agent, and whose fault it is (``simulator.contact.classify_contacts``)."""
+        """Find the first overlap with each agent, and ego's fault in it (``simulator.contact.classify_contacts``)."""
         steps = jnp.arange(motion.shape[0])
-        is_touching = overlapping(motion, size, others)
+        is_touching = predict_overlaps(motion, size, others)
         first = jnp.min(jnp.where(is_touching, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
         touches = jnp.isfinite(first)
         step = jnp.where(touches, first, 0.0).astype(jnp.int32)

@@ -19,7 +19,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, gap, overlap
 from drivax.geometry.vectors import norm
 from drivax.planners.pdm import scoring
-from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency, stop
+from drivax.planners.pdm.brake import BrakeConfig, braking_acceleration, is_emergency, stop
 from drivax.planners.pdm.forecast import Contacts, Forecast
 from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig, ground_along
 from drivax.planners.pdm.tracking import Car, Reference, track
@@ -313,7 +313,7 @@ class PdmPlanner:
         best = jnp.argmax(proposals.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
         is_braking = is_emergency(proposals.metrics.fault_s[best], speed, brake)
-        brake_acceleration = braking(speed, carry.acceleration, brake)
+        brake_acceleration = braking_acceleration(speed, carry.acceleration, brake)
         acceleration = jnp.where(is_braking, brake_acceleration, proposals.cars.acceleration[best, 1])
         steering = jnp.where(is_braking, 0.0, proposals.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
@@ -377,7 +377,7 @@ class PdmPlanner:
         if space is None:
             return track(car, reference, wheelbase, self.config.tracking)
         poses = replace(space, steps=max(space.steps, self.config.steps)).plan(plan).reshape(-1, 3)
-        axle_reference = Reference.fitted(poses, self.config.steps, wheelbase, space.controller)
+        axle_reference = Reference.fit(poses, self.config.steps, wheelbase, space.controller)
         return track(car, axle_reference, wheelbase, space.controller, about_axle=True)
 
     @property

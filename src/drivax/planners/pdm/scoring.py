@@ -22,7 +22,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import COS, LENGTH, SIN, corners
 from drivax.geometry.vectors import norm, wrap
 from drivax.metrics import comfort
-from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, overlapping
+from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, predict_overlaps
 from drivax.planners.pdm.tracking import Car
 from drivax.scenario.bank.columns import EdgeRow, LaneRow
 from drivax.scenario.bank.queries import (
@@ -111,7 +111,7 @@ def evaluate_proposal(
     """
     motion = car.motion
     fault_times = contacts.fault_times(ground.is_in_several_lanes | ground.is_offroad)
-    is_imminent = overlapping(motion, size, others, config.ttc_s)
+    is_imminent = predict_overlaps(motion, size, others, config.ttc_s)
     is_road_user = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
     is_road_user |= others.kind == AgentKind.CYCLIST
     fault_gates = jnp.where(is_road_user, 0.0, config.static_collision)

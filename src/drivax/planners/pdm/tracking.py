@@ -51,7 +51,7 @@ class Reference:
     curvature: Float[Array, "*batch N"]  # Of the path, 1/m
 
     @classmethod
-    def fitted(cls, plan: Poses, steps: int, wheelbase: Scalar, config: TrackingConfig) -> Reference:
+    def fit(cls, plan: Poses, steps: int, wheelbase: Scalar, config: TrackingConfig) -> Reference:
         """Return the reference of the rear axle for planned poses of the box centre; its poses end after ``steps``.
 
         Speeds and curvatures are those that ``simulator.controller`` fits at the present step; it fits again later.

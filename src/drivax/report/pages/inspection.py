@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from drivax.files import check_output, write_text
-from drivax.report.charts import histogram, series_legend, short
+from drivax.report.charts import format_short, histogram, series_legend
 from drivax.report.inspection import (
     QUANTITIES,
     Counts,
@@ -48,7 +48,7 @@ def _lead(inspections: Sequence[Inspection]) -> str:
         set(recordings_of([entry for inspection in inspections for entry in inspection.entries]))
     )
     hours = sum(inspection.hours for inspection in inspections)
-    length = f"{short(hours)} hours" if hours >= 1 else f"{short(60 * hours)} minutes"
+    length = f"{format_short(hours)} hours" if hours >= 1 else f"{format_short(60 * hours)} minutes"
     return f"<b>{count:,}</b> scenarios of {recordings:,} recordings, {length} of driving."
 
 

@@ -35,7 +35,7 @@ from drivax.report.pages.page import (
     section,
 )
 from drivax.report.pictures.player_data import pack_episode
-from drivax.report.runs import Training, read_evaluations, read_runs
+from drivax.report.runs import TrainingCurves, read_evaluations, read_runs
 from drivax.table import Table, bounds, number, suffix
 
 EPISODES = 12
@@ -91,7 +91,10 @@ def _load_episodes(
 
 
 def _page(
-    runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed_episodes: PackedEpisodes, tags: Tags
+    runs: Sequence[EpisodeTable],
+    trainings: Sequence[TrainingCurves],
+    packed_episodes: PackedEpisodes,
+    tags: Tags,
 ) -> str:
     sections, data, scripts = [], [], []
     if runs:
@@ -115,7 +118,7 @@ def _page(
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
 
 
-def _unhealthy_critics(trainings: Sequence[Training]) -> str:
+def _unhealthy_critics(trainings: Sequence[TrainingCurves]) -> str:
     """Return a list of what is wrong with critics; empty if nothing is."""
     items = [
         f"<li>{escape(training.name)}: {escape(str(problem))}</li>"
@@ -284,7 +287,7 @@ def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     return definitions((label.heading, label.explanation) for label in labels)
 
 
-def _provenance(runs: Sequence[EpisodeTable | Training]) -> str:
+def _provenance(runs: Sequence[EpisodeTable | TrainingCurves]) -> str:
     """Return the provenance of the numbers: commands, data, versions and every ``run.json``."""
     rows = []
     for run in runs:

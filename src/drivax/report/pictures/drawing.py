@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.errors import UsageError, missing_package
+from drivax.errors import UsageError, explain_missing_package
 from drivax.geometry.boxes import corners
 from drivax.report.pictures.palette import (
     LEGEND,
@@ -122,7 +122,7 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Boxes:
+class AgentBoxes:
     """Agents as boxes: pose and presence at every step, length and width in metres, and the name of a colour."""
 
     xy: Float[Array, "step agent 2"]
@@ -159,9 +159,9 @@ class Drawing:
     goal: Float[Array, "_ 2"]
     light_line: Float[Array, "light 2 2"]
     light_state: Int[Array, "step light"]
-    agents: Boxes
-    parked: Boxes
-    log: Boxes
+    agents: AgentBoxes
+    parked: AgentBoxes
+    log: AgentBoxes
 
     @classmethod
     def of(cls, scenario: Scenario, box: Box) -> Drawing:
@@ -267,17 +267,17 @@ def _lights(scenario: Scenario) -> tuple[Float[Array, "light 2 2"], Int[Array, "
     return line[rows].reshape(-1, 2, 2), codes
 
 
-def _boxes(scenario: Scenario, rows: Any, valid: Any = None) -> Boxes:
+def _boxes(scenario: Scenario, rows: Any, valid: Any = None) -> AgentBoxes:
     """Return the boxes of some agents, present where ``valid`` or, by default, as in the scenario."""
     steps = int(scenario.steps)
     colours = [agent_colour(int(kind)) for kind in scenario.agent_kind[rows]]
-    return Boxes(
+    return AgentBoxes(
         scenario.agent_xy[:steps, rows], scenario.agent_heading[:steps, rows], scenario.agent_size[rows, :2], colours,
         scenario.agent_valid[:steps, rows] if valid is None else valid,
     )  # fmt: skip
 
 
-def _agent_boxes(scenario: Scenario, box: Box) -> Boxes:
+def _agent_boxes(scenario: Scenario, box: Box) -> AgentBoxes:
     """Return all moving agents but ego, present while they are inside the box."""
     steps = int(scenario.steps)
     is_near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
@@ -286,12 +286,12 @@ def _agent_boxes(scenario: Scenario, box: Box) -> Boxes:
     return _boxes(scenario, rows, is_near[:, rows])
 
 
-def _parked_boxes(scenario: Scenario, box: Box) -> Boxes:
+def _parked_boxes(scenario: Scenario, box: Box) -> AgentBoxes:
     steps = int(scenario.steps)
     rows = np.flatnonzero(scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box))
     colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]
     shape = (steps, len(rows))
-    return Boxes(
+    return AgentBoxes(
         np.broadcast_to(scenario.parked_xy[rows], (*shape, 2)), np.broadcast_to(scenario.parked_heading[rows], shape),
         scenario.parked_size[rows, :2], ["parked" if name == "vehicle" else name for name in colours],
         scenario.parked_valid[:steps, rows],
@@ -317,10 +317,8 @@ def draw_scenario(
     """
     if not 0 <= step < int(scenario.steps):
         raise UsageError(f"step {step} is not in the scenario", cure=f"use 0 to {int(scenario.steps) - 1}")
-    try:
+    with explain_missing_package():
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_package(error) or error from error
     path = None if ego is None else np.asarray(ego, dtype=np.float64)
     centre = scenario.agent_xy[step, 0]
     if path is not None and np.isfinite(path[step]).all():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from drivax.errors import missing_package
+from drivax.errors import explain_missing_package
 from drivax.geometry.boxes import corners
 from drivax.report.pictures.palette import LIGHT
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -84,10 +84,8 @@ def draw_observation(config: ObservationConfig, observation: Mapping[str, Any], 
     Raises:
         UsageError: matplotlib is not installed.
     """
-    try:
+    with explain_missing_package():
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_package(error) or error from error
     groups = ObservationGroups.of(config, observation)
     low, high = _extent(groups)
     width, height = high - low

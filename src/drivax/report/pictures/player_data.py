@@ -14,8 +14,8 @@ from drivax.report.charts import COMMANDS, SIGNALS, Signal, signals
 from drivax.report.pictures.drawing import (
     EVENT_WORDS,
     LAYERS,
+    AgentBoxes,
     Box,
-    Boxes,
     Drawing,
     Rollout,
     replace_traffic,
@@ -111,17 +111,17 @@ def _lines(scale: Scale, lines: Sequence[Array]) -> dict[str, str]:
     return {"counts": _encode(counts), "points": _encode(points)}
 
 
-def _poses(scale: Scale, boxes: Boxes) -> Array:
+def _poses(scale: Scale, boxes: AgentBoxes) -> Array:
     return scale.poses(boxes.xy, boxes.heading, boxes.valid)
 
 
-def _boxes(scale: Scale, boxes: Boxes, poses: Array) -> dict[str, Any]:
+def _boxes(scale: Scale, boxes: AgentBoxes, poses: Array) -> dict[str, Any]:
     return {
         "kind": list(boxes.colour), "size": _encode(scale.lengths(boxes.size)), "pose": _encode(poses)
     }  # fmt: skip
 
 
-def _parked_entries(scale: Scale, parked: Boxes) -> dict[str, Any]:
+def _parked_entries(scale: Scale, parked: AgentBoxes) -> dict[str, Any]:
     """Return parked agents with one pose each, and the first and last step at which they are present."""
     valid = parked.valid
     poses = scale.poses(parked.xy[0], parked.heading[0], np.ones(len(parked.size), bool))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import UInt8
 
-from drivax.errors import UsageError, did_you_mean, missing_package
+from drivax.errors import UsageError, did_you_mean, explain_missing_package
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import atomic_write, check_output, inside
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, rank_scenarios, rollouts_of
@@ -147,10 +147,8 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
     Raises:
         UsageError: PyAV is not installed.
     """
-    try:
+    with explain_missing_package():
         import av
-    except ImportError as error:
-        raise missing_package(error) or error from error
     options = {"movflags": "+faststart"}
     with atomic_write(file) as target, av.open(target.name, "w", format="mp4", options=options) as container:
         stream: Any = None
@@ -181,13 +179,11 @@ class Canvas:
     """
 
     def __init__(self, width: int, height: int, theme: str) -> None:
-        try:
+        with explain_missing_package():
             from matplotlib.backends.backend_agg import RendererAgg
             from matplotlib.font_manager import FontProperties
             from matplotlib.path import Path
             from matplotlib.transforms import Affine2D
-        except ImportError as error:
-            raise missing_package(error) or error from error
         # At 72 dots per inch a point of matplotlib is a pixel.
         self._agg = RendererAgg(width, height, 72)
         self._path, self._affine, self._font = Path, Affine2D, FontProperties

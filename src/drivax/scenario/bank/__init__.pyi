@@ -21,5 +21,5 @@ from .queries import offroad_distance as offroad_distance
 from .queries import project_on_route as project_on_route
 from .queries import route_ahead as route_ahead
 from .scenario_bank import ScenarioBank as ScenarioBank
-from .scenario_bank import Sizes as Sizes
+from .sizes import Sizes as Sizes
 from .smallest import first_smallest as first_smallest

@@ -132,7 +132,7 @@ def to_segments(
 
 
 def is_level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
-    """Whether segments are on the level of a height (:data:`LEVEL_M`)."""
+    """Return whether segments are on the level of a height (:data:`LEVEL_M`)."""
     return jnp.abs(height - z) <= LEVEL_M
 
 
@@ -141,7 +141,7 @@ def _chord(rows: Float[Array, "F K"]) -> tuple[Float[Array, " K"], Float[Array, 
 
 
 def _runs_along(rows: Float[Array, "F K"], heading: Vector) -> Bool[Array, " K"]:
-    """Whether segments lead less than 90 degrees away from a heading."""
+    """Return whether segments lead less than 90 degrees away from a heading."""
     ux, uy = _chord(rows)
     return ux * heading[0] + uy * heading[1] > 0.0
 
@@ -310,14 +310,14 @@ def _nearest_vertex(
 def _holds(
     squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
 ) -> Bool[Array, "P K"]:
-    """Whether lanes in the direction of the ego hold points."""
+    """Return whether lanes in the direction of the ego hold points."""
     return aligned & (squared <= (half + LANE_MARGIN_M) ** 2)
 
 
 def _corner_lanes(
     bank: ScenarioBank, index: Integer, point: Vector, heading: Vector, z: Scalar
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a lane is near a corner of a long box, and whether the corner is outside all lanes."""
+    """Return whether a lane is near a corner of a long box, and whether the corner is outside all lanes."""
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
     squared = jnp.where(inside & is_level(rows[LaneRow.Z], z), squared, _FAR)

@@ -144,7 +144,10 @@ def most_egos(records: Sequence[_Record]) -> int:
 
 
 def of_ego(records: Sequence[_Record], name: str, ego: int, *part: int) -> np.ndarray[Any, Any]:
-    """Stack a field of the k-th ego: ``name`` (or ``part`` of it) for the recorded one, ``ego_name`` for others."""
+    """Stack a field of the k-th ego of all records.
+
+    The field is ``name`` (or ``part`` of it) for the recorded ego, k = 0, and ``ego_name`` for further egos.
+    """
     return stack_field(records, f"ego_{name}", ego - 1) if ego else stack_field(records, name, *part)
 
 

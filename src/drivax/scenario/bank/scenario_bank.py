@@ -11,8 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields, replace
-from itertools import islice
+from dataclasses import asdict, replace
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
-from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.errors import DataError, UsageError
 from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
 from drivax.scenario.bank.routes_and_strands import (
     corridor_lanes,
@@ -31,13 +30,13 @@ from drivax.scenario.bank.routes_and_strands import (
     stack_lights,
     stack_routes,
 )
+from drivax.scenario.bank.sizes import BATCH, Sizes, last_used
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
     EDGE_KINDS,
     LANE_KINDS,
     LEAST_STEPS,
     POLYGON_KINDS,
-    Capacity,
     RoadKind,
     Scenario,
     stack_field,
@@ -47,8 +46,6 @@ from drivax.scenario.schema import (
 Scalar = Float[Array, ""]
 Integer = Int[Array, ""]
 Vector = Float[Array, " 2"]
-#: Most sizes are multiples of this, so that banks of similar scenarios share programs.
-_MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
 #: Limits of a lane's class where the source gives none, m/s (metric ``speeding``).
@@ -57,8 +54,6 @@ CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE):
 WORD = 32
 #: Coordinates of unused segments, m.
 _FAR_M = 1e6
-#: Scenarios that are stacked at a time: their columns fit in the cache of a core.
-_BATCH = 32
 #: Threads that stack; NumPy releases the lock of the interpreter in its loops.
 _THREADS = min(os.cpu_count() or 1, 8)
 #: Alignment of arrays that JAX takes over without a copy, bytes.
@@ -73,96 +68,6 @@ PER_EGO = ("routes", "route_points", "on_lanes", "goal", "log_progress", "log_ah
 
 _Record = Shaped[np.ndarray, ""]
 _Arrays = dict[str, np.ndarray[Any, Any]]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Sizes of the arrays of a bank; banks of the same sizes run the same compiled programs.
-
-    Attributes:
-        agents, slots: Moving agents; slots of a frame for moving and parked agents.
-        lights: Traffic lights.
-        edges, lanes, road: Segments of road edges and of car lanes, and pieces of road to observe.
-        edge_run, lane_run: Longest run of a row of three grid cells.
-        graphs: Lanes of the graph.
-        long_ego: Whether some ego is too long for a single grid query.
-    """
-
-    agents: int
-    slots: int
-    lights: int
-    edges: int
-    lanes: int
-    edge_run: int
-    lane_run: int
-    graphs: int
-    road: int
-    long_ego: bool
-
-    @classmethod
-    def whole(cls, capacity: Capacity) -> Sizes:
-        """Return the sizes that hold all scenarios of a capacity."""
-        sizes = {name: getattr(capacity, name) for name in ("agents", "lights", "edge_run", "lane_run")}
-        sizes |= {"edges": capacity.segments, "lanes": capacity.segments, "graphs": capacity.lanes}
-        slots = capacity.agents + capacity.parked
-        return cls(**sizes, slots=slots, road=capacity.road_rows, long_ego=False)
-
-    @classmethod
-    def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
-        """Return the sizes that one or more scenarios of one capacity use."""
-        remaining, batch_sizes = iter(scenarios), list[Sizes]()
-        while batch := list(islice(remaining, _BATCH)):
-            batch_sizes.append(_batch_sizes(batch))
-        if not batch_sizes:
-            raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
-        return cls(*(max(getattr(sizes, field.name) for sizes in batch_sizes) for field in fields(cls)))
-
-
-def _batch_sizes(scenarios: Sequence[Scenario]) -> Sizes:
-    """Return the sizes that a batch of scenarios of one capacity uses."""
-    capacity, records = scenarios[0].capacity, [scenario.record for scenario in scenarios]
-    agents, parked, lights, lanes = (
-        last_used(mask)
-        for mask in (
-            stack_field(records, "agent_valid").any(1),
-            stack_field(records, "parked_valid").any(1),
-            (stack_field(records, "light_state") >= 0).any(1),
-            stack_field(records, "lane_length") > 0,
-        )
-    )
-    moving = max(1, _round_up(int(agents.max()), capacity.agents))
-    slots = _round_up(int((agents + parked).max()), capacity.agents + capacity.parked)
-    _, edge_end, lane_end, _ = stack_field(records, "segment_blocks").T
-    egos = np.zeros((len(records), 1), int)
-    if capacity.egos > 1:
-        egos = np.hstack([egos, np.maximum(stack_field(records, "ego_slot"), 0)])
-    ego_size_m = np.take_along_axis(stack_field(records, "agent_size"), egos[..., None], axis=1)
-    half_diagonal_m = np.hypot(*ego_size_m.T[:2]).astype(np.float64) / 2
-    return Sizes(
-        agents=moving,
-        slots=max(slots, moving),
-        lights=max(1, _round_up(int(lights.max()), capacity.lights)),
-        edges=int(edge_end.max()),
-        lanes=int((lane_end - edge_end).max()),
-        edge_run=_round_up(_longest_run(stack_field(records, "grid_edge"), capacity.grid), capacity.edge_run),
-        lane_run=_round_up(_longest_run(stack_field(records, "grid_lane"), capacity.grid), capacity.lane_run),
-        graphs=max(1, _round_up(int(lanes.max()), capacity.lanes)),
-        road=max(1, int(stack_field(records, "road_rows").max())),
-        # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
-        long_ego=bool((half_diagonal_m + 3.0 > capacity.cell_m - 2.0).any()),
-    )
-
-
-def _round_up(count: int, most: int) -> int:
-    """Round up to a multiple of 8, but not above ``most``."""
-    # Floor division of the negative number rounds up.
-    return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
-
-
-def _longest_run(start: Int[np.ndarray, "n cells1"], grid: int) -> int:
-    """Longest run over three neighbouring cells of a grid row, at least 1."""
-    begin, end = (part.reshape(-1, grid, grid) for part in (start[:, :-1], start[:, 1:]))
-    return max(int((end[..., 2:] - begin[..., :-2]).max()), 1)
 
 
 @record
@@ -197,6 +102,8 @@ class ScenarioBank:
         last_step: Last step of the log of each ego; for the recorded one that of the scenario, followed by padding.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along lanes or straight on: x, y.
+        chances: Cumulative probability that a training episode begins in each scenario, in units of ``1 / (2^32 - 1)``;
+            None: all are equal.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether padding was cut to what these scenarios use; not if sizes were passed.
@@ -232,6 +139,7 @@ class ScenarioBank:
     last_step: Int[Array, " M"]
     identity: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
+    chances: UInt[Array, " N"] | None
     cell_m: float = static()
     edge_run: int = static()
     lane_run: int = static()
@@ -283,13 +191,13 @@ class ScenarioBank:
         return 0 if self.most_egos == 1 else self.egos.reshape(-1)[row]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Select scenarios by index."""
+        """Select scenarios by index; all are equally likely to be drawn."""
         ego_rows = (rows[:, None] * self.most_egos + jnp.arange(self.most_egos)).reshape(-1)
 
         def select(path: tuple[Any, ...], leaf: Array) -> Array:
             return leaf[ego_rows if path[0].name in PER_EGO else rows]
 
-        return jax.tree_util.tree_map_with_path(select, self)
+        return jax.tree_util.tree_map_with_path(select, replace(self, chances=None))
 
     @classmethod
     def from_scenarios(
@@ -328,7 +236,7 @@ class ScenarioBank:
         return cls(
             **{name: jax.device_put(value, may_alias=True) for name, value in arrays.items()},
             cell_m=logs[0].capacity.cell_m, edge_run=sizes.edge_run, lane_run=sizes.lane_run,
-            long_ego=sizes.long_ego, trimmed=trim is True,
+            long_ego=sizes.long_ego, trimmed=trim is True, chances=None,
         )  # fmt: skip
 
 
@@ -366,7 +274,7 @@ def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
             arrays[name][rows] = values
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(fill, (slice(first, first + _BATCH) for first in range(0, len(records), _BATCH))))
+        list(pool.map(fill, (slice(first, first + BATCH) for first in range(0, len(records), BATCH))))
     for name in PER_EGO:
         arrays[name] = arrays[name].reshape(-1, *arrays[name].shape[2:])
     names = [(scenario.text("dataset"), scenario.id) for scenario in scenarios]
@@ -400,11 +308,6 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
 
 def _digest(*texts: str) -> int:
     return int.from_bytes(hashlib.blake2b("\0".join(texts).encode(), digest_size=4).digest(), "little")
-
-
-def last_used(mask: Any) -> Int[np.ndarray, " n"]:
-    """Return the number of columns of ``mask [n, column]`` up to the last true one, per row."""
-    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
 def _stack_batch(records: Sequence[_Record], sizes: Sizes) -> _Arrays:

@@ -45,7 +45,7 @@ from drivax.scenario.build.tracks import (
     local_tracks,
     place,
 )
-from drivax.scenario.recording import Recording, check, differentiate, plausible, step_seconds
+from drivax.scenario.recording import Recording, check, differentiate, plausible_steps, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
@@ -266,7 +266,7 @@ def _lanes_of(routes: Sequence[Route]) -> Int[Array, " route_lane"]:
 def _drop_jumps(recording: Recording) -> Recording:
     """Drop steps of tracks that are not plausible, and count the tracks that lose some."""
     tracks = recording.tracks
-    valid = plausible(recording)
+    valid = plausible_steps(recording)
     has_jump = (valid != tracks.valid).any(axis=1)
     if not has_jump.any():
         return recording

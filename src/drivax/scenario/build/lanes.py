@@ -137,7 +137,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     samples = _samples(lines)
     left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
     right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
-    dangling = {name: _dangling(lanes, index, *links) for name, links in _DANGLING.items()}
+    dangling = {name: _count_dangling(lanes, index, *links) for name, links in _DANGLING.items()}
     return LaneGraph(
         lines=lines,
         feature=np.array(rows, dtype=np.int64),
@@ -160,7 +160,7 @@ def _widths(lanes: Sequence[MapFeature], gap: Float[Array, " lane"]) -> Float[Ar
     return np.where((width > 0.0) & (width <= MOST_WIDTH_M), width, spacing)
 
 
-def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
+def _count_dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], *names: str) -> int:
     """Number of links of these kinds to missing lanes."""
     return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
 
@@ -242,7 +242,7 @@ def _adjacent(
 
 
 def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Whether lane ``b`` runs along ``a`` in its direction, its distance and arc-length shift: ``[pair, probe]``."""
+    """Return the mask of lanes ``b`` that run along ``a``, their distance and arc-length shift: ``[pair, probe]``."""
     fraction = np.array(_PROBES)
     index = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
     probe = samples[a][:, index]

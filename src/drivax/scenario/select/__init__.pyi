@@ -6,6 +6,7 @@ from .selection import read_names as read_names
 from .selection import select_scenarios as select_scenarios
 from .selection import tag_words as tag_words
 from .selection import vocabulary as vocabulary
+from .splits import parse_shares as parse_shares
 from .splits import split_of as split_of
 from .splits import write_splits as write_splits
 from .tags import TAGS as TAGS

@@ -8,7 +8,6 @@ nor ``!=``; :meth:`Selection.unknown` counts such scenarios.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import functools
 import math
@@ -304,12 +303,12 @@ def _missing_error(data: Listing, missing: Sequence[_Name]) -> DataError:
     datasets = sorted(
         {str(entry["dataset"]) for entry in data.entries if entry["scenario_id"] == scenario_id}
     )
-    guess = difflib.get_close_matches(scenario_id, [str(entry["scenario_id"]) for entry in data.entries], n=1)
     cure = "use ids that drivax inspect --json lists"
     if datasets and not others:
         cure = f"the set has this id in data set {', '.join(datasets)}"
-    elif guess and not others:
-        cure = f"did you mean {guess[0]!r}?"
+    elif not others:
+        ids = (str(entry["scenario_id"]) for entry in data.entries)
+        cure = did_you_mean(scenario_id, ids, otherwise=cure)
     more = "".join(f", {name.label}" for name in others[: _MOST_NAMES - 1])
     more += f" and {len(others) - _MOST_NAMES + 1} more" if len(others) >= _MOST_NAMES else ""
     which = "are" if others else "is"
@@ -338,9 +337,9 @@ def _find_quantity(text: str, name: str) -> Quantity:
     if name in known:
         return known[name]
     # Match names without their group too: log_collides suggests audit.log_collides.
-    by_end = {full.rpartition(".")[2]: full for full in known} | {full: full for full in known}
-    guess = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
-    cure = f"did you mean {by_end[guess[0]]!r}?" if guess else f"write tag.{name} for a tag of your own"
+    by_end = {full.rpartition(".")[2]: full for full in known}
+    otherwise = f"write tag.{name} for a tag of your own"
+    cure = did_you_mean(name, known, otherwise=otherwise, aliases=by_end, cutoff=0.7)
     raise _filter_error(text, f"unknown quantity {name!r}", cure)
 
 

@@ -196,7 +196,7 @@ def _ego_distance(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array,
 
 
 def _meets_crossing(tracks: LocalTracks) -> bool:
-    """Whether a vehicle crosses ego's heading nearby at some step (:func:`difficulty_of`)."""
+    """Return whether a vehicle crosses ego's heading nearby at some step (:func:`difficulty_of`)."""
     rows = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
     rows = rows[rows != tracks.ego]
     angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
@@ -206,7 +206,7 @@ def _meets_crossing(tracks: LocalTracks) -> bool:
 
 
 def _brakes(tracks: LocalTracks) -> bool:
-    """Whether the logged ego is slower by 2 m/s or more one second after some step."""
+    """Return whether the logged ego is slower by 2 m/s or more one second after some step."""
     speed = np.hypot(*tracks.velocity[tracks.ego].T)
     valid, steps = tracks.valid[tracks.ego], round(1.0 / DT_S)
     both_valid = valid[steps:] & valid[:-steps]

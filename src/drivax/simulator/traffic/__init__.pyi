@@ -2,6 +2,7 @@ from .bank_data import PreparedBank as PreparedBank
 from .bank_data import TrafficData as TrafficData
 from .bank_data import prepare_bank as prepare_bank
 from .log import LogTraffic as LogTraffic
+from .log import alone as alone
 from .override import OverrideTraffic as OverrideTraffic
 from .override import motions_of_actions as motions_of_actions
 from .override import with_override as with_override

@@ -56,7 +56,7 @@ class Movers:
 
 @record
 class Leaders:
-    """What is ahead of R vehicles."""
+    """Leaders of R vehicles, and the agents around their corridors."""
 
     # Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free
     gap: Float[Array, " R"]
@@ -193,7 +193,9 @@ def _closest(
     mover = movers.box[:, None]
     behind_m = mover[..., LENGTH] / 2 + BEHIND_M
     box = columns(frame.box)
-    is_near = reaching(box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind_m, 0.0, RECTANGLES)
+    is_near = overlaps_rectangles(
+        box, nodes, mover[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind_m, 0.0, RECTANGLES
+    )
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
     is_near &= frame.valid & (slot != movers.slot[:, None])
     is_near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
@@ -226,7 +228,7 @@ def closest(
     return jnp.where(valid, number_of(smallest, SLOT_BITS), 0), valid
 
 
-def reaching(
+def overlaps_rectangles(
     box: Float[Array, "6 S"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind_m: Any, ahead_m: Any,
     rectangles: int,
 ) -> Bool[Array, "R S"]:  # fmt: skip

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.plugins import find_named, is_dotted, makes
 from drivax.scenario.bank.columns import SizeColumn
@@ -256,11 +256,11 @@ def make_traffic(name: str) -> Traffic:
     if name in TRAFFIC:
         return TRAFFIC[name]()
     if not is_dotted(name):
-        cure = f"use {', '.join(TRAFFIC)}, or package.module:name"
-        raise UsageError(f"there is no traffic {name!r}", cure=cure)
+        cure = did_you_mean(name, TRAFFIC, otherwise=f"use {', '.join(TRAFFIC)}, or package.module:name")
+        raise UsageError(f"unknown traffic {name!r}", cure=cure)
     traffic = find_named(name)
     if isinstance(traffic, type) or not isinstance(traffic, Traffic):
         traffic = traffic() if makes(traffic, Traffic) else None
     if not isinstance(traffic, Traffic):
-        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
+        raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.Traffic")
     return traffic

@@ -36,7 +36,7 @@ _TTC_HORIZON_S = 5.0
 _APPEARANCE_M = 40.0
 #: Longitudinal and lateral distance of a new actor from other agents, m: for a vehicle, and for other kinds of actors.
 _VEHICLE_MARGIN_M, _OTHER_MARGIN_M = (1.5, 0.3), (0.2, 0.05)
-#: Distance of centres below which parallel vehicles are in the way of a new actor, m.
+#: Distance of centres below which parallel vehicles block a new actor, m.
 _SAME_LANE_M = 6.5
 #: Margins added to the length and width of a crossing vehicle, and largest distance of centres in overlap tests, m.
 _CROSSING_MARGIN_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
@@ -139,7 +139,7 @@ def least_ttc(
 
 
 def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
-    """Whether the simulated actor comes close to collision with an ego that keeps its speed from the event's start.
+    """Return whether the simulated actor comes close to collision with an ego that keeps its speed during the event.
 
     Rejects events that other agents disturbed, or before which ego slowed down. ``view`` is the scenario without
     the event, ``motion`` the simulated motion with it.
@@ -151,7 +151,7 @@ def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
 
 
 def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
-    """Whether an ego at constant speed comes close to collision: from the event's first step, and from the current one.
+    """Return whether an ego at constant speed comes close to collision: from the event's first and the current step.
 
     Where ego's speed changes in between (a turn, a queue) only the first counts.
     """
@@ -166,7 +166,7 @@ def comes_close(view: EgoView, adversary: ScriptedUser, step: int) -> bool:
 
 
 def vehicles_in_lane(view: EgoView, extra: ScriptedUser, until: int) -> tuple[int, ...]:
-    """Return the rows of vehicles that are in the way of a new actor at any step up to ``until``.
+    """Return the rows of vehicles that block a new actor at any step up to ``until``.
 
     Lanes play no role: a vehicle counts if it is near the actor and has about the same heading.
     """
@@ -236,7 +236,7 @@ def _is_clear(
     box: Float64[np.ndarray, " 6"], others: Float64[np.ndarray, "user 6"], valid: Bool[np.ndarray, " user"],
     speed: Float64[np.ndarray, " user"],
 ) -> bool:  # fmt: skip
-    """Whether a new box is clear of all others, each extended by its travel in the next 0.8 s."""
+    """Return whether a new box is clear of all others, each extended by its travel in the next 0.8 s."""
     extended_box = others.copy()
     extended_box[:, 4] += _BEHIND_S * speed
     extended_box[:, :2] += _BEHIND_S / 2 * speed[:, None] * others[:, 2:4]

@@ -53,7 +53,7 @@ _TOLERANCE_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
-    """Whether a network has what an event needs, such as a light, a lane that ends, or bays."""
+    """Return whether a network allows an event, which may need a light, a lane that ends, or bays."""
     return SCRIPTS[kind].possible(network)
 
 

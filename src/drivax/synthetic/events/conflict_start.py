@@ -138,7 +138,7 @@ def _hits(
     others: _Others, extent: _Extent, step: _Steps, path: Path, position: _Floats,
     size_m: Float64[np.ndarray, " 2"], from_behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:  # fmt: skip
-    """Whether an agent overlaps ego and did not come from behind; those that did are marked in ``from_behind``."""
+    """Return whether an agent overlaps ego and did not come from behind; mark those that did in ``from_behind``."""
     half, side = size_m / 2
     near_m, far_m, right_m, left_m = extent
     is_close = (near_m < position + half) & (far_m > position - half) & (right_m < side) & (left_m > -side)

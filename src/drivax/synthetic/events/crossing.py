@@ -102,7 +102,7 @@ class CrossTraffic(EventScript):
     arrival_s: tuple[float, float] = (2.5, 5.5)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: beginnings of connectors that an actor may cross."""
+        """Return the beginnings of connectors that an actor may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(
@@ -112,7 +112,7 @@ class CrossTraffic(EventScript):
         )
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose a vehicle that crosses ego's path in a junction."""
         network, share = view.roles.network, float(rng.uniform(*self.speed_share))
         conflicts = [self._lower_priority_conflicts(network, connector) for connector in view.connectors]
         connectors = sorted(set[int]().union(*conflicts))
@@ -146,7 +146,7 @@ class CrossTraffic(EventScript):
         return [other for other in others if self._crosses(lane, network.lanes[other], connector)]
 
     def _crosses(self, lane: Lane, other: Lane, index: int) -> bool:
-        """Whether an actor on the connector ``other`` would cross ego's connector ``lane`` (``index``)."""
+        """Return whether an actor on the connector ``other`` would cross ego's connector ``lane`` (``index``)."""
         if not other.predecessors or not other.connector:
             return False
         alignment = math.cos(float(other.curve.heading[0] - lane.curve.heading[0]))
@@ -196,7 +196,7 @@ class CrossTraffic(EventScript):
         return None
 
     def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:
-        """Whether the light is red (red-light runner) or never red (turning vehicle) in the 1.2 s before the entry.
+        """Return whether the light is red (red-light runner) or never red (turning vehicle) for 1.2 s before the entry.
 
         Without lights only a turning vehicle fits.
         """

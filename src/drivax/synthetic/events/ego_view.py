@@ -201,7 +201,7 @@ class EgoView:
         return best
 
     def plain_road(self, station: float) -> bool:
-        """Whether a station is on a lane outside of junctions, more than 14 m from the middle of any crossing."""
+        """Return whether a station is on a lane outside of junctions, over 14 m from the middle of any crossing."""
         lane, network = self.lane_at(station), self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
@@ -215,7 +215,7 @@ class EgoView:
         return self._connectors_between(begin, end, 3.0)
 
     def meets_junction(self, low_m: float, high_m: float) -> bool:
-        """Whether ego's path has a junction between two stations; scripted actors do not obey its rules."""
+        """Return whether ego's path has a junction between two stations; scripted actors do not obey its rules."""
         return bool(self._connectors_between(low_m, high_m + 4.0, 4.0))
 
     def _connectors_between(self, low_m: float, high_m: float, step_m: float) -> list[int]:

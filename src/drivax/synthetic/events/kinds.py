@@ -87,7 +87,7 @@ class EventScript(ABC):
         return open_road(network)
 
     def possible(self, network: RoadNetwork) -> bool:
-        """Whether the event is possible in a network."""
+        """Return whether the event is possible in a network."""
         return bool(self.destinations(network))
 
     @abstractmethod

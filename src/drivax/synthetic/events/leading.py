@@ -94,12 +94,12 @@ class LeadBrakes(EventScript):
     tailgating_s: tuple[float, float] = (0.4, 0.7)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: roads with a limit of at least 10 m/s."""
+        """Return roads with a limit of at least 10 m/s."""
         places = open_road(network, _LEAST_MPS)
         return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
+        """Propose a leader that brakes to a halt, at a severity drawn from the possible range."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
@@ -140,11 +140,11 @@ class StalledVehicle(EventScript):
     headway_s: tuple[float, float] = (0.9, 1.4)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: roads with a limit of at least 10 m/s."""
+        """Return roads with a limit of at least 10 m/s."""
         return open_road(network, _LEAST_MPS)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`; the severity is drawn from the possible range instead."""
+        """Propose a leader that stalls, at a severity drawn from the possible range."""
         step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         return None if step is None else _propose_leader(view, step, headway, rng, None, ())
 
@@ -214,7 +214,7 @@ class CutIn(EventScript):
     end_after_s: tuple[float, float] = (5.5, 9.0)
 
     def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
-        """See :class:`EventScript`: for a late merge the ends of lanes, on the adjacent lanes."""
+        """Return places next to the ends of lanes for a late merge, else roads with an adjacent lane."""
         if not self.late_merge:
             return open_road(network, has_neighbour=True)
         lanes, places = network.lanes, []
@@ -228,7 +228,7 @@ class CutIn(EventScript):
         return tuple(places)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose a vehicle that changes into ego's lane and brakes."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         if self.late_merge:
             step, side = self._draw_lane_end(view, rng)

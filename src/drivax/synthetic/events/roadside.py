@@ -27,12 +27,12 @@ _ROLLING_MPS2 = 6.0
 
 class _StreetScript(EventScript):
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: on networks with streets."""
+        """Return whether the network has a street."""
         return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
 
 
 def _is_open_street(view: EgoView, station: float) -> bool:
-    """Whether a station is on a street away from junctions and crossings."""
+    """Return whether a station is on a street away from junctions and crossings."""
     lanes = view.roles.network.lanes
     return view.plain_road(station) and lanes[view.lane_at(station)].limit_mps <= _STREET_MPS
 
@@ -70,11 +70,11 @@ class Jaywalker(_StreetScript):
     speed_mps: tuple[float, float] = (1.3, 3.0)
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`."""
+        """Return whether the network has bays to hide in, or a street."""
         return bool(network.bays) if self.hidden else super().possible(network)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose a pedestrian that crosses ego's lane."""
         pace_mps = float(rng.uniform(*self.speed_mps))
         draw_origin = self._start_behind_parked if self.hidden else self._start_at_kerb
         origin = draw_origin(view, severity_mps2, pace_mps, rng)
@@ -166,11 +166,11 @@ class LaneBlocked(EventScript):
     speed_mps: tuple[float, float] = (2.5, 7.0)
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: on all roads."""
+        """Return whether the network has lanes: the event is possible on all roads."""
         return bool(network.lanes)
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose an object that rolls into ego's lane."""
         step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         pace_mps, deviation_m = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         clearance_m = float(rng.uniform(0.1, 0.7))
@@ -197,7 +197,7 @@ class ReversingCar(_StreetScript):
     gain_mps2: float = 3.0
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose a car that backs out of a driveway."""
         step, pace_mps = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
         overlap_m, margin_m = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
@@ -231,7 +231,7 @@ class WrongWayCyclist(_StreetScript):
     swing_s: float = 1.6
 
     def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """See :class:`EventScript`."""
+        """Propose a cyclist that comes towards ego."""
         step, pace_mps = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
         clear_s, inner_m = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
         if step is None:

@@ -150,7 +150,7 @@ class Conflicts:
 
 @dataclass(frozen=True)
 class StopLine:
-    """A line that ego's centre must not pass at ``closed`` steps and should not pass at ``late`` ones.
+    """Stop line for ego's centre: passing is forbidden at the steps ``closed``, and discouraged at the steps ``late``.
 
     ``base_m`` is its distance ahead of ego along the path.
     """

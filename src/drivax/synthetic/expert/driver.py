@@ -13,7 +13,7 @@ from drivax.synthetic.expert.violations import Violation, discomfort, find_viola
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
 from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, Staging
-from drivax.synthetic.traffic.simulation import Run, Traffic
+from drivax.synthetic.traffic.simulation import Run, WorldTraffic
 
 #: Hardest braking of an accepted expert, m/s2: just within nuPlan's comfort limit, and the IDM's limit in events.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
@@ -78,7 +78,11 @@ def expert_path(
 
 
 def drive_ego(
-    traffic: Traffic, staging: Staging, first_step: int, aware_step: int = 0, unplanned: Motion | None = None
+    traffic: WorldTraffic,
+    staging: Staging,
+    first_step: int,
+    aware_step: int = 0,
+    unplanned: Motion | None = None,
 ) -> Generator[Run, Motion, tuple[Motion, str]]:
     """Drive ego like other traffic if that is acceptable and comfortable, else along a plan.
 

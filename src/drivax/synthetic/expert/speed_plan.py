@@ -189,7 +189,7 @@ class _OccupiedStates:
         return contact * self._factor + close * self._following
 
     def touches(self, step: int, v: int, s: int) -> bool:
-        """Whether ego touches an obstacle around a step."""
+        """Return whether ego touches an obstacle around a step."""
         half = COARSE // 2
         rows = np.minimum(step + np.arange(-half, half + 1), len(self._occupancy.hard) - 1)
         return bool(self._occupancy.hard[rows, self._index[:, v, s]].any())

@@ -106,7 +106,7 @@ def find_violation(
 
 
 def is_staged(staging: Staging) -> bool:
-    """Whether a staging changes anything."""
+    """Return whether a staging changes anything."""
     return any(vars(staging).values())
 
 
@@ -161,7 +161,7 @@ def inside(
 
 
 def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
-    """Whether a corner of the box leaves the road at any step."""
+    """Return whether a corner of the box leaves the road at any step."""
     is_new = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
     points = corners(box[is_new]).reshape(-1, 2)
     return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
@@ -205,7 +205,7 @@ def _find_rule_violation(roles: Roles, motion: Motion, times_s: _Series, first_s
 def _passes_red_off_route(
     network: RoadNetwork, path: Path, xy: _Points, front: _Points, heading: _Series, red_steps: _LaneSteps
 ) -> bool:
-    """Whether ego, off its route, passes the line of another lane at red; the metric counts this, too."""
+    """Return whether ego, off its route, passes the line of another lane at red; the metric counts this, too."""
     route = {span.lane for span in path.spans}
     red_lanes = np.flatnonzero(red_steps.any(axis=0))
     others = [k for k in red_lanes if network.lanes[k].connector and k not in route]
@@ -237,7 +237,7 @@ def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
 
 
 def _stopped_before_line(lane: Lane, motion: Motion, first_step: int, front: _Points, passed: _Steps) -> bool:
-    """Whether ego stopped at most 3 m before the line and 3 s before each passing of it."""
+    """Return whether ego stopped at most 3 m before the line and 3 s before each passing of it."""
     for step in np.flatnonzero(passed):
         # The stop may lie before the recording.
         begin = max(0, first_step + int(step) - round(_STOP_WINDOW_S / DT_S))
@@ -276,7 +276,7 @@ def against_traffic(
 
 
 def goes_against_traffic(network: RoadNetwork, xy: _Points, heading: _Series) -> bool:
-    """Whether ego travels more than 2 m against traffic within a second."""
+    """Return whether ego travels more than 2 m against traffic within a second."""
     stride = 2
     wrong = against_traffic(network, xy[::stride], heading[::stride])
     travelled = np.hypot(*np.diff(xy[::stride], axis=0).T) * wrong[1:]

@@ -33,12 +33,12 @@ class Pose:
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return Pose(self.x + metres * cos, self.y + metres * sin, self.heading)
 
-    def aside(self, left_m: float) -> Pose:
+    def shift_left(self, left_m: float) -> Pose:
         """Pose at a distance to the left (negative: right)."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return Pose(self.x - left_m * sin, self.y + left_m * cos, self.heading)
 
-    def turned(self) -> Pose:
+    def reverse(self) -> Pose:
         """Pose at the same place with the opposite heading."""
         return Pose(self.x, self.y, self.heading + math.pi)
 
@@ -103,7 +103,7 @@ class Curve:
         xy = self.xy + left_m[:, None] * self.normal
         return Curve(xy, self.heading + np.arctan2(slope, stretch))
 
-    def reversed(self) -> Curve:
+    def reverse(self) -> Curve:
         """Curve in the other direction."""
         return Curve(self.xy[::-1].copy(), self.heading[::-1] + math.pi)
 

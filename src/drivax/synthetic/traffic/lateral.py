@@ -267,7 +267,7 @@ class Detours:
         self, request: DetourRequest, positions: DetourPositions, lateral: float, obstacles: Extents,
         moving: Boxes,
     ) -> bool:  # fmt: skip
-        """Whether the detour is free of road edges, standing obstacles and oncoming, crossing or overtaking users."""
+        """Return whether the detour avoids edges, standing obstacles, and oncoming, crossing or overtaking users."""
         begin, out_end, back_begin, end = positions
         half = request.size_m[1] / 2
         low, high = lateral - half - _EDGE_M, lateral + half + _EDGE_M

@@ -49,7 +49,7 @@ _Values = Float64[np.ndarray, " k"]
 _Indices = Int64[np.ndarray, " k"]
 
 
-class Leaders:
+class LeaderSearch:
     """Search for the leader of every vehicle."""
 
     def __init__(self, worlds: Worlds, drivers: Drivers) -> None:
@@ -234,7 +234,7 @@ class StaticObstacles:
         self.near_m[row, : len(near_m)] = near_m
 
     def is_blocked(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
-        """Whether an obstacle lies within a distance ahead of a vehicle's front, in a band of this half width."""
+        """Return whether an obstacle lies within a distance ahead of a front bumper, in a band of this half width."""
         path_extents = self._extents[row]
         is_blocking = (path_extents.right_m < half_m) & (path_extents.left_m > -half_m)
         is_blocking &= (path_extents.near_m > front_m - 0.5) & (path_extents.near_m < front_m + within_m)

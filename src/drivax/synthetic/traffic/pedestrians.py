@@ -329,7 +329,7 @@ def place_pedestrians(
     """
     pedestrians = []
     for sidewalk in network.sidewalks:
-        length, reverse = float(sidewalk.arc_m[-1]), sidewalk.reversed()
+        length, reverse = float(sidewalk.arc_m[-1]), sidewalk.reverse()
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
             curve = sidewalk if rng.random() < 0.5 else reverse
             # Pedestrians keep to the right.

@@ -73,14 +73,14 @@ def parked_cars(
         if is_occupied and size[0] < bay.length_m:
             clearance = (bay.length_m - size[0]) / 2
             pose = bay.pose.ahead(float(np.clip(along, -clearance, clearance)))
-            pose = replace(pose.aside(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
-            result.append(ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
+            pose = replace(pose.shift_left(float(np.clip(lateral, -0.15, 0.15))), heading=pose.heading + turn)
+            result.append(ScriptedUser.from_pose(AgentKind.VEHICLE, size, pose, steps))
     has_double_parked, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for index in rng.permutation(len(network.bays)).tolist() if has_double_parked else ():
         bay, size = network.bays[index], _draw_size(rng, network.bays[index].length_m)
         if _can_double_park(network, bay, size[1], gap_m):
             pose = _double_parked_pose(network, bay, size[1], gap_m)
-            return (*result, ScriptedUser.standing(AgentKind.VEHICLE, size, pose, steps))
+            return (*result, ScriptedUser.from_pose(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
 
 
@@ -98,11 +98,11 @@ def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: f
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
     side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
-    return centre.aside(side * ((lane.width_m - width_m) / 2 - gap_m))
+    return centre.shift_left(side * ((lane.width_m - width_m) / 2 - gap_m))
 
 
 def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
-    """Whether a car may be double-parked next to a bay: away from the lane's ends, with room for others to pass."""
+    """Return whether a car may be double-parked next to a bay: away from lane ends, with room for others to pass."""
     lane = network.lanes[bay.lane]
     if lane.connector or not _MIN_FROM_ENDS_M < bay.along_m < lane.length_m - _MIN_FROM_ENDS_M:
         return False
@@ -112,7 +112,7 @@ def _can_double_park(network: RoadNetwork, bay: Bay, width_m: float, gap_m: floa
 
 
 def _has_oncoming_lane(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
-    """Whether a lane has an adjacent lane of the other direction."""
+    """Return whether a lane has an adjacent lane of the other direction."""
     current = _pose_at(lane, along_m)
     for other in network.lanes:
         gap = np.hypot(other.curve.xy[:, 0] - current.x, other.curve.xy[:, 1] - current.y)
@@ -227,7 +227,7 @@ def _drop_overlapping(network: RoadNetwork, vehicles: _Places, ego: _Place, most
 def _is_blocked(
     network: RoadNetwork, lane: int, along: float, parked: Sequence[tuple[float, float, float]]
 ) -> bool:
-    """Whether a parked car is in a straight strip, a vehicle wide, from 14 m behind a position to 30 m ahead.
+    """Return whether a parked car is in a straight strip, a vehicle wide, from 14 m behind a position to 30 m ahead.
 
     ``parked`` has the x, y and width of each car. Bends are ignored: cars in bays on their outside may count, and cars
     in the lane further ahead may not.

@@ -348,7 +348,7 @@ class RightOfWay:
     def _clears_in_time(
         self, state: TrafficState, rules: Rules, request: _Request, holders: _Holders
     ) -> bool:
-        """Whether a driver with priority over all blockers need not brake, since they clear before it arrives."""
+        """Return whether a driver with priority over all blockers need not brake, since they clear in time."""
         connector = request.connector
         if rules.control[connector] >= _STOP or not request.required_mps2 < _WAITING_MPS2:
             return False
@@ -365,7 +365,7 @@ class RightOfWay:
         return True
 
     def _accepts_gap(self, state: TrafficState, rules: Rules, request: _Request) -> bool:
-        """Whether the gap to vehicles with priority is large enough."""
+        """Return whether the gap to vehicles with priority is large enough."""
         i, connector, tables = request.row, request.connector, state.tables
         world = int(self._worlds.world[i])
         others, vehicles = rules.yields_to[connector], self._worlds.vehicles(world)

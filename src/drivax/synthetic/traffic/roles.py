@@ -112,7 +112,7 @@ class ScriptedUser:
     valid: Bool[np.ndarray, " time"]
 
     @classmethod
-    def standing(
+    def from_pose(
         cls, kind: AgentKind, size_m: tuple[float, float, float], pose: Pose, steps: int
     ) -> ScriptedUser:
         """Return a user that never moves."""

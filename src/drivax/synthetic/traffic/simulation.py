@@ -36,7 +36,7 @@ from drivax.synthetic.traffic.obstacles import (
     NO_EXTENTS,
     Boxes,
     Extents,
-    Leaders,
+    LeaderSearch,
     StaticObstacles,
     extents,
     nearest_obstacles,
@@ -151,7 +151,7 @@ class _Log:
         )
 
 
-class Traffic:
+class WorldTraffic:
     """Traffic of all users of a world, which can be run several times."""
 
     def __init__(self, roles: Roles, times_s: Float64[np.ndarray, " time"]) -> None:
@@ -163,7 +163,7 @@ class Traffic:
         if roles.network.signals is not None:
             self.colour, self.to_red = roles.network.signals.colours(times_s, shape[1])
 
-    def before_step(self, steps: int) -> Traffic:
+    def before_step(self, steps: int) -> WorldTraffic:
         """Return the traffic of the first ``steps`` steps."""
         shorter = copy.copy(self)
         shorter.times_s = self.times_s[:steps]
@@ -185,9 +185,9 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Run:
-    """Arguments of :meth:`Traffic.run`."""
+    """Arguments of :meth:`WorldTraffic.run`."""
 
-    traffic: Traffic
+    traffic: WorldTraffic
     staging: Staging = field(default_factory=Staging)
     ego: EgoPlan | None = None
 
@@ -241,7 +241,7 @@ class _Simulation:
         self._gather_obstacles(runs)
         self._right_of_way = RightOfWay(worlds, drivers)
         self._changes = LaneChanges(worlds, drivers, self._obstacles.boxes)
-        self._leaders = Leaders(worlds, drivers)
+        self._leaders = LeaderSearch(worlds, drivers)
         self._delay = np.rint(drivers.reaction_s / DT_S).astype(int).clip(0, _MAX_REACTION_STEPS)
         for first_row, run in zip(self._ego_rows.tolist(), runs, strict=True):
             for tailgate in run.staging.tailgates:
@@ -297,12 +297,12 @@ class _Simulation:
 
     def _gather_scripts(self, runs: Sequence[Run]) -> None:
         """Gather moving scripted users, overrides, and planned egos with their positions along their paths."""
-        row = self._worlds.first_row
+        first = self._worlds.first_row
         self._movers = [
             (world, user) for world, run in enumerate(runs) for user in run.staging.extras if not user.is_static
         ]  # fmt: skip
         self._overrides = [
-            (int(row[world]) + override.vehicle, override)
+            (int(first[world]) + override.vehicle, override)
             for world, run in enumerate(runs)
             for override in run.staging.overrides
         ]
@@ -328,19 +328,19 @@ class _Simulation:
         """Record a step and advance all users to the next one."""
         log = self._log
         plans = [
-            (row, plan, min(t - plan.first_step, len(plan.speed) - 1), position_m)
-            for row, plan, position_m in self._plans
+            (vehicle, plan, min(t - plan.first_step, len(plan.speed) - 1), position_m)
+            for vehicle, plan, position_m in self._plans
             if t >= plan.first_step
         ]
-        for row, plan, k, position_m in plans:
-            self._position_m[row], self._speed[row] = position_m[k], plan.speed[k]
+        for vehicle, plan, k, position_m in plans:
+            self._position_m[vehicle], self._speed[vehicle] = position_m[k], plan.speed[k]
         active = self._position_m + self._half_m < self._tables.length_m
         ahead_m = self._position_m + self._speed * _SPEED_TIME_S
         sample = self._tables.interpolate(np.concatenate((self._position_m, ahead_m)).reshape(2, -1))
         pose, fastest, fastest_ahead = sample[0, :, :3], sample[0, :, 3], sample[1, :, 3]
-        for row, plan, k, _ in plans:
-            active[row] = True
-            pose[row] = (*plan.xy[k], plan.heading[k])
+        for vehicle, plan, k, _ in plans:
+            active[vehicle] = True
+            pose[vehicle] = (*plan.xy[k], plan.heading[k])
         self._vehicles = Boxes(pose[:, :2], pose[:, 2], self._speed, self._size_m)
         self._advance_pedestrians(t, active)
         log.pose[t], log.speed[t], log.at_m[t], log.valid[t] = pose, self._speed, self._position_m, active
@@ -349,18 +349,18 @@ class _Simulation:
             self._start_manoeuvres(t, preferred, fastest, active)
         log.acceleration[t] = self._advance(self._apply_reaction_times(t, preferred), active)
 
-    def _switch_path(self, t: int, row: int, path: Path, position_m: float, end_m: float) -> None:
+    def _switch_path(self, t: int, vehicle: int, path: Path, position_m: float, end_m: float) -> None:
         """Put a vehicle at a position on another path; it starts no further manoeuvre before ``end_m``."""
-        world = int(self._worlds.world[row])
+        world = int(self._worlds.world[vehicle])
         crossings = self._tables.crossings[world]
-        self._tables.replace(row, path)
-        self._obstacles.replace(row, path)
-        self._position_m[row] = position_m
+        self._tables.replace(vehicle, path)
+        self._obstacles.replace(vehicle, path)
+        self._position_m[vehicle] = position_m
         # With more crossings than on any path before, all vehicles of its world decide again: stored sets depend on it.
         widened = self._tables.crossings[world] > crossings
-        self._brakes_for_crossing[self._worlds.vehicles(world) if widened else row] = False
-        self._right_of_way.reset_vehicle(row, self._tables, position_m + self._half_m[row])
-        self._busy_m[row], self._rest_until[row] = end_m, t + _REST_STEPS
+        self._brakes_for_crossing[self._worlds.vehicles(world) if widened else vehicle] = False
+        self._right_of_way.reset_vehicle(vehicle, self._tables, position_m + self._half_m[vehicle])
+        self._busy_m[vehicle], self._rest_until[vehicle] = end_m, t + _REST_STEPS
 
     def _advance_pedestrians(self, t: int, active: VehicleMask) -> None:
         """Advance the pedestrians, and gather them and the moving scripted users of this step."""
@@ -422,11 +422,11 @@ class _Simulation:
         """Return the gap for the IDM to the next line, crossing, static obstacle or lane end to stop at."""
         tables, front = self._tables, self._position_m + self._half_m
         committed = {}
-        for row, plan, position_m in self._plans:
+        for vehicle, plan, position_m in self._plans:
             if t >= plan.first_step:
                 step = min(t - plan.first_step + _LOOKAHEAD_STEPS, len(position_m) - 1)
-                front_m = position_m[step] + self._half_m[row]
-                committed[row] = int(np.sum(tables.connector_begin[row] < front_m))
+                front_m = position_m[step] + self._half_m[vehicle]
+                committed[vehicle] = int(np.sum(tables.connector_begin[vehicle] < front_m))
         state = TrafficState(
             tables=tables,
             step=t,
@@ -470,9 +470,9 @@ class _Simulation:
             self._preferred_memory[:] = preferred
         self._preferred_memory[t % depth] = preferred
         result = self._preferred_memory[(t - self._delay) % depth, self._rows]
-        for row, override in self._overrides:
+        for vehicle, override in self._overrides:
             if override.first_step <= t <= override.last_step:
-                result[row] = min(result[row], override.acceleration_mps2)
+                result[vehicle] = min(result[vehicle], override.acceleration_mps2)
         return result
 
     def _advance(self, preferred: PerVehicle, active: VehicleMask) -> PerVehicle:
@@ -495,8 +495,8 @@ class _Simulation:
         """Start lane changes and detours of vehicles that may decide now."""
         # Vehicles of finished worlds keep their paths.
         may_decide = (self._position_m > self._busy_m) & (self._rest_until <= t) & active & (t < self._steps)
-        for row, override in self._overrides:
-            may_decide[row] &= t < override.first_step
+        for vehicle, override in self._overrides:
+            may_decide[vehicle] &= t < override.first_step
         free = may_decide.copy()
         free[self._ego_rows] = False
         state = VehicleState(self._position_m, self._speed, active, free, fastest, preferred)
@@ -504,15 +504,15 @@ class _Simulation:
         for change in changes:
             self._start_lane_change(t, change)
             may_decide[change.vehicle] = False
-        for row, plan, _ in self._plans:
-            may_decide[row] &= t < plan.first_step
+        for vehicle, plan, _ in self._plans:
+            may_decide[vehicle] &= t < plan.first_step
         self._start_detours(t, may_decide)
 
     def _start_lane_change(self, t: int, change: Change) -> None:
         """Start a lane change; after it the vehicle returns to the lanes of its old path where it can."""
-        row, worlds = change.vehicle, self._worlds
-        world, present = worlds.world[row], self._tables.paths[row]
-        network, number = worlds.networks[world], row - int(worlds.first_row[world])
+        vehicle, worlds = change.vehicle, self._worlds
+        world, present = worlds.world[vehicle], self._tables.paths[vehicle]
+        network, number = worlds.networks[world], vehicle - int(worlds.first_row[world])
         lanes = [change.lane - int(worlds.first_lane[world])]
         old_lanes = {span.lane for span in present.spans}
         while network.lanes[lanes[-1]].successors:
@@ -523,15 +523,15 @@ class _Simulation:
         # One wave of 8 cm, 90 m long, with a phase of the vehicle's own.
         sway = Sway((0.08,), (0.07,), (float(number),))
         target = lane_path(network, tuple(lanes), sway)
-        path, position = lane_change_path(target, present, self._position_m[row], change.length_m)
-        self._switch_path(t, row, path, position, position + change.length_m)
+        path, position = lane_change_path(target, present, self._position_m[vehicle], change.length_m)
+        self._switch_path(t, vehicle, path, position, position + change.length_m)
 
     def _start_detours(self, t: int, may_decide: VehicleMask) -> None:
         """Start detours of vehicles near a standing obstacle: a static one, a stuck vehicle or a large halted user."""
         is_stuck, worlds = np.zeros(len(self._rows), bool), self._worlds
-        for row, override in self._overrides:
+        for vehicle, override in self._overrides:
             is_overridden = override.first_step <= t <= override.last_step
-            is_stuck[row] |= is_overridden and self._speed[row] < _HALTED_MPS
+            is_stuck[vehicle] |= is_overridden and self._speed[vehicle] < _HALTED_MPS
         is_halted = np.abs(self._moving_users.speed) < _HALTED_MPS
         is_large = is_halted & (self._moving_users.size_m[:, 0] > _LARGE_M)
         has_stuck = worlds.mask(worlds.world[is_stuck])
@@ -544,20 +544,20 @@ class _Simulation:
         is_looking = np.where(slow_only, self._speed < _SLOW_DETOUR_MPS, self._obstacles.gap(front) < LOOK_M)
         is_looking &= may_decide & may_detour[worlds.world] & (self._speed < _DETOUR_MPS)
         half_m = self._width_m / 2 + DETOUR_MARGIN_M
-        for row in is_looking.nonzero()[0].tolist():
-            if has_halted[worlds.world[row]] or self._obstacles.is_blocked(
-                row, front[row], half_m[row], LOOK_M
+        for vehicle in is_looking.nonzero()[0].tolist():
+            if has_halted[worlds.world[vehicle]] or self._obstacles.is_blocked(
+                vehicle, front[vehicle], half_m[vehicle], LOOK_M
             ):
-                self._start_detour(t, row, is_stuck, is_large)
+                self._start_detour(t, vehicle, is_stuck, is_large)
 
     def _start_detour(
-        self, t: int, row: int, is_stuck: VehicleMask, is_large: Bool[np.ndarray, " user"]
+        self, t: int, vehicle: int, is_stuck: VehicleMask, is_large: Bool[np.ndarray, " user"]
     ) -> None:
         """Start a detour around an obstacle ahead, if there is one; ``is_large`` is a mask of large halted users."""
-        world, worlds = int(self._worlds.world[row]), self._worlds
+        world, worlds = int(self._worlds.world[vehicle]), self._worlds
         is_in_world, is_moving = self._user_world == world, np.abs(self._moving_users.speed) >= _HALTED_MPS
         is_other = (self._position_m > 0.0) & ~is_stuck & (worlds.world == world)
-        is_other[row] = False
+        is_other[vehicle] = False
         standing = self._obstacles.boxes[world].concatenate(
             self._vehicles.select(is_stuck & (worlds.world == world))
         )
@@ -565,9 +565,9 @@ class _Simulation:
         moving = self._vehicles.select(is_other).concatenate(
             self._moving_users.select(is_in_world & is_moving)
         )
-        position, speed = float(self._position_m[row]), float(self._speed[row])
-        size = 2 * float(self._half_m[row]), float(self._width_m[row])
-        request = detour_request(self._tables, row, position, speed, size)
+        position, speed = float(self._position_m[vehicle]), float(self._speed[vehicle])
+        size = 2 * float(self._half_m[vehicle]), float(self._width_m[vehicle])
+        request = detour_request(self._tables, vehicle, position, speed, size)
         detour = self._runs[world].traffic.detours.find(request, standing, moving)
         if detour is not None:
-            self._switch_path(t, row, detour[0], position, detour[1])
+            self._switch_path(t, vehicle, detour[0], position, detour[1])

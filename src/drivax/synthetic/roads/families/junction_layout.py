@@ -185,7 +185,9 @@ class Geometry:
         for heading, street in zip(headings, streets, strict=True):
             pose = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
             centred = (street.outward - street.inward) * street.width_m / 2
-            arms.append(Arm(pose.aside(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street))
+            arms.append(
+                Arm(pose.shift_left(centred + float(rng.uniform(-self.offset_m, self.offset_m))), street)
+            )
         return arms
 
     def mouths(self, rng: np.random.Generator, arms: Sequence[Arm]) -> list[float]:
@@ -219,7 +221,7 @@ def draw_street(
 
 def _intersection(before: Arm, after: Arm) -> tuple[float, float]:
     """Intersect an arm's left edge with the next arm's right edge; return the distances along both middle lines."""
-    start, end = before.base.aside(before.street.left_m), after.base.aside(-after.street.right_m)
+    start, end = before.base.shift_left(before.street.left_m), after.base.shift_left(-after.street.right_m)
     before_m, behind_m = tangent_lengths(start, end, math.sin(end.heading - start.heading))
     return before_m, -behind_m
 
@@ -238,7 +240,7 @@ def add_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[
         lanes = []
         for j in range(count):
             curve = middle.parallel(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))
-            curve = curve if side < 0 else curve.reversed()
+            curve = curve if side < 0 else curve.reverse()
             lanes.append(draft.lane(curve, street.width_m, street.limit_mps))
         for pair in pairwise(lanes):
             draft.link_neighbours(*pair)
@@ -357,7 +359,7 @@ def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: 
     def approach(place: Place) -> Approach:
         return sites[place[0]].approaches[place[1]]
 
-    pieces = [approach(begin).side.parallel(approach(begin).arm.street.left_m).reversed()]
+    pieces = [approach(begin).side.parallel(approach(begin).arm.street.left_m).reverse()]
     end = begin
     while True:
         after = (end[0], (end[1] + 1) % len(sites[end[0]].approaches))
@@ -384,7 +386,9 @@ def _add_crossings(draft: Draft, site: Site) -> None:
         left, right, (begin, end) = street.left_m, -street.right_m, street.crossing_m
         near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in (begin, end))
         if street.marked:
-            draft.crosswalk(near.aside(left), far.aside(left), far.aside(right), near.aside(right))
+            draft.crosswalk(
+                near.shift_left(left), far.shift_left(left), far.shift_left(right), near.shift_left(right)
+            )
         # Connectors begin and end at the stop line.
         to_axis_m = street.stop_line_m - (begin + end) / 2
         entering = [(move.lane, to_axis_m) for move in site.moves if move.arm == i]
@@ -392,5 +396,5 @@ def _add_crossings(draft: Draft, site: Site) -> None:
             (move.lane, draft.lanes[move.lane].length_m - to_axis_m) for move in site.moves if move.to == i
         ]
         middle = near.ahead((end - begin) / 2)
-        axis = points(middle.aside(left), middle.aside(right))
+        axis = points(middle.shift_left(left), middle.shift_left(right))
         draft.crossings.append(Crossing(axis, end - begin, (*entering, *leaving), street.marked))

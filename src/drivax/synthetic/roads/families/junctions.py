@@ -124,7 +124,7 @@ def _yields_to(
 
 
 def _are_separate(approaches: list[list[Move]], conflicts: Conflicts) -> bool:
-    """Whether no moves of two approaches are in conflict."""
+    """Return whether no moves of two approaches are in conflict."""
     a, b = approaches
     return not any(conflicts[x.lane, y.lane] for x in a for y in b)
 
@@ -346,7 +346,7 @@ class Corridor:
         outline = self._draw_outline(rng, style, main)
         first = outline.move_to(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._draw_middle(rng, first.gate)
-        second = self._draw_outline(rng, style, main).move_to(middle.end.turned())
+        second = self._draw_outline(rng, style, main).move_to(middle.end.reverse())
         draft = Draft()
         sites = self._add_sites(rng, draft, (first, second), middle)
         finish_sites(rng, style, draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, self.geometry)
@@ -405,7 +405,7 @@ class Corridor:
         inward, outward = add_lanes(draft, near.arms[0].street, middle)
         shared = (
             Approach(near.arms[0], near.mouths[0], middle, side, inward, outward),
-            Approach(far.arms[0], far.mouths[0], middle.reversed(), side.reversed(), outward, inward),
+            Approach(far.arms[0], far.mouths[0], middle.reverse(), side.reverse(), outward, inward),
         )
         sites = []
         for outline, first in zip(outlines, shared, strict=True):

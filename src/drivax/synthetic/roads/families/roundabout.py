@@ -166,7 +166,7 @@ class Roundabout:
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
             lateral = spread + (j + 0.5) * plan.width_m
-            inward.append(draft.lane(middle.offset_by(lateral).reversed(), plan.width_m, plan.limit_mps))
+            inward.append(draft.lane(middle.offset_by(lateral).reverse(), plan.width_m, plan.limit_mps))
             outward.append(draft.lane(middle.offset_by(-lateral), plan.width_m, plan.limit_mps))
         for lanes in (inward, outward):
             if len(lanes) == 2:
@@ -268,7 +268,7 @@ def _add_islands(draft: Draft, plan: _Plan, arms: list[_Arm]) -> None:
         half = plan.spread_m(arm.middle) - _KERB_M
         axis_piece = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
         half = half[: len(axis_piece.xy)]
-        islands.append(ring(axis_piece.offset_by(half), axis_piece.offset_by(-half).reversed()))
+        islands.append(ring(axis_piece.offset_by(half), axis_piece.offset_by(-half).reverse()))
     draft.edges += [Line(RoadKind.EDGE_MEDIAN, island) for island in islands]
 
 
@@ -289,8 +289,10 @@ def _add_crossing(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
     position = mouth.ahead(_CROSSING_M)
     lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
     lanes += [(lane, _CROSSING_M) for lane in arm.outward]
-    axis = points(position.aside(-half), position.aside(half))
+    axis = points(position.shift_left(-half), position.shift_left(half))
     draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
     if marked:
         near, far = (mouth.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
-        draft.crosswalk(near.aside(half), far.aside(half), far.aside(-half), near.aside(-half))
+        draft.crosswalk(
+            near.shift_left(half), far.shift_left(half), far.shift_left(-half), near.shift_left(-half)
+        )

@@ -113,7 +113,7 @@ class Street:
         """Add the lanes, the edges and the markings."""
         self.add_lanes()
         right, left = self.edge_m
-        outer = ring(self.middle.offset_by(-right), self.middle.offset_by(left).reversed())
+        outer = ring(self.middle.offset_by(-right), self.middle.offset_by(left).reverse())
         self.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, outer))
         self.add_median()
         for side, reach in zip((-1.0, 1.0), self.reach_m, strict=True):
@@ -128,7 +128,7 @@ class Street:
             for k in range(strip.first, strip.last):
                 piece = line.piece(self.cuts[k], self.cuts[k + 1])
                 self.lanes[strip.place, k] = self.draft.lane(
-                    piece if strip.forward else piece.reversed(),
+                    piece if strip.forward else piece.reverse(),
                     self.width_m,
                     self.limit_mps,
                     ends=strip.ends and k == strip.last - 1,
@@ -177,7 +177,7 @@ class Street:
         if self.median_m:
             half, end = self.median_m / 2 - _KERB_M, round(2 / STEP_M)
             inner = self.middle.piece(end, len(self.middle.xy) - 1 - end)
-            island = ring(inner.parallel(half), inner.parallel(-half).reversed())
+            island = ring(inner.parallel(half), inner.parallel(-half).reverse())
             self.draft.edges.append(Line(RoadKind.EDGE_MEDIAN, island))
 
     def add_markings(self) -> None:
@@ -220,11 +220,13 @@ class Street:
         current, right, left = self.middle.pose(at), -self.edge_m[0][at], self.edge_m[1][at]
         section = self._section(at)
         lanes = tuple(self._on_lane(place, k, at) for place, k in self.lanes if k == section)
-        axis = points(current.aside(right), current.aside(left))
+        axis = points(current.shift_left(right), current.shift_left(left))
         self.draft.crossings.append(Crossing(axis, CROSSWALK_M, lanes, marked))
         if marked:
             near, far = (current.ahead(CROSSWALK_M / 2 * sign) for sign in (-1.0, 1.0))
-            self.draft.crosswalk(near.aside(right), near.aside(left), far.aside(left), far.aside(right))
+            self.draft.crosswalk(
+                near.shift_left(right), near.shift_left(left), far.shift_left(left), far.shift_left(right)
+            )
 
     def _on_lane(self, place: int, section: int, at: int) -> tuple[int, float]:
         """Return the lane of a section, and the distance along it at sample ``at`` of the middle line, m."""
@@ -260,12 +262,12 @@ class Street:
 
     def _add_bay(self, place: int, lateral: float, at_m: float, length_m: float) -> None:
         sample = round(at_m / STEP_M)
-        pose = self.middle.pose(sample).aside(lateral)
+        pose = self.middle.pose(sample).shift_left(lateral)
         # Keep the view of crossings free; in a bend, one far away may also be level with the bay.
         along = np.array([np.cos(pose.heading), np.sin(pose.heading)])
         offsets = [crossing.axis.mean(axis=0) - [pose.x, pose.y] for crossing in self.draft.crossings]
         if not any(np.hypot(*offset) < 30.0 and abs(offset @ along) < _BAY_CLEAR_M for offset in offsets):
-            pose = pose if self._forward(place) else pose.turned()
+            pose = pose if self._forward(place) else pose.reverse()
             self.draft.bays.append(Bay(pose, length_m, *self._on_lane(place, self._section(sample), sample)))
 
 

@@ -289,19 +289,19 @@ class Highway(StreetFamily):
         cut = street.cuts[strip.first if direction < 0 else strip.last]
         length = self.ramp_m[0 if direction < 0 else 1]
         line = street.draft.lanes[auxiliary_lane].curve
-        gore = line.start.turned() if direction < 0 else line.end
+        gore = line.start.reverse() if direction < 0 else line.end
         # Followed away from the highway, an on-ramp bends to the left and an off-ramp to the right.
         curvature = np.gradient(street.middle.heading, STEP_M)[cut::direction] * direction
         road_curvature = curvature[: round(length / STEP_M) + 1]
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(road_curvature - direction * bend, STEP_M, gore)
-        curve = outward if direction > 0 else outward.reversed()
+        curve = outward if direction > 0 else outward.reverse()
         limit = street.limit_mps * float(rng.uniform(*self.ramp_limit))
         lane = street.draft.lane(curve, street.width_m, limit, kind=street.kind, exit_only=direction > 0)
         street.draft.link(*((lane, auxiliary_lane) if direction < 0 else (auxiliary_lane, lane)))
         half = street.width_m / 2
         left, right = curve.parallel(half + _RAMP_SHOULDER_M), curve.parallel(-half - street.shoulder_m)
-        nose, sample = _nose(street, strip, left if direction > 0 else left.reversed())
+        nose, sample = _nose(street, strip, left if direction > 0 else left.reverse())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if direction > 0 else left.piece(0, last - nose)
         return _Ramp(lane, left, right, sample)
@@ -346,12 +346,12 @@ def _add_boundary(street: Street, strip: Strip, on_ramp: _Ramp | None, off_ramp:
     pieces, begin = [], 0
     if on_ramp is not None:
         begin = street.cuts[strip.first]
-        pieces += [main.piece(0, on_ramp.nose - 2), on_ramp.left.reversed(), on_ramp.right]
+        pieces += [main.piece(0, on_ramp.nose - 2), on_ramp.left.reverse(), on_ramp.right]
     end = last if off_ramp is None else street.cuts[strip.last]
     pieces.append(full.piece(begin, end))
     if off_ramp is not None:
-        pieces += [off_ramp.right, off_ramp.left.reversed(), main.piece(off_ramp.nose + 2, last)]
-    pieces.append(street.middle.offset_by(left).reversed())
+        pieces += [off_ramp.right, off_ramp.left.reverse(), main.piece(off_ramp.nose + 2, last)]
+    pieces.append(street.middle.offset_by(left).reverse())
     street.draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*pieces)))
     street.add_median()
 

@@ -1,0 +1,2 @@
+from .motion import ArgoverseMotion as ArgoverseMotion
+from .sensor import ArgoverseSensor as ArgoverseSensor

@@ -1,0 +1,1 @@
+from .reader import NuPlan as NuPlan

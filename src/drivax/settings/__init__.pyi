@@ -1,0 +1,10 @@
+from .loading import check_names as check_names
+from .loading import dump as dump
+from .loading import is_path as is_path
+from .loading import load as load
+from .loading import modules_of as modules_of
+from .loading import preset as preset
+from .loading import presets as presets
+from .structure import kind_of as kind_of
+from .structure import parse_yaml as parse_yaml
+from .structure import plain as plain

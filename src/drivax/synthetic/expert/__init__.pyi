@@ -1,0 +1,10 @@
+from .driver import draw_expert as draw_expert
+from .driver import drive_ego as drive_ego
+from .driver import expert_lanes as expert_lanes
+from .driver import expert_path as expert_path
+from .plan import plan_ego as plan_ego
+from .violations import LIMITS as LIMITS
+from .violations import Violation as Violation
+from .violations import broken_limits as broken_limits
+from .violations import discomfort as discomfort
+from .violations import find_violation as find_violation
