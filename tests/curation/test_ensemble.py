@@ -31,9 +31,9 @@ from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
 from drivax.errors import DataError, UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig, BcState
-from drivax.learning.divergence import DivergenceError
 from drivax.learning.driving import Driving
 from drivax.learning.experience import sample_steps
+from drivax.learning.training_log import DivergenceError
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian

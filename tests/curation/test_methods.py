@@ -11,8 +11,7 @@ from drivax.cli.curate import Curate
 from drivax.cli.train import Train
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.methods import METHODS, Request, check_current, curate, event_kinds, event_steps
-from drivax.curation.scores import Combination, read_scores, write_scores
-from drivax.curation.subset import top_rows, write_top
+from drivax.curation.scores import Combination, read_scores, top_rows, write_scores, write_top
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event

@@ -90,8 +90,7 @@ class Curate(MethodInputs):
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and print statistics of scores and weights."""
     from drivax import settings
-    from drivax.curation.scores import read_scores, write_scores
-    from drivax.curation.subset import check_top
+    from drivax.curation.scores import check_top, read_scores, write_scores
     from drivax.scenario.store import ScenarioSet
 
     config = find_method(args.method).config
@@ -208,8 +207,7 @@ def _export(
     embedding: Any,
 ) -> None:
     """Write the subset, and print its path and its first scenarios."""
-    from drivax.curation.scores import OWN_SCORES, read_scores
-    from drivax.curation.subset import write_top
+    from drivax.curation.scores import OWN_SCORES, read_scores, write_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 

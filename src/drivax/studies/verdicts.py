@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.methods import ORACLES
-from drivax.curation.scores import ScoreTable
-from drivax.curation.subset import top_rows
+from drivax.curation.scores import ScoreTable, top_rows
 from drivax.evaluation.episode_table import SHARES
 from drivax.metrics.catalogue import METRICS
 from drivax.stats.ranking import correlation_interval, rank_correlation
