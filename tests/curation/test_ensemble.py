@@ -116,7 +116,7 @@ def test_saved_ensemble_scores_as_the_trained_one_and_other_sets(data, ensemble,
     table = read_scores(scores, ScenarioSet.open(other))
     assert table.config["trained_on"] == data.hash and table.config["folds"] == 3
     assert main([*call, "--out", str(tmp_path / "x.npz"), "--folds", "4"]) == 2
-    assert "members, which exists, has no such setting; leave out --folds 4" in capsys.readouterr().err
+    assert "members, which exists; leave out --folds 4" in capsys.readouterr().err
     assert main(["curate", "kinematic", "--data", str(other), "--members", str(out), "--out", "x.npz"]) == 2
     assert "leave out --members" in capsys.readouterr().err
 
@@ -412,4 +412,4 @@ def test_invalid_settings_are_refused(data, tmp_path, capsys):
     assert main([*call, "--folds", "3"]) == 2
     assert "folds: unknown setting; use one of urgent_s" in capsys.readouterr().err
     assert main([*call[:1], "uniform", *call[2:], "--folds", "3"]) == 2
-    assert "uniform has no such setting; leave out --folds 3" in capsys.readouterr().err
+    assert "unknown setting for uniform; leave out --folds 3" in capsys.readouterr().err

@@ -156,13 +156,13 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
     source = args.members if args.method == "ensemble" else args.actions if is_rarity else None
     is_saved = source is not None and source.exists()
     if is_saved:
-        subject, has_settings = f"{source}, which exists,", False
+        subject, has_settings = f"{source}, which exists", False
     if again or not is_rarity:
         ignored_values["--actions"] = args.actions
     if not args.diverse and (again or args.method not in ("ensemble", "novelty")):
         ignored_values["--members"] = args.members
     if again:
-        subject = f"{args.again}, which is not scored again,"
+        subject = f"{args.again}, which is not scored again"
         ignored_values["--like"] = args.like
         ignored_values["--tables"] = args.tables or None
         ignored_values["--runs"] = args.runs or None
@@ -179,7 +179,7 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
     if again or not has_settings:
         ignored_flags += overrides
     if ignored_flags:
-        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(ignored_flags))
+        raise UsageError(f"unknown setting for {subject}", cure="leave out " + " ".join(ignored_flags))
     if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
         raise UsageError(
             "random_matched permutes finished scores, which have no components",

@@ -68,7 +68,7 @@ def read_stamp(library: bytes) -> dict[str, str] | None:
 
 @cache
 def _load() -> ctypes.CDLL | str:
-    """Return the library with its kernels registered, or why it is not used."""
+    """Load the library and register its kernels; return it, or the reason for not using it."""
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
     cure = "make native" if (SOURCES / "build.py").is_file() else "install drivax again"
@@ -85,7 +85,7 @@ def _load() -> ctypes.CDLL | str:
 
 
 def _access_problem() -> str | None:
-    """Return why more users can write the library than the package's own code, and the cure, or None."""
+    """Return an error with a cure if more users can write the library than the package's own code, else None."""
     own_status = Path(__file__).stat()
     for path in (PATH.resolve(), PATH.resolve().parent, PATH.parent):
         status = path.stat()
@@ -97,7 +97,7 @@ def _access_problem() -> str | None:
 
 
 def _build_problem() -> str | None:
-    """Return why the library, which has not been loaded yet, was not built for this package and machine, or None."""
+    """Return an error if the library, not yet loaded, was not built for this package and machine, else None."""
     if not PATH.is_file():
         return "is not a regular file"
     built = read_stamp(PATH.read_bytes())
@@ -130,7 +130,7 @@ def _target_name(library: ctypes.CDLL, kernel: str) -> str:
 
 
 def state() -> str:
-    """Return which library is in use, or why none is, for ``drivax doctor``."""
+    """Describe the library in use, or the reason for using none, for ``drivax doctor``."""
     library = _load()
     if isinstance(library, str):
         return library

@@ -289,7 +289,10 @@ def rates(
 def rates_of_groups(
     episodes: Episodes, strata: Strata, groups: Mapping[str, Bool[np.ndarray, " scenario"]], metric: str
 ) -> dict[str, dict[str, float | int | None]]:
-    """Return an arm's mean of a metric, with its interval, in each group of scenarios (a mask) with two recordings."""
+    """Return an arm's mean of a metric with its interval, by group of scenarios.
+
+    ``groups`` has a mask per group. Skips groups in which the metric is defined in fewer than two recordings.
+    """
     weights = {name: mask.astype(np.float64) for name, mask in groups.items()}
     return {
         name: _rate(episodes[metric], strata, weight, metric in _SHARES)
@@ -351,7 +354,7 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
 
 
 class ProgressError(Exception):
-    """A driver gets further than the other even at its lowest speed; ``faster``: the first (0) or the second (1)."""
+    """The faster driver makes more progress even at its lowest speed; ``faster``: the first (0) or the second (1)."""
 
     def __init__(self, faster: int) -> None:
         super().__init__(f"driver {faster} makes more progress even at its lowest speed")
@@ -364,7 +367,7 @@ class EqualProgress:
 
     Attributes:
         values: Values of the first and the second driver, NaN where a metric is undefined at any speed.
-        slower: Which driver is slowed down: 0 or 1.
+        slower: The driver whose speed is limited: the first (0) or the second (1).
         share: Its speed limiter, interpolated, as a share of the speed limit.
     """
 
@@ -376,15 +379,16 @@ class EqualProgress:
 def match_progress(
     first: BySpeed, second: BySpeed, metric: str, weights: Float[np.ndarray, " scenario"]
 ) -> EqualProgress:
-    """Return a metric of two drivers at the lower ``progress_ratio`` of both.
+    """Compare two drivers at equal progress by limiting the speed of the faster one.
 
-    The faster driver's metric m is interpolated linearly between the two speeds whose progress p encloses the other
-    driver's progress P. With the slope b of m over p, the result has the values of m - b (p - P): mixed over both
-    speeds for the faster driver, at full speed for the other. Their means are the interpolated ones, and their variance
-    is that of the interpolated difference (delta method): the errors of m and p at both speeds, and of P.
+    Returns ``metric`` of both at the lower ``progress_ratio``. The faster driver's metric m is interpolated linearly
+    between the two speeds whose progress p encloses the other driver's progress P. With the slope b of m over p, the
+    result has the values of m - b (p - P): mixed over both speeds for the faster driver, at full speed for the other.
+    Their means are the interpolated ones, and their variance is that of the interpolated difference (delta method): the
+    errors of m and p at both speeds, and of P.
 
     Raises:
-        ProgressError: The faster driver gets further even at its lowest speed.
+        ProgressError: The faster driver makes more progress even at its lowest speed.
     """
     drivers = first, second
     names = ("progress_ratio", metric)
@@ -410,11 +414,11 @@ def match_progress(
     of_upper, of_lower = (drivers[faster][speed] for speed in (upper, lower))
     slope = (mean(of_upper[metric]) - mean(of_lower[metric])) / range_of_progress
 
-    def adjusted(episodes: Mapping[str, Values]) -> Values:
+    def adjust(episodes: Mapping[str, Values]) -> Values:
         values = episodes[metric] - slope * (episodes["progress_ratio"] - target)
         return np.where(is_defined, values, np.nan)
 
-    mixed = (1.0 - mix) * adjusted(of_upper) + mix * adjusted(of_lower)
-    other = adjusted(drivers[1 - faster][1.0])
+    mixed = (1.0 - mix) * adjust(of_upper) + mix * adjust(of_lower)
+    other = adjust(drivers[1 - faster][1.0])
     share = upper + mix * (lower - upper)
     return EqualProgress((other, mixed) if faster else (mixed, other), faster, share)
