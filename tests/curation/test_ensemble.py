@@ -36,7 +36,7 @@ from drivax.learning.experience import sample_steps
 from drivax.learning.training_log import DivergenceError
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.attention import EntityConfig
-from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
+from drivax.networks.distributions import Grid, SquashedGaussian, SquashedMixture
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -190,7 +190,7 @@ def test_information_depends_on_modes_with_equal_means():
 
     def two_modes(logit):
         parts = SquashedGaussian(jnp.array([[0.0, -1.0], [0.0, 1.0], [0.0, 0.0]]), jnp.full((3, 2), 0.05))
-        return Mixture(jnp.array([logit, -logit, -50.0]), parts)
+        return SquashedMixture(jnp.array([logit, -logit, -50.0]), parts)
 
     key = jax.random.key(0)
     same = stacked(two_modes(0.0), two_modes(0.0))
