@@ -221,11 +221,8 @@ def test_unsuccessful_scenarios_are_split_by_reason():
     assert training_log._split_unsuccessful(values) == shares
 
 
-def test_weights_need_an_offline_algorithm(data, config, tmp_path):
+def test_weights_cannot_be_added_to_a_run(data, config, tmp_path):
     weighted = TrainingSet(data, np.ones((3, 91)))
-    with pytest.raises(UsageError, match="ToyConfig does not draw logged steps by weight"):
-        train(config, weighted, tmp_path / "run", validation=None)
-    assert not (tmp_path / "run").exists()
     train(config, data, tmp_path / "run", validation=None)
     with pytest.raises(UsageError, match="was trained with other weights"):
         train(config, weighted, tmp_path / "run", resume=True)

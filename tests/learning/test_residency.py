@@ -13,7 +13,7 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
 from drivax.learning.algorithms.cql import CqlConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.config import Residency, TrainConfig
-from drivax.learning.experience import cumulative_probability, draw_positions
+from drivax.learning.environment import cumulative_probability, draw_positions
 from drivax.learning.loop import train
 from drivax.learning.program import Program, Seeds
 from drivax.learning.residency import Residents, Rotation
@@ -180,6 +180,31 @@ def test_logged_steps_and_weights_are_those_of_residents(scenarios, algorithm, w
     chosen = None if weights is None else weights[numbers]
     alone = Source.of(config, Subset(scenarios, numbers.tolist()), chosen, (), ())
     assert_equal(program.data, alone.complete(residents.load(6)))
+    residents.close()
+
+
+@pytest.mark.parametrize("resident", [False, True], ids=["all resident", "some resident"])
+def test_episodes_begin_in_scenarios_by_weight(scenarios, resident):
+    weights = np.zeros((8, scenarios.capacity.steps))
+    weights[1:6, 10:12] = [[1.0, 2.0], [0.5, 0.5], [4.0, 0.0], [1.0, 1.0], [0.0, 0.0]]
+    weights[6:, 20] = 0.2, 0.0
+    config = replace(config_of(PPO), residency=RESIDENCY if resident else None)
+    residents = Residents.of(Source.of(config, scenarios, weights, (), ()), None)
+    bank = residents.load()
+    data = residents.complete(bank)
+    numbers, closed = np.arange(8), np.zeros(8, bool)
+    if resident:
+        numbers = residents.rotation.resident(0)
+        closed = np.arange(5) < residents.rotation.leaving
+    expected = np.where(closed, 0.0, weights.sum(axis=1)[numbers])
+    assert expected.any()
+    chance = np.diff(np.asarray(data.chances, np.int64), prepend=0) / (2**32 - 1)
+    np.testing.assert_allclose(chance, expected / expected.sum(), atol=1e-9)
+    learner = config.algorithm.build(residents.source.environment, bank, config.iterations)
+    state = learner.init(data, jax.random.key(0))
+    assert set(np.asarray(state.environments.state.context.index)) <= set(np.flatnonzero(expected))
+    effective = weights.sum() ** 2 / (weights.sum(axis=1) ** 2).sum()
+    assert f"effective sample of {effective:.0f} of 8 scenarios" in residents.notices(data)[-1]
     residents.close()
 
 

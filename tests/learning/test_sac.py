@@ -191,7 +191,7 @@ def test_demonstrations_are_a_share_of_each_batch(logged):
     assert (np.asarray(batch.reward)[~is_logged] < 0.0).all()
     assert float(logs["loss/mean_q"]) != 0.0
     assert training_data(CONFIG, *logged) is logged[1], "without demonstrations nothing is prepared"
-    with pytest.raises(UsageError, match="SacConfig does not draw logged steps by weight"):
+    with pytest.raises(UsageError, match="SacConfig draws neither logged steps nor scenarios by weight"):
         training_data(CONFIG, *logged, np.ones((5, 6)))
 
 

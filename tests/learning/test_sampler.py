@@ -71,7 +71,7 @@ def test_draws_follow_from_the_key_alone(weights):
 
 
 def test_zero_weights_are_refused():
-    with pytest.raises(DataError, match="all weights of usable steps are 0"):
+    with pytest.raises(DataError, match="all weights are 0"):
         sampler(np.zeros((2, 2)))
 
 

@@ -70,6 +70,7 @@ COMMANDS = {
     "generate": Command("generate scenarios of the built-in world", overrides=True),
     "convert": Command("convert a public data set to a scenario set"),
     "export": Command("write a part of a set, or a set or episodes in another format", overrides=True),
+    "merge": Command("merge several sets into one"),
     "inspect": Command("summarise, audit and verify scenario sets"),
     "view": Command("browse and play a scenario set on one HTML page"),
     "curate": Command("score how critical each scenario of a set is", overrides=True),

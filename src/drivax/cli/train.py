@@ -51,7 +51,7 @@ class Train:
 
     Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
-    Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
+    Example: drivax train ppo --data sets/train --scores scores.npz --scale scenario --out runs/ppo-critical
 
     Example: drivax train offline/iql --data sets/train --episodes episodes/mixed --out runs/iql-mixed
     """
@@ -69,7 +69,8 @@ class Train:
     """Episodes to learn from instead of the logs, by bc and offline algorithms: folders of drivax record or runs of
     drivax evaluate, on DATA, or a Minari data set."""
     scores: Path | None = None
-    """Scores of DATA by drivax curate: bc, offline algorithms and sac with demonstrations draw logged steps by them."""
+    """Scores of DATA by drivax curate. bc, offline algorithms and sac with demonstrations draw logged steps by them,
+    others the scenarios in which episodes begin."""
     scale: Literal["step", "scenario"] | None = None
     """Weigh single steps (the default) or whole scenarios; with --scores."""
     arm: Annotated[ArmName | None, tyro.conf.arg(aliases=["--agent"])] = None

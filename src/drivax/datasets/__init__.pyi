@@ -4,6 +4,7 @@ from .conversion import convert as convert
 from .doctor import Diagnosis as Diagnosis
 from .doctor import diagnose as diagnose
 from .export.writer import Export as Export
+from .export.writer import merge as merge
 from .formats import detect as detect
 from .formats import survey as survey
 from .gpudrive import GpuDrive as GpuDrive

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environment, Environments, Outcome, Rollout, SampledAction
+from drivax.learning.environment import (
+    Environment,
+    Environments,
+    Outcome,
+    Rollout,
+    SampledAction,
+    cumulative_probability,
+)
 from drivax.planners.planner import Planner
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 
 #: An additional loss of a policy: maps its parameters and a key to the loss and values to log.
 AuxiliaryLoss = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
@@ -134,19 +144,25 @@ def training_data(
 ) -> Any:
     """Return the data of a learner's iterations: the environment's data, or the logged experience in it.
 
-    ``weights`` ``[N, T]`` are the sampling weights of all logged steps, at least 0; None: uniform.
+    ``weights`` ``[N, T]`` or ``[M, T]`` are the sampling weights of all logged steps, at least 0; None: uniform. For
+    algorithms that draw no logged steps, episodes begin in each scenario in proportion to the sum over its steps.
 
     Raises:
-        UsageError: There are weights, but the algorithm does not draw logged steps by weight.
+        UsageError: There are weights, but neither logged steps nor scenarios to draw by weight.
+        DataError: All weights are 0.
     """
     is_offline = isinstance(config, OfflineAlgorithm)
     experience = config.experience(environment, data, weights) if is_offline else None
     if experience is not None:
         return experience
-    if weights is not None:
-        problem = f"{type(config).__name__} does not draw logged steps by weight"
-        cure = (
-            "leave out the weights, or use bc, cql, iql, awac, td3_bc, or sac or bc_sac with demonstrations"
-        )
-        raise UsageError(problem, cure=cure)
-    return data
+    if weights is None:
+        return data
+    if not isinstance(data, ScenarioBank):
+        problem = f"{type(config).__name__} draws neither logged steps nor scenarios by weight here"
+        raise UsageError(problem, cure="leave out the weights")
+    mass = np.asarray(weights, np.float64).reshape(len(data), -1).sum(axis=1)
+    if data.chances is not None:  # Some scenarios may be closed to new episodes.
+        mass = mass * (np.diff(np.asarray(data.chances, np.int64), prepend=0) > 0)
+        if not mass.any():
+            return data
+    return replace(data, chances=jnp.asarray(cumulative_probability(mass)))

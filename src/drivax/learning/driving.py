@@ -12,12 +12,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environment, Environments, Outcome, any_across_learners
+from drivax.learning.environment import (
+    Environment,
+    Environments,
+    Outcome,
+    any_across_learners,
+    draw_positions,
+)
 from drivax.learning.experience import (
     ExpertActions,
     ExpertSteps,
     StepIndex,
-    draw_positions,
     expert_steps,
     require_log,
 )

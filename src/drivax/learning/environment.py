@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, UInt
 
+from drivax.errors import DataError
 from drivax.scenario.record import record
 
 
@@ -154,6 +155,7 @@ class SampledAction(NamedTuple):
     extra: dict[str, Array]
 
 
+_MAX_UINT32 = 2**32 - 1
 #: The fields of :class:`SampledAction`. An actor samples them, given observations and a key.
 Sampled = tuple[Array, Array, dict[str, Array]]
 Actor = Callable[[Mapping[str, Array], Array], Sampled]
@@ -216,6 +218,24 @@ def collect(
     sums |= {"action_magnitude": magnitudes.sum(), "action_magnitude/n": alive}
     totals |= {name: value.astype(jnp.float32) for name, value in sums.items()}
     return environments, rollout, {name: value.sum() for name, value in totals.items()}
+
+
+def cumulative_probability(weights: np.ndarray) -> UInt[np.ndarray, " n"]:
+    """Return the cumulative probability of weights, in units of ``1 / (2^32 - 1)``.
+
+    Raises:
+        DataError: All weights are 0.
+    """
+    sums = np.cumsum(weights.reshape(-1), dtype=np.float64)
+    if not sums[-1] > 0.0:
+        raise DataError("all weights are 0", cure="give one a weight above 0")
+    return np.floor(sums / sums[-1] * _MAX_UINT32).astype(np.uint32)
+
+
+def draw_positions(cumulative: UInt[Array, " n"], key: Array, shape: tuple[int, ...]) -> Int[Array, "..."]:
+    """Draw positions with replacement, given their cumulative probability; those of probability 0 are never drawn."""
+    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_MAX_UINT32 - 1))
+    return jnp.searchsorted(cumulative, number, side="right").astype(jnp.int32)
 
 
 @custom_vmap

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.checks import check_above_zero, check_at_most
 from drivax.errors import DataError, UsageError
-from drivax.learning.environment import Environment
+from drivax.learning.environment import Environment, cumulative_probability, draw_positions
 from drivax.learning.replay import Transitions
 from drivax.rl.equations import n_step_returns
 from drivax.scenario.record import record, static
@@ -30,8 +30,6 @@ from drivax.stats.intervals import effective_size
 StepIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 #: Observations, expert actions within the bounds, and whether the actions were clipped to them.
 ExpertActions = tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]
-
-_MAX_UINT32 = 2**32 - 1
 
 
 @record
@@ -61,28 +59,10 @@ def sampler(weights: np.ndarray) -> Sampler:
     return Sampler(cumulative, jnp.asarray(effective_size(weights), jnp.float32), weights.shape[1])
 
 
-def cumulative_probability(weights: np.ndarray) -> UInt[np.ndarray, " n"]:
-    """Return the cumulative probability of weights, in units of ``1 / (2^32 - 1)``.
-
-    Raises:
-        DataError: All weights are 0.
-    """
-    sums = np.cumsum(weights.reshape(-1), dtype=np.float64)
-    if not sums[-1] > 0.0:
-        raise DataError("all weights of usable steps are 0", cure="give one a weight above 0")
-    return np.floor(sums / sums[-1] * _MAX_UINT32).astype(np.uint32)
-
-
 def sample_steps(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> StepIndex:
     """Draw step indices with replacement."""
     position = draw_positions(sampler.cumulative, key, shape)
     return position // sampler.steps, position % sampler.steps
-
-
-def draw_positions(cumulative: UInt[Array, " n"], key: Array, shape: tuple[int, ...]) -> Int[Array, "..."]:
-    """Draw positions with replacement, given their cumulative probability; those of probability 0 are never drawn."""
-    number = jnp.minimum(jax.random.bits(key, shape, jnp.uint32), jnp.uint32(_MAX_UINT32 - 1))
-    return jnp.searchsorted(cumulative, number, side="right").astype(jnp.int32)
 
 
 def check_weights(weights: np.ndarray, scenarios: int, steps: int, egos: int) -> np.ndarray:
@@ -212,7 +192,7 @@ class ExperienceConfig:
 
         Raises:
             UsageError: There is no expert, or the weights do not fit the data.
-            DataError: No step is usable, or all weights of usable steps are 0.
+            DataError: No step is usable, or the weights of all usable steps are 0.
         """
         expert = expert_steps(require_log(environment), data)
         usable = expert.usable & ~(expert.clipped & self.mask_clipped)

@@ -20,7 +20,7 @@ from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving, count_egos
-from drivax.learning.experience import check_weights
+from drivax.learning.experience import Experience, check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import PretrainedRun, find_traffic, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
@@ -112,8 +112,8 @@ def train(
 
     Args:
         config: Settings of the training run.
-        data: Scenarios to train on, all held on the device. Weights are for ``bc``, offline algorithms, and ``sac`` and
-            ``bc_sac`` with ``demonstrations``; episodes for ``bc`` and offline algorithms.
+        data: Scenarios to train on. Weights are those of logged steps, or (ppo, sac) of the scenarios in which episodes
+            begin: the sum over their steps. Episodes are for ``bc`` and offline algorithms.
         out: Run folder.
         validation: Scenarios that rank checkpoints. By default, whole recordings of ``data`` are held out: at most a
             tenth of its scenarios and at most 256, or the smallest recording if none fits; nothing if there is only one
@@ -150,8 +150,8 @@ def train(
     program = Program(Seeds(learner, tuple(seeds)), residents.complete(bank), config.devices)
     warn_of_other_bits([folder.info for folder in folders], len(program.devices), opts.log)
     (memory := program.account(None if held_out is None else held_out.bank)).check()
-    notice = validation_set.text() if isinstance(validation_set, HoldOut) else ""
-    for line in filter(None, (notice, residents.text(bank), memory.text())):
+    held_out_notice = [validation_set.text()] if isinstance(validation_set, HoldOut) else []
+    for line in (*held_out_notice, *residents.notices(program.data), memory.text()):
         opts.log(line)
     # Read before folders are created, because an error must leave none.
     networks = {} if opts.resume else pretrained_networks(config.begin_from, program, opts.log)
@@ -208,17 +208,16 @@ def usable_steps(
 ) -> np.ndarray:
     """Return the mask ``[M, T]`` of the logged steps that training with weights can draw, for each ego it drives.
 
-    With episodes, the mask is ``[N, T]`` and holds where any episode of the scenario has such a step. ``trust`` is as
-    for :func:`train`.
-
-    Raises:
-        UsageError: The algorithm does not draw logged steps by weight.
+    With episodes, the mask is ``[N, T]`` and holds where any episode of the scenario has such a step. All steps count
+    for algorithms that draw scenarios instead. ``trust`` is as for :func:`train`.
     """
     training = data if isinstance(data, TrainingSet) else TrainingSet(data)
     scenarios, steps = training.scenarios, training.scenarios.capacity.steps
     uniform = np.ones((len(scenarios), steps))
     source = Source.of(config, scenarios, uniform, training.episodes, trust)
     experience = source.complete(source.load())
+    if not isinstance(experience, Experience):
+        return uniform > 0
     usable, scenario = np.asarray(experience.usable), experience.expert.scenario
     if scenario is None:
         return usable

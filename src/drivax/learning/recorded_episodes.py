@@ -113,12 +113,21 @@ def _without_history(context: AgentContext) -> dict[str, Any]:
     return {field.name: getattr(context, field.name) for field in fields(context) if field.name != "history"}
 
 
-@partial(jax.jit, static_argnums=0)
 def replay_episodes(
     environment: RecordedDriving, bank: ScenarioBank, index: Int[Array, " M"], motion: Float[Array, "M S 4"],
     action: Float[Array, "M S1 D"],
 ) -> RecordedEpisodes:  # fmt: skip
     """Replay all episodes, in batches."""
+    # A compiled function that returned the bank would copy it.
+    return RecordedEpisodes(bank, *_replay_all(environment, bank, index, motion, action))
+
+
+@partial(jax.jit, static_argnums=0)
+def _replay_all(
+    environment: RecordedDriving, bank: ScenarioBank, index: Int[Array, " M"], motion: Float[Array, "M S 4"],
+    action: Float[Array, "M S1 D"],
+) -> tuple[dict[str, Any], Float[Array, "M times 4"], ExpertSteps]:  # fmt: skip
+    """Return contexts, motion and steps of all episodes, as in :class:`RecordedEpisodes`."""
     finite = jnp.isfinite(action).all(axis=-1)
     action = jnp.where(finite[..., None], action, 0.0)
     replay = partial(environment.replay, bank)
@@ -140,7 +149,7 @@ def replay_episodes(
         action, reward, terminated, truncated, usable, clipped | ~is_decision, environment.task.hold,
         scenarios=len(bank), scenario=index,
     )  # fmt: skip
-    return RecordedEpisodes(bank, jax.tree.map(pad, contexts), pad(motion), steps)
+    return jax.tree.map(pad, contexts), pad(motion), steps
 
 
 class StoredEpisode(NamedTuple):

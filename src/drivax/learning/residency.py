@@ -24,12 +24,13 @@ from drivax.errors import UsageError
 from drivax.files import format_bytes
 from drivax.learning.config import Residency, TrainConfig
 from drivax.learning.driving import with_expert_steps
-from drivax.learning.environment import Environments
-from drivax.learning.experience import Experience, cumulative_probability, environment_data
+from drivax.learning.environment import Environments, cumulative_probability
+from drivax.learning.experience import Experience, environment_data
 from drivax.learning.program import Program
 from drivax.learning.replay import Replay
 from drivax.learning.training_set import Rows, Source
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.stats.intervals import effective_size
 
 #: Mean number of episodes that begin in a scenario while it is resident, and the steps of an episode that is assumed.
 _EPISODES, _EPISODE_STEPS = 8, 40
@@ -234,19 +235,26 @@ class Residents:
         taken = time.perf_counter() - started
         return state, {"residency/waited_s": waited, "residency/exchange_s": taken}
 
-    def text(self, bank: ScenarioBank) -> str:
-        """Return a line for the log, given the bank; nothing if all scenarios are resident."""
-        if self.rotation is None:
-            return ""
-        rotation, residency, iterations = self.rotation, self.rotation.residency, self.config.iterations
-        size = format_bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(bank)))
-        entering = iterations // residency.every * residency.block
-        times = (residency.scenarios + entering) / rotation.total
-        return (
-            f"residency: {residency.scenarios:,} of {rotation.total:,} scenarios ({size} per device), "
-            f"{residency.block} exchanged every {residency.every} iterations: {entering:,} enter in the run, so that "
-            f"each is resident {times:.1f} times"
-        )
+    def notices(self, data: Any) -> list[str]:
+        """Return lines for the log about residency and weights of scenarios, given the data of the algorithm."""
+        lines, rotation, weights = [], self.rotation, self.source.weights
+        if rotation is not None:
+            residency, iterations = rotation.residency, self.config.iterations
+            size = format_bytes(sum(leaf.nbytes for leaf in jax.tree.leaves(environment_data(data))))
+            entering = iterations // residency.every * residency.block
+            times = (residency.scenarios + entering) / rotation.total
+            lines.append(
+                f"residency: {residency.scenarios:,} of {rotation.total:,} scenarios ({size} per device), "
+                f"{residency.block} exchanged every {residency.every} iterations: {entering:,} enter in the run, so "
+                f"that each is resident {times:.1f} times"
+            )
+        if weights is not None and not isinstance(data, Experience):
+            total = len(self.source.scenarios)
+            effective = effective_size(weights.reshape(total, -1).sum(axis=1))
+            lines.append(
+                f"episodes begin by weight: effective sample of {effective:,.0f} of {total:,} scenarios"
+            )
+        return lines
 
     def close(self) -> None:
         """Stop the thread."""

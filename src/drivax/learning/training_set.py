@@ -133,7 +133,7 @@ class Source:
         return recorded
 
     def complete(self, data: Any, rows: Rows | None = None) -> Any:
-        """Return the data of the algorithm's iterations, given those of the environment.
+        """Return the data of the algorithm's iterations, given those of the environment (:func:`training_data`).
 
         ``rows`` are the numbers of the scenarios that these contain; None: all.
         """

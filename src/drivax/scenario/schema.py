@@ -10,8 +10,8 @@ from __future__ import annotations
 import enum
 import hashlib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from typing import Any
 
@@ -187,6 +187,27 @@ class Capacity:
         return self if egos == self.egos else replace(self, name=f"{self.name}-{egos}egos", egos=egos)
 
 
+def common_capacity(capacities: Iterable[Capacity]) -> Capacity:
+    """Return the smallest capacity that holds scenarios of all these capacities.
+
+    Raises:
+        UsageError: They differ in steps or in the grid.
+    """
+    first, *others = dict.fromkeys(capacities)
+    for other in others:
+        for name, cure in (("steps", "convert both with one --future-s"), ("grid", ""), ("cell_m", "")):
+            if (own := getattr(first, name)) != (value := getattr(other, name)):
+                problem = f"capacity {other.name!r} has {name} {value:g}, {first.name!r} {own:g}"
+                raise UsageError(problem, cure=cure or "convert both with one --capacity")
+    most = {
+        f.name: max(getattr(c, f.name) for c in (first, *others))
+        for f in fields(Capacity)
+        if f.name != "name"
+    }
+    exact = (c for c in (first, *others) if asdict(c) == most | {"name": c.name})
+    return next(exact, Capacity("+".join(sorted({c.name for c in (first, *others)})), **most))
+
+
 CAPACITIES = {
     "default": Capacity(),
     "large": Capacity(
@@ -288,6 +309,24 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
         end = offsets[-1] + np.dtype(field_type).itemsize
     names, formats, itemsize = list(layout), list(layout.values()), -(-end // 4096) * 4096
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+
+
+#: Fields in which unused slots and unknown values are -1; they are 0 in all others.
+_MISSING = (
+    "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
+    "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
+    "lane_successor", "lane_predecessor", "lane_left", "lane_right", "lane_light", "route_lane", "route_limit",
+    "road_kind", "road_limit", "event_kind", "event_start", "event_end", "event_actor", "ego_slot", "ego_route_lane",
+    "ego_route_limit",
+)  # fmt: skip
+
+
+def blank(capacity: Capacity) -> np.ndarray[Any, Any]:
+    """Return a record without valid entries: zeros, and -1 for missing indices and values."""
+    record = np.zeros((), record_dtype(capacity))
+    for name in set(_MISSING) & set(record.dtype.names or ()):
+        record[name] = -1
+    return record
 
 
 def stack_field(records: Sequence[np.ndarray[Any, Any]], name: str, *part: Any) -> np.ndarray[Any, Any]:
@@ -409,6 +448,16 @@ class Scenario:
     def text(self, name: str) -> str:
         """Return ``scenario_id``, ``dataset`` or ``segment`` as the source has it."""
         return self.names.get(name) or bytes(self.record[name][()]).rstrip(b"\0").decode()
+
+    def fit(self, capacity: Capacity) -> Scenario:
+        """Return the scenario with the padding of another capacity, at least as large in all sizes."""
+        if capacity == self.capacity:
+            return self
+        record = blank(capacity)
+        for name in self.record.dtype.names or ():
+            values = self.record[name]
+            record[name][tuple(map(slice, values.shape))] = values
+        return replace(self, record=record, capacity=capacity)
 
     @property
     def has(self) -> Flag:

@@ -15,6 +15,7 @@ from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError, did_you_mean
 from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
+from drivax.scenario.schema import common_capacity
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter, check_set_space
 
@@ -133,6 +134,50 @@ def write_part(
             if progress is not None:
                 progress(number, len(rows))
     return Exported(out, len(rows), len(ScenarioSet.open(out).manifest["shards"]), {})
+
+
+def merge(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    filters: Sequence[str] = (),
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Exported:
+    """Write the scenarios of several sets as one set, which appears under ``out`` when it is complete.
+
+    Records of smaller capacities are padded. Every scenario keeps its data set, segment and tags.
+
+    Args:
+        paths: The sets, in the order of the new one.
+        out: Folder to create.
+        filters: Conditions on scenarios, such as ``type=turn_left`` (``scenario.select.selection``).
+        overwrite: Replace an existing scenario set; other folders are never replaced.
+        progress: Called with (scenarios done, scenarios).
+
+    Raises:
+        DataError: A set is damaged, no scenario of it is selected, or two sets have the same scenario.
+        UsageError: There are fewer than two sets, their capacities differ in steps or grid, or ``out`` exists and may
+            not be replaced.
+    """
+    out, sets = Path(out), [ScenarioSet.open(path) for path in paths]
+    if len(sets) < 2:
+        raise UsageError("one set to merge", cure="name two or more")
+    capacity = common_capacity(scenarios.capacity for scenarios in sets)
+    rows = [select_scenarios(scenarios, filters) for scenarios in sets]
+    total = sum(map(len, rows))
+    for scenarios in sets:
+        refuse_part(scenarios, out)
+    source = {"merged": [{"set": s.path.name, "hash": s.hash, "source": s.manifest["source"]} for s in sets]}
+    check_set_space(out, capacity, total)
+    with ScenarioWriter(out, capacity, source, overwrite=overwrite) as writer:
+        for scenarios, numbers in zip(sets, rows, strict=True):
+            for number in numbers:
+                writer.add(scenarios[number].fit(capacity))
+                if progress is not None:
+                    progress(len(writer), total)
+            scenarios.release()
+    return Exported(out, total, len(ScenarioSet.open(out).manifest["shards"]), {})
 
 
 def refuse_part(scenarios: ScenarioSet, out: Path) -> None:

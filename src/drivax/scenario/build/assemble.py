@@ -62,7 +62,7 @@ from drivax.scenario.schema import (
     Scenario,
     SourceCounts,
     among,
-    record_dtype,
+    blank,
     stored_name,
 )
 from drivax.scenario.select.tags import scenario_tags
@@ -82,14 +82,6 @@ MEASURED = (
 )  # fmt: skip
 #: Actors that a record stores per event.
 EVENT_ACTORS = 4
-#: Fields in which unused slots and unknown values are -1; they are 0 in all others.
-MISSING = (
-    "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
-    "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
-    "lane_successor", "lane_predecessor", "lane_left", "lane_right", "lane_light", "route_lane", "route_limit",
-    "road_kind", "road_limit", "event_kind", "event_start", "event_end", "event_actor", "ego_slot", "ego_route_lane",
-    "ego_route_limit",
-)  # fmt: skip
 #: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
 _LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
 _FEATURE_GROUPS = {
@@ -399,14 +391,6 @@ def fill(
             record[f"event_{name}"][i] = getattr(event, name)
         actors = event.actors[:EVENT_ACTORS]
         record["event_actor"][i, : len(actors)] = actors
-    return record
-
-
-def blank(capacity: Capacity) -> Record:
-    """Return a record without valid entries: zeros, and -1 for missing indices and values."""
-    record = np.zeros((), record_dtype(capacity))
-    for name in set(MISSING) & set(record.dtype.names or ()):
-        record[name] = -1
     return record
 
 
