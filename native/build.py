@@ -25,7 +25,7 @@ import jax.ffi
 SOURCES = Path(__file__).resolve().parent
 LIBRARY = SOURCES.parent / "src" / "drivax" / "kernels" / "libdrivax.so"
 #: drivax itself may not be installed yet.
-_stamp = runpy.run_path(str(LIBRARY.with_name("stamp.py")))
+_library = runpy.run_path(str(LIBRARY.with_name("library.py")))
 #: Flags of each target, and floats per vector.
 TARGETS = {
     "sse42": (("-msse4.2",), 4),
@@ -83,7 +83,7 @@ def build_hash(flags: list[str], sources: str) -> str:
 
 def build(options: tuple[str, ...] = ()) -> None:
     """Compile all sources and link them; the library appears under its name when it is complete."""
-    stamp = _stamp["stamp"](SOURCES)
+    stamp = _library["stamp"](SOURCES)
     with tempfile.TemporaryDirectory(dir=LIBRARY.parent) as folder:
         steps = commands(Path(folder), options, stamp["sources"])
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -101,10 +101,10 @@ def build(options: tuple[str, ...] = ()) -> None:
             str(library),
         ]
         subprocess.run(link, check=True)
-        if _stamp["stamp"](SOURCES) != stamp:
+        if _library["stamp"](SOURCES) != stamp:
             sys.exit("make native: sources changed during the build; run it again")
         stamp["options"] = " ".join(options)
-        library.write_bytes(_stamp["append_stamp"](library.read_bytes(), stamp))
+        library.write_bytes(_library["append_stamp"](library.read_bytes(), stamp))
         # Whatever the umask: drivax loads no library that other users can write.
         library.chmod(library.stat().st_mode & ~0o022)
         library.replace(LIBRARY)

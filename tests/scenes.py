@@ -125,30 +125,4 @@ def further_egos(recordings, capacity, egos):
     return scenarios, alone, np.array(places)
 
 
-def moved(recording, angle, dx, dy):
-    """The same world rotated about the origin and shifted."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.array([[cos, sin], [-sin, cos]])
-
-    def place(xy):
-        return xy @ turn + np.array([dx, dy])
-
-    old = recording.tracks
-    new = replace(
-        old,
-        xy=np.where(old.valid[..., None], place(old.xy), 0.0),
-        velocity=old.velocity @ turn,
-        heading=np.where(old.valid, (old.heading + angle + np.pi) % (2 * np.pi) - np.pi, 0.0),
-    )
-    features = tuple(
-        replace(f, points=np.concatenate([place(f.points[:, :2]), f.points[:, 2:]], 1))
-        for f in recording.features
-    )
-    lights = tuple(
-        replace(li, stop_point=np.array([*place(li.stop_point[None, :2])[0], li.stop_point[2]]))
-        for li in recording.lights
-    )
-    return replace(recording, tracks=new, features=features, lights=lights)
-
-
 RED, GREEN = LightState.STOP, LightState.GO

@@ -15,9 +15,8 @@ import pytest
 from drivax.api import evaluate
 from drivax.cli import main
 from drivax.errors import DataError
-from drivax.evaluation.comparison import compare
+from drivax.evaluation.comparison import ComparisonPlan, compare
 from drivax.evaluation.episode_table import Crash, EpisodeTable, Trajectories
-from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.result_tables import planners_table, transfer_table
 from drivax.evaluation.runner import EvaluationConfig
 from drivax.learning.config import TrainConfig

@@ -23,8 +23,7 @@ from drivax.curation.scores import ScoreTable
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import make_agent, train
-from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
-from drivax.learning.pretrained import PretrainedRun
+from drivax.learning.policies import PretrainedRun, export_policy, find_traffic, load_policy, policy_traffic
 from drivax.planners.catalogue import make_planner
 from drivax.plugins import find_named, makes, result_class
 from drivax.scenario.store import ScenarioSet

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
 from drivax.files import write_json
-from drivax.report.pictures.still import draw_on
+from drivax.report.pictures.drawing import draw_on
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES, CURRENT_STEP, DT_S, LEAST_STEPS, AgentKind, Scenario

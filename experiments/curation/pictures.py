@@ -20,8 +20,8 @@ from drivax.curation.logged import score_steps
 from drivax.curation.methods import Request, curate, ensemble_table
 from drivax.curation.rarity import ExpertActions, KernelRarity, known_actions
 from drivax.curation.scores import ScoreTable
+from drivax.report.pictures.drawing import draw_on
 from drivax.report.pictures.palette import LIGHT, SERIES
-from drivax.report.pictures.still import draw_on
 from drivax.scenario.schema import DT_S, STEPS
 from drivax.scenario.store import ScenarioSet
 from experiments.repository import DOCS, save_picture

@@ -224,7 +224,7 @@ def offenders(rows: list[dict[str, Any]]) -> str:
 
 def draw(row: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:
     """Draw a violation at its first step."""
-    from drivax.report.pictures.still import draw_scenario
+    from drivax.report.pictures.drawing import draw_scenario
 
     steps = [row[name] for name in ("collision_step", "first_offroad_step", "red_light_step")]
     step = min(step for step in steps if step is not None)

@@ -24,9 +24,8 @@ import numpy as np
 
 from drivax.files import write_json
 from drivax.learning.algorithms.off_policy_evaluation import FittedQ, FittedQConfig, estimate_return
-from drivax.learning.algorithms.offline import OfflineConfig
+from drivax.learning.algorithms.offline import OfflineConfig, policy_returns
 from drivax.learning.config import TrainConfig
-from drivax.learning.critic_health import policy_returns
 from drivax.learning.driving import Driving
 from drivax.learning.experience import Experience, ExperienceConfig
 from drivax.learning.policies import load_policy

@@ -11,7 +11,7 @@ import argparse
 import json
 from typing import Any
 
-from drivax.studies.bench_encoders import bench_encoders
+from drivax.studies.bench import bench_encoders
 from experiments.repository import DOCS, RESULTS
 
 RESULT = RESULTS / "encoders.json"

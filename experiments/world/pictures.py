@@ -23,9 +23,8 @@ from matplotlib.patches import Polygon
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.report.pictures.drawing import road_lines
+from drivax.report.pictures.drawing import draw_on, road_lines
 from drivax.report.pictures.palette import LIGHT
-from drivax.report.pictures.still import draw_on
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CURRENT_STEP, DT_S, Scenario
 from drivax.synthetic.domains import DOMAINS

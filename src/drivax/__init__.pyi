@@ -8,8 +8,8 @@ from .api import generate as generate
 from .api import load as load
 from .api import make_simulator as make_simulator
 from .compilation import use_compilation_cache as use_compilation_cache
+from .evaluation.comparison import ComparisonPlan as ComparisonPlan
 from .evaluation.episode_table import EpisodeTable as EpisodeTable
-from .evaluation.plan import ComparisonPlan as ComparisonPlan
 from .learning.config import TrainConfig as TrainConfig
 from .learning.loop import make_agent as make_agent
 from .learning.loop import train as train

@@ -12,10 +12,9 @@ from drivax import curation, datasets, learning, synthetic
 from drivax.errors import UsageError
 from drivax.evaluation import runner
 from drivax.evaluation.audit import audit, scenario_names
-from drivax.evaluation.comparison import Comparison
+from drivax.evaluation.comparison import Comparison, ComparisonPlan
 from drivax.evaluation.comparison import compare as compare_evaluations
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.runner import with_metrics
 from drivax.planners.catalogue import PLANNERS, as_planner, default_task, make_planner
 from drivax.planners.planner import Planner

@@ -11,8 +11,7 @@ from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import score_steps, valid_steps
 from drivax.curation.methods import Request, curate
 from drivax.curation.rarity import ExpertActions
-from drivax.curation.scores import ScoreTable, aggregate, read_scores, write_scores
-from drivax.curation.subset import top_rows, write_top
+from drivax.curation.scores import ScoreTable, aggregate, read_scores, top_rows, write_scores, write_top
 from drivax.curation.weights import WeightConfig, draw_statistics, permute_scores, sampling_weights
 from drivax.errors import DataError, UsageError
 from drivax.report.pages.viewer import criticality_html

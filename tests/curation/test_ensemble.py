@@ -31,12 +31,12 @@ from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
 from drivax.errors import DataError, UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig, BcState
-from drivax.learning.divergence import DivergenceError
 from drivax.learning.driving import Driving
 from drivax.learning.experience import sample_steps
+from drivax.learning.training_log import DivergenceError
 from drivax.networks.actor_critic import NetworkConfig
-from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
-from drivax.networks.entity import EntityConfig
+from drivax.networks.attention import EntityConfig
+from drivax.networks.distributions import Grid, SquashedGaussian, SquashedMixture
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -116,7 +116,7 @@ def test_saved_ensemble_scores_as_the_trained_one_and_other_sets(data, ensemble,
     table = read_scores(scores, ScenarioSet.open(other))
     assert table.config["trained_on"] == data.hash and table.config["folds"] == 3
     assert main([*call, "--out", str(tmp_path / "x.npz"), "--folds", "4"]) == 2
-    assert "members, which exists, has no such setting; leave out --folds 4" in capsys.readouterr().err
+    assert "members, which exists; leave out --folds 4" in capsys.readouterr().err
     assert main(["curate", "kinematic", "--data", str(other), "--members", str(out), "--out", "x.npz"]) == 2
     assert "leave out --members" in capsys.readouterr().err
 
@@ -190,7 +190,7 @@ def test_information_depends_on_modes_with_equal_means():
 
     def two_modes(logit):
         parts = SquashedGaussian(jnp.array([[0.0, -1.0], [0.0, 1.0], [0.0, 0.0]]), jnp.full((3, 2), 0.05))
-        return Mixture(jnp.array([logit, -logit, -50.0]), parts)
+        return SquashedMixture(jnp.array([logit, -logit, -50.0]), parts)
 
     key = jax.random.key(0)
     same = stacked(two_modes(0.0), two_modes(0.0))
@@ -412,4 +412,4 @@ def test_invalid_settings_are_refused(data, tmp_path, capsys):
     assert main([*call, "--folds", "3"]) == 2
     assert "folds: unknown setting; use one of urgent_s" in capsys.readouterr().err
     assert main([*call[:1], "uniform", *call[2:], "--folds", "3"]) == 2
-    assert "uniform has no such setting; leave out --folds 3" in capsys.readouterr().err
+    assert "unknown setting for uniform; leave out --folds 3" in capsys.readouterr().err

@@ -13,7 +13,8 @@ from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from scenes import bank_of, car, moved, straight_road
+from drivax.testing.worlds import rotate_recording
+from scenes import bank_of, car, straight_road
 
 NOW = 10  # the step at which `car` is at (x, y)
 CONFIG = KinematicConfig()
@@ -141,7 +142,7 @@ def test_nearer_and_faster_is_more_critical(steps):
 
 def test_invariant_to_shifting_and_turning_the_world(components):
     names = ("leader", "pedestrian", "far", "beside", "kerb")
-    turned = bank_of(*(moved(straight_road(SCENES[name]), 2.1, 300.0, -70.0) for name in names))
+    turned = bank_of(*(rotate_recording(straight_road(SCENES[name]), 2.1, 300.0, -70.0) for name in names))
     for name, part in score_bank(CONFIG, turned).items():
         for row, scene in enumerate(names):
             np.testing.assert_allclose(

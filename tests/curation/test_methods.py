@@ -11,8 +11,7 @@ from drivax.cli.curate import Curate
 from drivax.cli.train import Train
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.methods import METHODS, Request, check_current, curate, event_kinds, event_steps
-from drivax.curation.scores import Combination, read_scores, write_scores
-from drivax.curation.subset import top_rows, write_top
+from drivax.curation.scores import Combination, read_scores, top_rows, write_scores, write_top
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
@@ -135,9 +134,9 @@ def test_histogram_of_one_set_scores_another(data, tables, tmp_path, capsys):
     for wrong, words in (
         (
             ["action_rarity", "--temper", "0.5"],
-            "actions.npz, which exists, has no such setting; leave out --temper 0.5",
+            "actions.npz, which exists; leave out --temper 0.5",
         ),
-        (["kinematic"], "kinematic has no such setting; leave out --actions"),
+        (["kinematic"], "unknown setting for kinematic; leave out --actions"),
         (
             ["action_rarity_published"],
             "is a histogram of action_rarity; use curate action_rarity, or another file",
@@ -242,7 +241,7 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
     assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 0
     np.testing.assert_allclose(read_scores(out, data).steps, table.steps, atol=1e-6)
     assert main(["curate", "oracle", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 2
-    assert "oracle has no such setting; leave out --urgent_s 2" in capsys.readouterr().err
+    assert "unknown setting for oracle; leave out --urgent_s 2" in capsys.readouterr().err
 
 
 def test_weights_and_aggregators_can_be_changed(data, tmp_path):

@@ -11,8 +11,7 @@ from drivax.cli import main
 from drivax.curation.ensemble import EnsembleConfig, load_ensemble
 from drivax.curation.methods import Request, curate
 from drivax.curation.novelty import Embedding, NoveltyConfig, nearest_distances, scenario_embeddings
-from drivax.curation.scores import read_scores
-from drivax.curation.subset import diverse_rows
+from drivax.curation.scores import diverse_rows, read_scores
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

@@ -302,9 +302,9 @@ def test_command_writes_scores(data, tmp_path, capsys):
     assert "is a table of kinematic; use curate kinematic" in capsys.readouterr().err
     for ignored in (["--seed", "1"], ["--like", str(out)]):
         assert main([*recombine, "--overwrite", *ignored]) == 2
-        assert f"has no such setting; leave out {ignored[0]}" in capsys.readouterr().err
+        assert f"which is not scored again; leave out {ignored[0]}" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "x"), "--seed", "1"]) == 2
-    assert "kinematic has no such setting; leave out --seed" in capsys.readouterr().err
+    assert "unknown setting for kinematic; leave out --seed" in capsys.readouterr().err
     control = ["curate", "random_matched", *command[2:], "--like", str(out), "--out", str(tmp_path / "x")]
     assert main([*control, "--scenario", "max"]) == 2
     assert "which have no components; pass --weights and --scenario to the method" in capsys.readouterr().err

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.curation import subset
+from drivax.curation import scores
 from drivax.curation.methods import Request, curate
-from drivax.curation.scores import ScoreTable, read_scores, write_scores
-from drivax.curation.subset import check_top, top_rows, write_top
+from drivax.curation.scores import ScoreTable, check_top, read_scores, top_rows, write_scores, write_top
 from drivax.errors import DataError, UsageError
 from drivax.report.pages.viewer import criticality_html
 from drivax.scenario.build.assemble import assemble
@@ -139,7 +138,7 @@ def test_subset_folder_holds_its_scores(data, tmp_path, monkeypatch):
 def test_failed_subset_leaves_no_folder(data, tmp_path, monkeypatch):
     table = hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6])
     write_top(table, data, 1, tmp_path / "top")
-    monkeypatch.setattr(subset, "write_scores", lambda *_: 1 / 0)
+    monkeypatch.setattr(scores, "write_scores", lambda *_: 1 / 0)
     for name in ("top", "other"):
         with pytest.raises(ZeroDivisionError):
             write_top(table, data, 2, tmp_path / name, overwrite=True)

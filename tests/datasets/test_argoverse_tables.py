@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from drivax.datasets.argoverse import unpacked_size
+from drivax.datasets.argoverse import tables
 from drivax.datasets.argoverse.tables import Kind, read_table
 from drivax.errors import DataError
 
@@ -180,7 +180,7 @@ print(refused)
 def test_rows_and_bytes_are_counted_before_they_are_read(tmp_path, monkeypatch, form, limit, words):
     table = pa.table({"x": np.arange(8.0), "name": list("abcdefgh")})
     path = write(tmp_path / form, table, **FORMATS[form])
-    monkeypatch.setattr(unpacked_size, limit, 7)
+    monkeypatch.setattr(tables, limit, 7)
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *_, **__: pytest.fail("read"))
     with pytest.raises(DataError, match=words):
         read_table(path, COLUMNS)
@@ -189,7 +189,7 @@ def test_rows_and_bytes_are_counted_before_they_are_read(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("form", FORMATS)
 def test_pages_and_messages_are_counted(tmp_path, monkeypatch, form):
     path = write(tmp_path / form, pa.table({"x": np.zeros(8), "name": list("abcdefgh")}), **FORMATS[form])
-    monkeypatch.setattr(unpacked_size, "_MOST_PARTS", 1)
+    monkeypatch.setattr(tables, "_MOST_PARTS", 1)
     with pytest.raises(DataError, match="more than 1 pages or messages"):
         read_table(path, COLUMNS)
 
@@ -198,9 +198,9 @@ def test_headers_of_pages_take_room(tmp_path, monkeypatch):
     path = write(tmp_path / "a.parquet", pa.table({"x": np.zeros(8), "name": list("abcdefgh")}))
     group = pq.read_metadata(path).row_group(0)
     with_headers = sum(group.column(number).total_uncompressed_size for number in range(2))
-    monkeypatch.setattr(unpacked_size, "MOST_BYTES", with_headers)
+    monkeypatch.setattr(tables, "MOST_BYTES", with_headers)
     read_table(path, COLUMNS)
-    monkeypatch.setattr(unpacked_size, "MOST_BYTES", with_headers - 1)
+    monkeypatch.setattr(tables, "MOST_BYTES", with_headers - 1)
     with pytest.raises(DataError, match="unpacks to more than"):
         read_table(path, COLUMNS)
 

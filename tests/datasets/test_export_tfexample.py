@@ -13,10 +13,9 @@ from datasets.test_export_recording import assert_same_map
 from drivax.datasets.export.recording import restore
 from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.womd import example_reader as womd_example
-from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import scenario_reader as protos
 from drivax.datasets.womd.messages import ORIGIN
-from drivax.datasets.womd.tfrecord import example
+from drivax.datasets.womd.tfrecord import EXAMPLE_FORMAT, example, format_of
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
@@ -432,7 +431,7 @@ def test_dense_map_is_sampled_more_sparsely_and_not_cut_off():
 def round_trip(recording, tolerance_m: float = 1e-3):
     stored = assemble(recording)
     payload = example(tf_example(stored)[0])
-    assert womd.format_of(payload) == womd.EXAMPLE_FORMAT  # not taken for ScenarioMax's
+    assert format_of(payload) == EXAMPLE_FORMAT  # not taken for ScenarioMax's
     back = womd_example.WomdExample().decode(payload)
     kept = restore(stored)
     rows = [kept.tracks.track_id.tolist().index(number) for number in back.tracks.track_id]

@@ -10,8 +10,8 @@ import pytest
 
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd.example_reader import ScenarioMax, WomdExample
-from drivax.datasets.womd.records import format_of
 from drivax.datasets.womd.scenario_reader import WomdScenario
+from drivax.datasets.womd.tfrecord import format_of
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording

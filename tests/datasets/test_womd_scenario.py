@@ -14,8 +14,8 @@ import pytest
 from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd import messages
-from drivax.datasets.womd.records import notes_of
 from drivax.datasets.womd.scenario_reader import WomdScenario
+from drivax.datasets.womd.tfrecord import notes_of
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature, Recording, windows

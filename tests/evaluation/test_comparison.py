@@ -13,9 +13,8 @@ import scipy.stats
 import drivax
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.comparison import compare
+from drivax.evaluation.comparison import ComparisonPlan, compare
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.evaluation.plan import ComparisonPlan
 from drivax.stats.effects import power, scenarios_needed
 from drivax.stats.intervals import paired_bootstrap, rate
 from drivax.stats.significance import holm_adjust, mcnemar_test, paired_permutation

@@ -18,7 +18,8 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
-from scenes import GLIMPSE, RED, SMALL, bank_of, car, moved, straight_road
+from drivax.testing.worlds import rotate_recording
+from scenes import GLIMPSE, RED, SMALL, bank_of, car, straight_road
 
 TASK = Task(observation=GLIMPSE, metrics="none")
 SIMULATOR = Simulator(TASK)
@@ -76,7 +77,7 @@ def test_first_action_does_not_depend_on_the_future():
 
 def test_action_is_invariant_to_rotation_and_translation():
     recording = straight_road([car(0, 0, 0, 10), car(24, 0, 0, 0), PERSON(40, -4, np.pi / 2, 1.0)])
-    turned = moved(recording, 0.7, 1000.0, -500.0)
+    turned = rotate_recording(recording, 0.7, 1000.0, -500.0)
     assert action(turned) == pytest.approx(action(recording), abs=2e-3)
 
 

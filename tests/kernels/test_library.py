@@ -12,7 +12,7 @@ import pytest
 
 from drivax import kernels
 from drivax.kernels import library
-from drivax.kernels.stamp import append_stamp, read_stamp, stamp
+from drivax.kernels.library import append_stamp, read_stamp, stamp
 from drivax.networks.encoders import max_pool
 from kernels.compare import COMPILER, TARGETS, needs_compiler, needs_kernels, run_tests
 
@@ -200,7 +200,7 @@ def test_a_copy_of_the_library_is_used(tmp_path):
 REGISTER = """
 from pathlib import Path
 from drivax.kernels import library
-from drivax.kernels.stamp import append_stamp, stamp
+from drivax.kernels.library import append_stamp, stamp
 
 library.PATH = Path({path!r})
 library.PATH.write_bytes(append_stamp(library.PATH.read_bytes(), stamp(library.SOURCES)))
@@ -223,7 +223,7 @@ def test_a_library_that_xla_refuses_is_not_used(tmp_path):
 @pytest.fixture
 def checkout(repository, tmp_path):
     """A copy of the build with a single small source."""
-    for name in ("native/build.py", "src/drivax/kernels/stamp.py"):
+    for name in ("native/build.py", "src/drivax/kernels/library.py"):
         (tmp_path / name).parent.mkdir(parents=True)
         shutil.copy2(repository / name, tmp_path / name)
     (tmp_path / "native" / "library.cc").write_text("int one() { return 1; }\n")

@@ -16,7 +16,7 @@ import pytest
 
 from drivax import kernels
 from drivax.geometry.boxes import corners
-from drivax.planners.pdm.ground import ground_along
+from drivax.planners.pdm.scoring import ground_along
 from drivax.scenario.bank.columns import AgentColumn, LaneRow
 from drivax.scenario.bank.queries import LaneHits, around_lanes, offroad_distance
 from drivax.scenario.bank.scenario_bank import PER_EGO, ScenarioBank

@@ -9,8 +9,8 @@ from drivax import settings
 from drivax.learning import loop
 from drivax.learning.algorithm import training_data
 from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.offline import critic_problems, policy_returns, returns_to_go
 from drivax.learning.config import TrainConfig
-from drivax.learning.critic_health import critic_problems, policy_returns, returns_to_go
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExpertSteps
 from drivax.learning.loop import train

@@ -21,11 +21,10 @@ from drivax.learning.algorithms.optimisers import sum_gradients
 from drivax.learning.algorithms.sac import _sums
 from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.learning.config import TrainConfig
-from drivax.learning.divergence import DivergenceError, large_logs, nonfinite_leaf, nonfinite_log
 from drivax.learning.environment import collect
 from drivax.learning.loop import mean_logs, train
 from drivax.learning.program import Program, Seeds
-from drivax.learning.training_log import rank
+from drivax.learning.training_log import DivergenceError, large_logs, nonfinite_leaf, nonfinite_log, rank
 from drivax.scenario.record import record
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder, seed_folders

@@ -19,8 +19,8 @@ from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, Warm
 from drivax.learning.driving import Driving
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.attention import EntityConfig
 from drivax.networks.encoders import MlpConfig
-from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble

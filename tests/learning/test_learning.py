@@ -111,7 +111,7 @@ def test_means_of_an_iteration():
 
 def test_impossible_settings_are_refused():
     for values, words in (
-        ({"traffic": "ldm"}, "there is no traffic 'ldm'"),
+        ({"traffic": "ldm"}, "unknown traffic 'ldm'; did you mean 'idm'"),
         ({"latest_start": 9}, r"latest_start is 9; use 10 \(earliest_start\) or more"),
         ({"earliest_start": -1}, "earliest_start is -1; use 0 or more"),
         ({"patience": 2}, "patience needs validations; set evaluate_every"),

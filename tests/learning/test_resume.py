@@ -13,7 +13,7 @@ from drivax.learning.algorithms.behaviour_cloning import Cloning
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import mean_logs
-from drivax.learning.pretrained import PretrainedRun, replace_networks
+from drivax.learning.policies import PretrainedRun, replace_networks
 from drivax.learning.replay import ReplayConfig
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints

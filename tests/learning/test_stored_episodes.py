@@ -22,7 +22,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig
 from drivax.learning.loop import train
-from drivax.learning.stored_episodes import StoredDriving, StoredEpisode, StoredEpisodes, observe_episodes
+from drivax.learning.recorded_episodes import StoredDriving, StoredEpisode, StoredEpisodes, observe_episodes
 from drivax.learning.training_set import TrainingSet, prepare_episodes, read_episodes, recorded_environment
 from drivax.planners.simple import ConstantVelocity, Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank

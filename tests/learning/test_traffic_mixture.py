@@ -98,7 +98,7 @@ def test_traffic_is_a_name_or_shares():
         ),
         ({"log": 1.5, "idm": -0.5}, "shares of traffic are log 1.5, idm -0.5; use"),
         ({}, "shares of traffic are missing"),
-        ({"log": 0.5, "idn": 0.5}, "there is no traffic 'idn'; use log"),
+        ({"log": 0.5, "idn": 0.5}, "unknown traffic 'idn'; did you mean 'idm'"),
         ({"log": "half"}, "'half' is not a number"),
     ],
 )

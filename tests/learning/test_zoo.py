@@ -159,8 +159,8 @@ def test_traffic_is_found_by_name(run, tmp_path):
     assert mixed == policy_traffic(path, base=IdmTraffic()) and mixed.name == "driven_by_bold+idm"
     assert isinstance(find_traffic("zoo:aggressive+idm"), PolicyTraffic)
     for name, words in (
-        ("runs/none", "there is no traffic 'runs/none'; use log, idm,.* zoo:aggressive"),
-        ("runs/none+idm", "there is no traffic"),
+        ("runs/none", "unknown traffic 'runs/none'; use log, idm,.* zoo:aggressive"),
+        ("runs/none+idm", "unknown traffic 'runs/none.idm'"),
         ("zoo:agressive+idm", "no policy 'zoo:agressive' in the zoo; use zoo:aggressive"),
         ("zoo:aggressive+idn", "no policy 'zoo:aggressive.idn' in the zoo"),
     ):
@@ -187,7 +187,7 @@ def test_no_folder_shadows_a_name(run, bank, tmp_path, monkeypatch):
     assert find_traffic("zoo:ppo").run == str(policy_folder("zoo:ppo"))
     for name in ("idm", "zoo:ppo", traffic):
         assert find_traffic(f"./{name}").run == find_traffic(f"./{name}+idm").run == str(tmp_path / name)
-    with pytest.raises(UsageError, match=r"there is no traffic 'idm\+idm'"):
+    with pytest.raises(UsageError, match=r"unknown traffic 'idm\+idm'"):
         find_traffic("idm+idm")
     with pytest.raises(UsageError, match=r"trained policy '/.*/idm' has its own task"):
         drivax.evaluate(Path("idm"), drivax.load([assemble(straight_road([car()]))]), task=Task())

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from drivax.metrics.catalogue import METRICS
+from drivax.testing.worlds import rotate_recording
 from judging import judge
 from metric_scenes import scenes
-from scenes import car, moved, tracks
+from scenes import car, tracks
 
 SCENES = scenes()
 
@@ -75,7 +76,7 @@ def with_others(recording, change):
 
 
 def shifted_and_turned(scene):
-    return moved(scene.recording, 2.1, 4000.0, -7000.0), turned(scene.drive, 2.1)
+    return rotate_recording(scene.recording, 2.1, 4000.0, -7000.0), turned(scene.drive, 2.1)
 
 
 def reversed_and_joined(scene):

@@ -11,9 +11,9 @@ from flax import nnx
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig, Policy, TwinCritic, graph_of
+from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Actions
 from drivax.networks.encoders import MlpConfig
-from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from quick import drawn, quick
 

@@ -10,9 +10,8 @@ from flax import nnx
 
 import encoder_oracle as oracle
 from drivax.errors import UsageError
-from drivax.networks.attention import Attention, group_shapes
+from drivax.networks.attention import Attention, EntityConfig, group_shapes
 from drivax.networks.encoders import MlpConfig
-from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from quick import drawn, quick
 

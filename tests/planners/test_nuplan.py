@@ -39,8 +39,9 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import DIRECT_STATE, PHYSICAL, Trajectory
 from drivax.tasks.task import Task
+from drivax.testing.worlds import rotate_recording
 from nuplan_planners import DevkitIdm, Faulty, Late, Replay
-from scenes import GLIMPSE, GREEN, RED, SMALL, car, moved, straight_road
+from scenes import GLIMPSE, GREEN, RED, SMALL, car, straight_road
 
 SPACE = Trajectory(steps=40)
 TASK = Task(actions=SPACE, observation=GLIMPSE)
@@ -59,7 +60,7 @@ def curved(radius_m=60.0, speed=8.0):
 
 def far_away(recording, name):
     """The same world, turned and in coordinates of a map."""
-    return replace(moved(recording, 0.7, EAST_M, NORTH_M), scenario_id=name)
+    return replace(rotate_recording(recording, 0.7, EAST_M, NORTH_M), scenario_id=name)
 
 
 @pytest.fixture(scope="module")

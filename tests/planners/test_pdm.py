@@ -16,7 +16,6 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking_acceleration, is_emergency, stop
 from drivax.planners.pdm.forecast import Forecast, boxes_of
-from drivax.planners.pdm.ground import ground_at
 from drivax.planners.pdm.planner import (
     LINE_ALONG,
     LINE_CURVATURE,
@@ -26,7 +25,7 @@ from drivax.planners.pdm.planner import (
     PdmPlanner,
     unroll_idm,
 )
-from drivax.planners.pdm.scoring import ScoringConfig
+from drivax.planners.pdm.scoring import ScoringConfig, ground_at
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -36,9 +35,9 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import ROUTE, Trajectory
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from drivax.testing.worlds import change_future, scatter_garbage
+from drivax.testing.worlds import change_future, rotate_recording, scatter_garbage
 from quick import quick
-from scenes import RED, SMALL, bank_of, car, moved, straight_road
+from scenes import RED, SMALL, bank_of, car, straight_road
 
 TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2), metrics="none")
 SIMULATOR = Simulator(TASK)
@@ -299,7 +298,7 @@ def test_pdm_does_not_read_the_future():
 def test_pdm_is_invariant_to_rotation_shift_and_padding_values():
     recording = straight_road([car(0, 0, 0, 10), car(24, 0.5, 0, 6), PERSON(40, -4, np.pi / 2, 1.0)])
     action, _, scored = decide(recording)
-    turned, _, other = decide(moved(recording, 0.7, 1000.0, -500.0))
+    turned, _, other = decide(rotate_recording(recording, 0.7, 1000.0, -500.0))
     assert turned == pytest.approx(action, abs=5e-3)
     np.testing.assert_allclose(other.score, scored.score, atol=0.01)
     filled = considering(scatter_garbage(bank_of(recording)))

@@ -11,14 +11,16 @@ import pytest
 from scipy.signal import savgol_filter
 
 from drivax.kernels import without_kernels
-from drivax.planners.pdm import ground
+from drivax.planners.pdm import scoring
 from drivax.planners.pdm.forecast import Contacts, Forecast, boxes_of, predict_overlaps
-from drivax.planners.pdm.ground import Ground, ground_along, ground_at
 from drivax.planners.pdm.scoring import (
+    Ground,
     ProposalMetrics,
     ScoringConfig,
     _direction,
     evaluate_proposal,
+    ground_along,
+    ground_at,
     is_comfortable,
     scores,
 )
@@ -202,8 +204,8 @@ def test_ground_is_looked_up_ahead_of_each_step():
 )
 def test_ground_along_equals_a_query_of_the_grid_per_pose(monkeypatch, most, every):
     """On curves that leave lanes, road and route of generated worlds, also with more segments than fit."""
-    monkeypatch.setattr(ground, "PATH_SEGMENTS", most[0])
-    monkeypatch.setattr(ground, "GROUP_SEGMENTS", most[1])
+    monkeypatch.setattr(scoring, "PATH_SEGMENTS", most[0])
+    monkeypatch.setattr(scoring, "GROUP_SEGMENTS", most[1])
     worlds = [assemble(generate_recording(0, index)) for index in range(6)]
     bank = ScenarioBank.from_scenarios(worlds)
     rng = np.random.default_rng(0)

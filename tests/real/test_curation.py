@@ -11,8 +11,7 @@ from drivax.curation.ensemble import EnsembleConfig
 from drivax.curation.kinematic import KinematicConfig, PublishedConfig
 from drivax.curation.logged import score_bank
 from drivax.curation.methods import Request, curate
-from drivax.curation.scores import read_scores
-from drivax.curation.subset import top_rows
+from drivax.curation.scores import read_scores, top_rows
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble

@@ -12,7 +12,7 @@ import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.evaluation.plan import ComparisonPlan
+from drivax.evaluation.comparison import ComparisonPlan
 
 from .conftest import redescribe
 from .test_report import Page

@@ -29,7 +29,7 @@ def share(image, name, near=2, theme=LIGHT):
 
 
 def test_only_present_things_are_drawn():
-    from drivax.report.pictures.still import draw_scenario
+    from drivax.report.pictures.drawing import draw_scenario
 
     scenario = make_scenario(0)
     early, late = (pixels(draw_scenario(scenario, step, legend=False)) for step in (10, 70))
@@ -43,7 +43,7 @@ def test_only_present_things_are_drawn():
 
 
 def test_legend_has_every_colour_of_the_dark_theme():
-    from drivax.report.pictures.still import draw_scenario
+    from drivax.report.pictures.drawing import draw_scenario
 
     scenario = make_scenario(0)
     plain = pixels(draw_scenario(scenario, 10, theme="dark", legend=False))
@@ -57,7 +57,7 @@ def test_legend_has_every_colour_of_the_dark_theme():
 
 
 def test_path_moves_ego_and_leaves_the_log_dashed():
-    from drivax.report.pictures.still import draw_scenario
+    from drivax.report.pictures.drawing import draw_scenario
 
     scenario = make_scenario(0)
     ego = offset_path(scenario, 20.0)
@@ -70,7 +70,7 @@ def test_path_moves_ego_and_leaves_the_log_dashed():
 
 
 def test_impossible_step_and_missing_matplotlib_are_errors(monkeypatch):
-    from drivax.report.pictures.still import draw_scenario
+    from drivax.report.pictures.drawing import draw_scenario
 
     with pytest.raises(UsageError, match="0 to 90"):
         draw_scenario(make_scenario(0), 91)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.rl.off_policy_evaluation import doubly_robust, weighted_importance_sampling
+from drivax.rl.equations import doubly_robust, weighted_importance_sampling
 
 STATES, ACTIONS, STEPS, GAMMA = 3, 2, 4, 0.9
 RNG = np.random.default_rng(0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.strands import NOWHERE_M, corridor_lanes, lane_strands
+from drivax.scenario.bank.routes_and_strands import NOWHERE_M, corridor_lanes, lane_strands
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, stack_field
 from drivax.synthetic.world import generate_recording

@@ -21,7 +21,8 @@ from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
-from scenes import GLIMPSE, RED, bank_of, car, moved, straight_road
+from drivax.testing.worlds import rotate_recording
+from scenes import GLIMPSE, RED, bank_of, car, straight_road
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +150,7 @@ def test_metrics_without_lights_are_undefined(simulator):
 def test_results_are_invariant_to_translation_and_rotation(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
     recording = straight_road(cars, light=RED)
-    recordings = recording, moved(recording, 2.1, 4000.0, -7000.0)
+    recordings = recording, rotate_recording(recording, 2.1, 4000.0, -7000.0)
     one, other = (episodes(simulator, IdmPlanner(), bank_of(recording)) for recording in recordings)
     for name in one.metrics:
         np.testing.assert_allclose(metric(one, name), metric(other, name), rtol=2e-3, atol=2e-2, err_msg=name)

@@ -7,13 +7,15 @@ import math
 
 import numpy as np
 
-from drivax.scenario.schema import AgentKind, RoadKind
+from drivax.scenario.schema import AgentKind
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.roads.curves import Pose, straight, turn
-from drivax.synthetic.roads.network import Control, Draft, Line, RoadNetwork
+from drivax.synthetic.roads.network import Control, Draft, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Drivers, Motion, Roles, ScriptedUser
+
+from . import staged_scenes
 
 FIRST, STEPS = 60, 151
 CURRENT = FIRST + 10
@@ -57,20 +59,14 @@ def scene(network, routes, at, speed, parked=()):
     return roles, motion
 
 
-def road(lanes=2, ends=False, limit=14.0):
+def road(lanes=2, ends=False, limit=staged_scenes.LIMIT):
     """One-way road along +x, 600 m long: lane 0 at y = 0, others to its left; lane 1 may end at 250 m."""
-    draft = Draft()
-    for k in range(lanes):
-        length = 250.0 if ends and k == 1 else 600.0
-        draft.lane(straight(Pose(0.0, 3.5 * k, 0.0), length), 3.5, limit)
-        if k:
-            draft.link_neighbours(k, k - 1)
-    built = list(draft.lanes)
-    if ends:
-        built[1] = dataclasses.replace(built[1], ends=True)
-    low, high = -3.0, 3.5 * lanes - 0.5
-    edge = np.array([[-5.0, low], [605.0, low], [605.0, high], [-5.0, high]])
-    return RoadNetwork("test", tuple(built), (Line(RoadKind.EDGE_BOUNDARY, edge),))
+    network = staged_scenes.road((1,) * lanes, length_m=600.0, limit=limit)
+    if not ends:
+        return network
+    first, second = network.lanes
+    second = dataclasses.replace(second, curve=straight(Pose(0.0, second.width_m, 0.0), 250.0), ends=True)
+    return dataclasses.replace(network, lanes=(first, second))
 
 
 def junction(turning):

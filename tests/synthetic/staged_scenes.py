@@ -19,21 +19,21 @@ CAR = (4.6, 1.9, 1.5)
 TIMES = np.arange(91) * 0.1
 
 
-def road(lanes=(1, 1, -1), turn=None):
+def road(lanes=(1, 1, -1), turn=None, length_m=LENGTH, limit=LIMIT):
     """A road along +x; lane 0 is the rightmost at y = 0, the next ones are to its left; -1 leads back.
 
     ``turn`` replaces the centre of lane 0; the edges stay those of the straight road.
     """
     built = []
     for k, direction in enumerate(lanes):
-        begin = Pose(0.0, k * WIDTH, 0.0) if direction > 0 else Pose(LENGTH, k * WIDTH, math.pi)
-        curve = straight(begin, LENGTH)
+        begin = Pose(0.0, k * WIDTH, 0.0) if direction > 0 else Pose(length_m, k * WIDTH, math.pi)
+        curve = straight(begin, length_m)
         if k == 0 and turn is not None:
             curve = turn
         left = k + 1 if direction > 0 and lanes[k + 1 : k + 2] == (1,) else -1
-        built.append(Lane(curve, WIDTH, LIMIT, left=left, right=k - 1 if direction > 0 and k else -1))
+        built.append(Lane(curve, WIDTH, limit, left=left, right=k - 1 if direction > 0 and k else -1))
     low, high = -WIDTH / 2 - 0.8, (len(lanes) - 0.5) * WIDTH + 0.8
-    ring = np.array([[-20.0, low], [LENGTH + 20.0, low], [LENGTH + 20.0, high], [-20.0, high]])
+    ring = np.array([[-20.0, low], [length_m + 20.0, low], [length_m + 20.0, high], [-20.0, high]])
     return RoadNetwork("by_hand", tuple(built), (Line(RoadKind.EDGE_BOUNDARY, ring),))
 
 

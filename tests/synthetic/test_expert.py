@@ -8,8 +8,7 @@ import pytest
 from drivax.synthetic.expert.driver import draw_expert, drive_ego, expert_lanes, expert_path
 from drivax.synthetic.expert.violations import first_overlap_step, user_boxes
 from drivax.synthetic.roads.families import CurvedRoad
-from drivax.synthetic.roads.network import Control
-from drivax.synthetic.roads.style import GRID
+from drivax.synthetic.roads.network import GRID, Control
 from drivax.synthetic.traffic.roles import Override, Staging
 from drivax.synthetic.traffic.simulation import WorldTraffic
 

@@ -13,8 +13,7 @@ from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, RoadK
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.families import FAMILIES
 from drivax.synthetic.roads.families.street_layout import Street, Strip
-from drivax.synthetic.roads.network import Control, map_features
-from drivax.synthetic.roads.style import GRID, RING
+from drivax.synthetic.roads.network import GRID, RING, Control, map_features
 from drivax.synthetic.traffic.paths import random_lanes
 
 from .oracles import box_corners, signed_area, winding_number

@@ -16,9 +16,8 @@ from drivax.synthetic.roads.families.junctions import (
     TJunction,
     UnprotectedLeft,
 )
-from drivax.synthetic.roads.network import CLEARANCE_M, Control, map_features
+from drivax.synthetic.roads.network import CLEARANCE_M, GRID, RING, Control, map_features
 from drivax.synthetic.roads.signals import Colour
-from drivax.synthetic.roads.style import GRID, RING
 from drivax.synthetic.traffic.placement import Density, place_vehicles
 
 from .oracles import distance_to_polyline, winding_number

@@ -20,9 +20,8 @@ from drivax.synthetic.expert.violations import (
     user_boxes,
 )
 from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
-from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.network import GRID, Control
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
-from drivax.synthetic.roads.style import GRID
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Staging
 from drivax.synthetic.world import WorldConfig, generate_recording

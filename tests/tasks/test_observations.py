@@ -11,7 +11,8 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import PRESETS, ObservationConfig, running_count
 from drivax.tasks.task import Task
-from scenes import RED, bank_of, car, moved, straight_road
+from drivax.testing.worlds import rotate_recording
+from scenes import RED, bank_of, car, straight_road
 
 
 @partial(jax.jit, static_argnums=1)
@@ -82,7 +83,7 @@ def test_road_rows_lie_in_the_box_and_are_cut_by_rank():
 
 def test_rotation_and_shift_change_nothing():
     recording = straight_road([car(0, 0, 0, 9), car(20, 1, 0.3, 6), car(-7, 3.7, 0, 8)], light=RED)
-    one, other = (look(bank_of(r)) for r in (recording, moved(recording, 1.3, 500.0, -900.0)))
+    one, other = (look(bank_of(r)) for r in (recording, rotate_recording(recording, 1.3, 500.0, -900.0)))
     for name in one:
         if name.startswith("road"):
             continue  # the order of rank may differ where two pieces are equally near; compared as sets below

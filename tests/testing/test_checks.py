@@ -12,8 +12,8 @@ from flax import nnx
 import own_terms
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.steps import StepValue
+from drivax.networks.attention import EntityConfig
 from drivax.networks.encoders import MlpConfig
-from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from drivax.tasks.observations import View
 from drivax.tasks.rewards import TERMS

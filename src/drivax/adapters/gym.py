@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import DrivaxError, UsageError, did_you_mean, explain_missing_package
 from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_metrics
-from drivax.report.pictures.still import draw_pixels
+from drivax.report.pictures.drawing import draw_pixels
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario

@@ -15,7 +15,7 @@ import numpy as np
 from drivax.adapters.gym import LIMIT, action_space, observation_space
 from drivax.errors import DataError, UsageError, explain_missing_package
 from drivax.files import replace_folder
-from drivax.learning.stored_episodes import StoredEpisode, StoredEpisodes, minari_folder
+from drivax.learning.recorded_episodes import StoredEpisode, StoredEpisodes, minari_folder
 from drivax.reading import explain_damage, read_json
 from drivax.tasks.task import Task
 

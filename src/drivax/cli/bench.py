@@ -19,8 +19,7 @@ from drivax.escaping import show
 from drivax.learning.program import use_all_cores
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.bench import BenchConfig, bench, bench_metrics
-from drivax.studies.bench_encoders import EncoderBench, bench_encoders
+from drivax.studies.bench import BenchConfig, EncoderBench, bench, bench_encoders, bench_metrics
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress

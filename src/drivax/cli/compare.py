@@ -47,9 +47,8 @@ def run(args: Compare, overrides: Sequence[str] = ()) -> int:
     """Compare the runs by the plan, or write the plan."""
     from drivax import settings
     from drivax.errors import UsageError
-    from drivax.evaluation.comparison import compare
+    from drivax.evaluation.comparison import ComparisonPlan, compare
     from drivax.evaluation.episode_table import EpisodeTable
-    from drivax.evaluation.plan import ComparisonPlan
     from drivax.files import check_output, write_text
     from drivax.report.pages.comparison import comparison_text, write_comparison
 

@@ -90,8 +90,7 @@ class Curate(MethodInputs):
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and print statistics of scores and weights."""
     from drivax import settings
-    from drivax.curation.scores import read_scores, write_scores
-    from drivax.curation.subset import check_top
+    from drivax.curation.scores import check_top, read_scores, write_scores
     from drivax.scenario.store import ScenarioSet
 
     config = find_method(args.method).config
@@ -157,13 +156,13 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
     source = args.members if args.method == "ensemble" else args.actions if is_rarity else None
     is_saved = source is not None and source.exists()
     if is_saved:
-        subject, has_settings = f"{source}, which exists,", False
+        subject, has_settings = f"{source}, which exists", False
     if again or not is_rarity:
         ignored_values["--actions"] = args.actions
     if not args.diverse and (again or args.method not in ("ensemble", "novelty")):
         ignored_values["--members"] = args.members
     if again:
-        subject = f"{args.again}, which is not scored again,"
+        subject = f"{args.again}, which is not scored again"
         ignored_values["--like"] = args.like
         ignored_values["--tables"] = args.tables or None
         ignored_values["--runs"] = args.runs or None
@@ -180,7 +179,7 @@ def _check_flags(args: Curate, overrides: Sequence[str], has_settings: bool) -> 
     if again or not has_settings:
         ignored_flags += overrides
     if ignored_flags:
-        raise UsageError(f"{subject} has no such setting", cure="leave out " + " ".join(ignored_flags))
+        raise UsageError(f"unknown setting for {subject}", cure="leave out " + " ".join(ignored_flags))
     if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
         raise UsageError(
             "random_matched permutes finished scores, which have no components",
@@ -208,8 +207,7 @@ def _export(
     embedding: Any,
 ) -> None:
     """Write the subset, and print its path and its first scenarios."""
-    from drivax.curation.scores import OWN_SCORES, read_scores
-    from drivax.curation.subset import write_top
+    from drivax.curation.scores import OWN_SCORES, read_scores, write_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 

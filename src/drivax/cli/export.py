@@ -76,7 +76,7 @@ def _export_episodes(args: Export, overrides: Sequence[str]) -> int:
     from drivax.evaluation.runner import EvaluationConfig
     from drivax.files import check_output, count_text
     from drivax.learning.driving import Driving
-    from drivax.learning.stored_episodes import minari_folder, observe_episodes, write_npz
+    from drivax.learning.recorded_episodes import minari_folder, observe_episodes, write_npz
     from drivax.learning.training_set import (
         episode_folders,
         prepare_episodes,

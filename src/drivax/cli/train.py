@@ -21,7 +21,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Egos
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import use_all_cores, widen_pool
-from drivax.learning.stored_episodes import minari_folder
+from drivax.learning.recorded_episodes import minari_folder
 from drivax.learning.training_set import TrainingSet, read_episodes
 from drivax.scenario.store import ScenarioSet
 

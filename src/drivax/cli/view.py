@@ -38,8 +38,7 @@ class View:
 
 def run(args: View) -> int:
     """Write the page; print its path and the number of scenarios."""
-    from drivax.curation.scores import read_scores
-    from drivax.curation.subset import top_rows
+    from drivax.curation.scores import read_scores, top_rows
     from drivax.report.pages.viewer import criticality_html, select_rows, write_player
     from drivax.scenario.store import ScenarioSet
 

@@ -3,8 +3,8 @@
 ``methods`` registers the methods and applies them to a set: ``kinematic``, ``rarity``, ``novelty``, ``query`` and
 ``failures`` compute components of every step of the logs (read by ``logged``), and ``ensemble`` trains policies, whose
 disagreement ``methods`` scores.
-``scores`` holds the table of scores, ``weights`` converts a table to sampling weights, and ``subset`` writes the most
-critical scenarios.
+``scores`` holds the table of scores and writes the most critical scenarios; ``weights`` converts a table to sampling
+weights.
 """
 
 import lazy_loader

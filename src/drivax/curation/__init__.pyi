@@ -8,7 +8,7 @@ from .scores import Combination as Combination
 from .scores import ScoreTable as ScoreTable
 from .scores import read_scores as read_scores
 from .scores import write_scores as write_scores
-from .subset import write_top as write_top
+from .scores import write_top as write_top
 from .weights import WeightConfig as WeightConfig
 from .weights import draw_statistics as draw_statistics
 from .weights import permute_scores as permute_scores

@@ -26,7 +26,6 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.memory import free_memory
 from drivax.files import check_output, replace_folder
 from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
-from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving, Egos, check_learnable
 from drivax.learning.experience import (
     Experience,
@@ -37,9 +36,10 @@ from drivax.learning.experience import (
     sampler,
 )
 from drivax.learning.program import all_finite, isolated_leaves
+from drivax.learning.training_log import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import Distribution
-from drivax.networks.entity import EntityConfig
 from drivax.reading import explain_damage
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.sizes import Sizes

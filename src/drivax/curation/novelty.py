@@ -22,8 +22,8 @@ from drivax.curation.logged import Numbers, Progress, map_batches, valid_steps
 from drivax.errors import DataError
 from drivax.learning.driving import Driving, Egos
 from drivax.networks.actor_critic import graph_of
+from drivax.networks.attention import EntityConfig
 from drivax.networks.encoders import EncoderConfig
-from drivax.networks.entity import EntityConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.store import ScenarioSet

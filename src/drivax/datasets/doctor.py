@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import unsupported
+from drivax.datasets import formats
 from drivax.datasets.formats import AUTO, Survey, find_reader, survey
 from drivax.datasets.reader import BadRecord, Description, Reader, attempt, with_steps
 from drivax.errors import DataError, UsageError
@@ -92,7 +92,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     """
     path = Path(path)
     # A scenario set or a run folder holds files, but none to convert.
-    if path.is_dir() and (error := unsupported.explain_own(path)) is not None:
+    if path.is_dir() and (error := formats.explain_own(path)) is not None:
         problems = (BadRecord.of(error, path), *_seal_problems(path))
         notes = () if len(problems) > 1 or (path / SEAL).exists() else (_NO_SEAL,)
         return Diagnosis(path, notes=notes, problems=problems)
@@ -100,7 +100,7 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     if isinstance(data, BadRecord):
         return Diagnosis(path, problems=(data,))
     parts, problems = _parts(data)
-    if not parts and path.is_dir() and (error := unsupported.explain_folder(path)) is not None:
+    if not parts and path.is_dir() and (error := formats.explain_folder(path)) is not None:
         problems.insert(0, BadRecord.of(error, path))
     expected = estimate(data, path, CAPACITIES["default"], STRIDE, None)
     return Diagnosis(
@@ -139,7 +139,7 @@ def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     """Describe a sample of the files of each format; list files of unknown format, and damaged files of the sample."""
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
     unknown = data.paths(None)[:_MOST_NAMES]
-    problems = [BadRecord.of(unsupported.explain(file), file) for file in unknown]
+    problems = [BadRecord.of(formats.explain(file), file) for file in unknown]
     for name in sorted(data.formats):
         files = data.paths(name)
         step = -(-len(files) // _SAMPLE)

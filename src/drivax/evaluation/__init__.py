@@ -1,8 +1,8 @@
 """Evaluate planners, compare evaluations, and audit scenarios.
 
 ``runner`` evaluates, and ``episode_table`` writes ``episodes.csv``, ``summary.json`` and trajectories. ``comparison``
-runs the tests; ``plan`` decides on significance (``MetricComparison.with_winner``), then ``decide`` recommends a
-planner.
+has the plan, runs the tests, and decides: on significance in ``MetricComparison.with_winner``, on a recommended planner
+in ``decide``.
 """
 
 import lazy_loader

@@ -1,12 +1,12 @@
 from .audit import audit as audit
 from .audit import scenario_names as scenario_names
 from .comparison import Comparison as Comparison
+from .comparison import ComparisonPlan as ComparisonPlan
 from .comparison import compare as compare
 from .episode_table import EpisodeTable as EpisodeTable
 from .episode_table import Trajectories as Trajectories
 from .observation_statistics import observation_statistics as observation_statistics
 from .pairing import comparable as comparable
-from .plan import ComparisonPlan as ComparisonPlan
 from .rollout import drive as drive
 from .runner import EvaluationConfig as EvaluationConfig
 from .runner import evaluate as evaluate

@@ -1,24 +1,33 @@
-"""The compiled library, if it is installed, and calls of its kernels through XLA's foreign function interface."""
+"""The compiled library, if installed: its stamp, and calls of its kernels through XLA's foreign function interface.
+
+``native/build.py`` runs this file by its path to append the stamp, which says what the library was built for and is
+checked before loading: this module needs only JAX, NumPy and the standard library.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import hashlib
+import json
 import os
+import re
 import stat
+import sysconfig
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.ffi
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap, sequential_vmap
 from jax.sharding import AxisType, PartitionSpec
 
-from drivax.kernels.stamp import read_stamp, stamp
-
+#: Major version of XLA's foreign function interface, in its header.
+_VERSION = re.compile(r"#define XLA_FFI_API_MAJOR (\d+)")
 #: ``make native`` and the wheels for Linux on x86-64 put it here. Loading it runs its code: no variable overrides it.
 PATH = Path(__file__).parent / "libdrivax.so"
 #: Its sources, in a checkout.
@@ -30,9 +39,36 @@ VARIABLE = "DRIVAX_NATIVE"
 _allowed = jax.make_user_context(True)
 
 
+def stamp(sources: Path) -> dict[str, str]:
+    """Return platform, major version of XLA's foreign function interface, and hash of the sources if they exist."""
+    header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h")
+    values = {"platform": sysconfig.get_platform(), "XLA FFI": "".join(_VERSION.findall(header.read_text()))}
+    if (sources / "build.py").is_file():
+        digest = hashlib.sha256()
+        for path in sorted([*sources.glob("*.cc"), *sources.glob("*.h"), sources / "build.py"]):
+            if not path.name.startswith("."):  # files of editors
+                digest.update(path.read_bytes())
+        values["sources"] = digest.hexdigest()[:12]
+    return values
+
+
+def append_stamp(library: bytes, values: dict[str, str]) -> bytes:
+    """Return a library with its stamp and, as the last line, the SHA-256 of everything before it."""
+    stamped = library + b"\n" + json.dumps(values).encode()
+    return stamped + b"\n" + hashlib.sha256(stamped).hexdigest().encode()
+
+
+def read_stamp(library: bytes) -> dict[str, str] | None:
+    """Return the stamp of a library; None if it has none or is incomplete."""
+    stamped, _, digest = library.rpartition(b"\n")
+    if hashlib.sha256(stamped).hexdigest().encode() != digest:
+        return None
+    return json.loads(stamped.rpartition(b"\n")[2])
+
+
 @cache
 def _load() -> ctypes.CDLL | str:
-    """Return the library with its kernels registered, or why it is not used."""
+    """Load the library and register its kernels; return it, or the reason for not using it."""
     if os.environ.get(VARIABLE) == "0":
         return f"none, since {VARIABLE}=0"
     cure = "make native" if (SOURCES / "build.py").is_file() else "install drivax again"
@@ -49,7 +85,7 @@ def _load() -> ctypes.CDLL | str:
 
 
 def _access_problem() -> str | None:
-    """Return why more users can write the library than the package's own code, and the cure, or None."""
+    """Return an error with a cure if more users can write the library than the package's own code, else None."""
     own_status = Path(__file__).stat()
     for path in (PATH.resolve(), PATH.resolve().parent, PATH.parent):
         status = path.stat()
@@ -61,7 +97,7 @@ def _access_problem() -> str | None:
 
 
 def _build_problem() -> str | None:
-    """Return why the library, which has not been loaded yet, was not built for this package and machine, or None."""
+    """Return an error if the library, not yet loaded, was not built for this package and machine, else None."""
     if not PATH.is_file():
         return "is not a regular file"
     built = read_stamp(PATH.read_bytes())
@@ -94,7 +130,7 @@ def _target_name(library: ctypes.CDLL, kernel: str) -> str:
 
 
 def state() -> str:
-    """Return which library is in use, or why none is, for ``drivax doctor``."""
+    """Describe the library in use, or the reason for using none, for ``drivax doctor``."""
     library = _load()
     if isinstance(library, str):
         return library

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from drivax.checks import check_at_least
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.algorithms.awac import AwacConfig
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
@@ -190,7 +190,7 @@ def split_traffic(name: str) -> tuple[str | None, str]:
     """Return the policy (or None) and the base traffic of a name like ``zoo:NAME+idm``.
 
     Raises:
-        UsageError: There is no such traffic.
+        UsageError: Unknown traffic.
     """
     run, plus, base = name.rpartition("+")
     if plus and base in TRAFFIC and is_policy(run, TRAFFIC):
@@ -199,5 +199,6 @@ def split_traffic(name: str) -> tuple[str | None, str]:
         return name, "log"
     if name not in TRAFFIC and not is_dotted(name):
         kinds = [*TRAFFIC, "package.module:name", "the folder of a training run", *zoo()]
-        raise UsageError(f"there is no traffic {name!r}", cure=f"use {', '.join(kinds)}")
+        cure = did_you_mean(name, [*TRAFFIC, *zoo()], otherwise=f"use {', '.join(kinds)}")
+        raise UsageError(f"unknown traffic {name!r}", cure=cure)
     return None, name

@@ -114,7 +114,7 @@ class Driving:
         """
         task = self.simulator.task
         if not isinstance(task, Task):
-            raise UsageError(f"{type(task).__name__} has no action space", cure="use drivax.tasks.task.Task")
+            raise UsageError(f"{type(task).__name__} has no action space", cure="use drivax.tasks.Task")
         return task
 
     @property
@@ -236,7 +236,7 @@ class Driving:
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def draw(self, data: ScenarioBank, key: Array, count: int) -> Any:
-        """Draw where new episodes start, for ``count`` environments."""
+        """Draw the starts of new episodes, for ``count`` environments."""
         return self._draw(data, key, count, self.earliest_start, self.latest_start)
 
     def _step_or_reset(
@@ -257,7 +257,7 @@ class Driving:
     def _over(
         self, data: ScenarioBank, state: SimState, over: Bool[Array, " B"], ends: Bool[Array, " B"]
     ) -> Bool[Array, " B"]:
-        """Return which episodes are over after a step, given which were over before it and which end in it."""
+        """Mask of the episodes that are over after a step, given the masks of those over before it and ending in it."""
         return ends
 
     def demonstrations(self, data: ScenarioBank, key: Array, count: int) -> ExpertActions:

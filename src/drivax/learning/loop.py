@@ -20,21 +20,21 @@ from drivax.files import explain_full_disk, inside
 from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.curriculum import mean_rollout
-from drivax.learning.divergence import DivergenceError, nonfinite_leaf, nonfinite_log
 from drivax.learning.driving import Driving, count_egos
 from drivax.learning.experience import Experience, check_weights
 from drivax.learning.mixture import Mixture, training_environment
-from drivax.learning.policies import find_traffic
-from drivax.learning.pretrained import PretrainedRun, initial_state, pretrained_networks
+from drivax.learning.policies import PretrainedRun, find_traffic, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
-from drivax.learning.recorded_episodes import RecordedDriving
+from drivax.learning.recorded_episodes import RecordedDriving, StoredEpisodes
 from drivax.learning.residency import Residents
-from drivax.learning.stored_episodes import StoredEpisodes
 from drivax.learning.training_log import (
+    DivergenceError,
     Preempted,
     StopSignal,
     TrainingLog,
     Validation,
+    nonfinite_leaf,
+    nonfinite_log,
     validate,
 )
 from drivax.learning.training_set import Source, TrainingSet, episodes_digest, prepare_episodes

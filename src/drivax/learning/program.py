@@ -443,7 +443,7 @@ class MemoryAccount:
 
     @property
     def cure(self) -> str:
-        """How to reduce the largest entry."""
+        """Return the cure that reduces the largest entry."""
         return _CURES[max(self.sizes, key=lambda name: self.sizes[name])]
 
     def check(self) -> None:

@@ -1,4 +1,7 @@
-"""The log of one seed's training: metrics, checkpoints, the validations that rank them, and divergence."""
+"""The log of one seed's training: metrics, checkpoints, the validations that rank them, and divergence.
+
+Numbers that are not finite stop a seed; large ones cause a warning.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ import numpy as np
 from drivax.errors import DrivaxError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.learning.divergence import DivergenceError, divergence_cure, large_logs
+from drivax.learning.program import trained_leaves
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Scenario
@@ -36,6 +39,15 @@ _METRICS = (
     "success", "accuracy", "accuracy_at_fault", "collision", "offroad", "red_light", "progress_ratio", "comfortable",
 )  # fmt: skip
 _ORDER = ("accuracy", "progress_ratio", "comfortable")
+#: Absolute logged values beyond which training warns: a KL divergence of 1 nat per iteration, and Q values that only
+#: rewards of +-100 per step reach at a discount of 0.99.
+_LOG_BOUNDS = {"loss/kl": 1.0, "loss/mean_q": 1e4, "loss/largest_q": 1e4}
+#: Prefixes of logged values that must be finite, causes before their effects.
+_FINITE_PREFIXES = ("rollout/action_magnitude", "reward/", "loss/")
+
+
+class DivergenceError(DrivaxError):
+    """The training of a seed stopped because its rewards, losses, parameters or actions are not finite."""
 
 
 @dataclass(frozen=True)
@@ -245,3 +257,41 @@ class TrainingLog:
             self._log.close()
             if kind is None:
                 seal(self.folder.path, self.folder.metrics.name)
+
+
+def nonfinite_log(row: Mapping[str, float]) -> str | None:
+    """Return the first action, reward or loss of an iteration that is NaN or infinite; None if there is none."""
+    names = (name for prefix in _FINITE_PREFIXES for name in row if name.startswith(prefix))
+    return next((f"{name} is {_word(row[name])}" for name in names if not np.isfinite(row[name])), None)
+
+
+def nonfinite_leaf(state: Any) -> str | None:
+    """Return the first trained leaf of a seed's state with a NaN or infinite number; None if there is none."""
+    for name, leaf in trained_leaves(state).items():
+        values = np.asarray(leaf, np.float32)
+        if not np.isfinite(values).all():
+            return f"{name} is {_word(values)}"
+    return None
+
+
+def large_logs(row: Mapping[str, float]) -> dict[str, str]:
+    """Return the logged values beyond their bounds by name, as text."""
+    return {
+        name: f"{name} is {row[name]:.3g}, beyond {bound:g}"
+        for name, bound in _LOG_BOUNDS.items()
+        if name in row and abs(row[name]) > bound
+    }
+
+
+def divergence_cure(problem: str, checkpoint: str | None) -> str:
+    """Return the cure of a divergence, given the last healthy checkpoint as ``RUN@STEP``."""
+    name = problem.split(" ")[0]
+    term = name.removeprefix("reward/")
+    change = "lower the learning rate" if term == name else f"correct the reward term {term}"
+    if checkpoint is None:
+        return f"{change} and start again with --overwrite; there is no healthy checkpoint yet"
+    return f"{change} and start a new run from the last healthy checkpoint: --from {checkpoint}"
+
+
+def _word(values: Any) -> str:
+    return "NaN" if np.isnan(values).any() else "infinite"

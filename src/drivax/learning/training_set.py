@@ -24,8 +24,14 @@ from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving, count_egos
 from drivax.learning.mixture import Mixture, training_environment
-from drivax.learning.recorded_episodes import RecordedDriving, RecordedEpisodes, replay_episodes
-from drivax.learning.stored_episodes import StoredDriving, StoredEpisodes, match_observations
+from drivax.learning.recorded_episodes import (
+    RecordedDriving,
+    RecordedEpisodes,
+    StoredDriving,
+    StoredEpisodes,
+    match_observations,
+    replay_episodes,
+)
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import Scenario

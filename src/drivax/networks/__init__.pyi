@@ -4,6 +4,7 @@ from .actor_critic import NetworkConfig as NetworkConfig
 from .actor_critic import Policy as Policy
 from .actor_critic import TwinCritic as TwinCritic
 from .actor_critic import Value as Value
+from .attention import EntityConfig as EntityConfig
 from .distributions import Actions as Actions
 from .distributions import Distribution as Distribution
 from .encoders import Encoder as Encoder
@@ -11,7 +12,6 @@ from .encoders import EncoderConfig as EncoderConfig
 from .encoders import MlpConfig as MlpConfig
 from .encoders import NormalisedEncoder as NormalisedEncoder
 from .encoders import group_names as group_names
-from .entity import EntityConfig as EntityConfig
 from .transformers import LqConfig as LqConfig
 from .transformers import LqhConfig as LqhConfig
 from .transformers import MtrConfig as MtrConfig

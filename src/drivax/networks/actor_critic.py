@@ -13,6 +13,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
+from drivax.networks.attention import EntityConfig
 from drivax.networks.distributions import (
     Actions,
     Distribution,
@@ -33,7 +34,6 @@ from drivax.networks.encoders import (
     check_widths,
     dense_layers,
 )
-from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
 #: Gains of orthogonal output weights. The small gain of policies makes the first actions follow ``first_scale``,

@@ -12,7 +12,7 @@ from .pages.report import write_tables as write_tables
 from .pages.viewer import write_player as write_player
 from .pictures.drawing import Drawing as Drawing
 from .pictures.drawing import Rollout as Rollout
+from .pictures.drawing import draw_scenario as draw_scenario
 from .pictures.observation import draw_observation as draw_observation
-from .pictures.still import draw_scenario as draw_scenario
 from .pictures.video import write_videos as write_videos
 from .runs import read_runs as read_runs

@@ -1,8 +1,8 @@
 """Equations of reinforcement learning: arrays in, arrays out.
 
-``equations`` has advantages and returns, TD targets, and the terms of losses, among them PPO's clipped surrogate. The
-modules of :mod:`drivax.learning.algorithms` add these terms up to the loss of an algorithm. ``off_policy_evaluation``
-estimates a policy's return from episodes of others.
+``equations`` has advantages and returns, TD targets, the terms of losses, among them PPO's clipped surrogate, and
+estimators of a policy's return from episodes of others. The modules of :mod:`drivax.learning.algorithms` add the terms
+up to the loss of an algorithm.
 """
 
 import lazy_loader

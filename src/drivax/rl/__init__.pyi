@@ -1,6 +1,7 @@
 from .equations import advantage_weights as advantage_weights
 from .equations import clipped_surrogate_loss as clipped_surrogate_loss
 from .equations import conservative_penalty as conservative_penalty
+from .equations import doubly_robust as doubly_robust
 from .equations import expectile_loss as expectile_loss
 from .equations import generalised_advantages as generalised_advantages
 from .equations import log_mass as log_mass
@@ -13,5 +14,4 @@ from .equations import soft_policy_loss as soft_policy_loss
 from .equations import soft_value as soft_value
 from .equations import td_target as td_target
 from .equations import temperature_loss as temperature_loss
-from .off_policy_evaluation import doubly_robust as doubly_robust
-from .off_policy_evaluation import weighted_importance_sampling as weighted_importance_sampling
+from .equations import weighted_importance_sampling as weighted_importance_sampling

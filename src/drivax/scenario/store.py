@@ -7,7 +7,7 @@ A set is a folder::
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     seal.json            SHA-256 of the manifest (``drivax.seal``)
     splits/              optional: lists for training, validation and test (``scenario.select.splits``)
-    scores.npz           optional: criticality scores by which scenarios were selected (``curation.subset``)
+    scores.npz           optional: criticality scores by which scenarios were selected (``curation.scores``)
 
 ``numpy.load(path, mmap_mode="r")`` reads a shard; a record lies at a fixed offset, so a scenario is one range read. A
 set appears under its name only when it is complete. This module needs no JAX.

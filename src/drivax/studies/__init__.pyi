@@ -1,6 +1,6 @@
 from .bench import BenchConfig as BenchConfig
+from .bench import EncoderBench as EncoderBench
 from .bench import bench_metrics as bench_metrics
-from .bench_encoders import EncoderBench as EncoderBench
 from .definition import Arm as Arm
 from .definition import Claim as Claim
 from .definition import Study as Study

@@ -22,8 +22,7 @@ from drivax import settings
 from drivax.curation.logged import score_steps
 from drivax.curation.methods import ORACLES, Request, check_current, curate, event_kinds
 from drivax.curation.rarity import ExpertActions
-from drivax.curation.scores import ScoreTable, read_scores, write_scores
-from drivax.curation.subset import top_rows
+from drivax.curation.scores import ScoreTable, read_scores, top_rows, write_scores
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
 from drivax.escaping import show

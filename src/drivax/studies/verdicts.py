@@ -12,15 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.methods import ORACLES
-from drivax.curation.scores import ScoreTable
-from drivax.curation.subset import top_rows
+from drivax.curation.scores import ScoreTable, top_rows
 from drivax.evaluation.episode_table import SHARES
 from drivax.metrics.catalogue import METRICS
 from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.stats.seeds import CrossedEffect, crossed_difference, crossed_mean, log_ratio, seeds_interval
 from drivax.stats.significance import holm_adjust
 from drivax.studies.definition import Claim, Stratum
-from drivax.studies.equal_progress import ProgressError, match_progress
 
 #: Rankings are unrelated if their correlation's interval is within ±UNRELATED, related if it is beyond ±RELATED.
 UNRELATED, RELATED = 0.1, 0.3
@@ -36,6 +34,8 @@ Values = Float[np.ndarray, "seed scenario"]
 Episodes = Mapping[str, Float[np.ndarray, "_ scenario"]]
 Weights = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
+#: Values of a driver by speed limiter (share of the speed limit; 1: none) and metric, a row per seed.
+BySpeed = Mapping[float, Episodes]
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,10 @@ def rates(
 def rates_of_groups(
     episodes: Episodes, strata: Strata, groups: Mapping[str, Bool[np.ndarray, " scenario"]], metric: str
 ) -> dict[str, dict[str, float | int | None]]:
-    """Return an arm's mean of a metric, with its interval, in each group of scenarios (a mask) with two recordings."""
+    """Return an arm's mean of a metric with its interval, by group of scenarios.
+
+    ``groups`` has a mask per group. Skips groups in which the metric is defined in fewer than two recordings.
+    """
     weights = {name: mask.astype(np.float64) for name, mask in groups.items()}
     return {
         name: _rate(episodes[metric], strata, weight, metric in _SHARES)
@@ -348,3 +351,74 @@ def compare_rankings(tables: Mapping[str, ScoreTable], recordings: Sequence[str]
             }
         )
     return pairs
+
+
+class ProgressError(Exception):
+    """The faster driver makes more progress even at its lowest speed; ``faster``: the first (0) or the second (1)."""
+
+    def __init__(self, faster: int) -> None:
+        super().__init__(f"driver {faster} makes more progress even at its lowest speed")
+        self.faster = faster
+
+
+@dataclass(frozen=True)
+class EqualProgress:
+    """A metric of two drivers at the same progress.
+
+    Attributes:
+        values: Values of the first and the second driver, NaN where a metric is undefined at any speed.
+        slower: The driver whose speed is limited: the first (0) or the second (1).
+        share: Its speed limiter, interpolated, as a share of the speed limit.
+    """
+
+    values: tuple[Float[np.ndarray, "_ scenario"], Float[np.ndarray, "_ scenario"]]
+    slower: int
+    share: float
+
+
+def match_progress(
+    first: BySpeed, second: BySpeed, metric: str, weights: Float[np.ndarray, " scenario"]
+) -> EqualProgress:
+    """Compare two drivers at equal progress by limiting the speed of the faster one.
+
+    Returns ``metric`` of both at the lower ``progress_ratio``. The faster driver's metric m is interpolated linearly
+    between the two speeds whose progress p encloses the other driver's progress P. With the slope b of m over p, the
+    result has the values of m - b (p - P): mixed over both speeds for the faster driver, at full speed for the other.
+    Their means are the interpolated ones, and their variance is that of the interpolated difference (delta method): the
+    errors of m and p at both speeds, and of P.
+
+    Raises:
+        ProgressError: The faster driver makes more progress even at its lowest speed.
+    """
+    drivers = first, second
+    names = ("progress_ratio", metric)
+    every_value = [episodes[name] for driver in drivers for episodes in driver.values() for name in names]
+    is_defined = (weights > 0.0) & ~np.isnan(np.concatenate(every_value)).any(axis=0)
+    if not is_defined.any():
+        undefined = [np.full_like(driver[1.0][metric], np.nan) for driver in drivers]
+        return EqualProgress((undefined[0], undefined[1]), 0, 1.0)
+
+    def mean(values: Values) -> float:
+        return float(np.average(values[:, is_defined].mean(axis=0), weights=weights[is_defined]))
+
+    progress = [{speed: mean(e["progress_ratio"]) for speed, e in driver.items()} for driver in drivers]
+    faster = int(progress[1][1.0] >= progress[0][1.0])
+    target, speeds = progress[1 - faster][1.0], sorted(drivers[faster], reverse=True)
+    below = next((k for k, speed in enumerate(speeds) if k and progress[faster][speed] <= target), None)
+    if below is None:
+        raise ProgressError(faster)
+    upper, lower = speeds[below - 1 : below + 1]
+    high, low = progress[faster][upper], progress[faster][lower]
+    range_of_progress = (high - low) or 1.0
+    mix = (high - target) / range_of_progress
+    of_upper, of_lower = (drivers[faster][speed] for speed in (upper, lower))
+    slope = (mean(of_upper[metric]) - mean(of_lower[metric])) / range_of_progress
+
+    def adjust(episodes: Mapping[str, Values]) -> Values:
+        values = episodes[metric] - slope * (episodes["progress_ratio"] - target)
+        return np.where(is_defined, values, np.nan)
+
+    mixed = (1.0 - mix) * adjust(of_upper) + mix * adjust(of_lower)
+    other = adjust(drivers[1 - faster][1.0])
+    share = upper + mix * (lower - upper)
+    return EqualProgress((other, mixed) if faster else (mixed, other), faster, share)

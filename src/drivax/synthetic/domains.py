@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivax.synthetic.roads.families import FAMILIES, RoadFamily
-from drivax.synthetic.roads.style import GRID, RING, RoadStyle
+from drivax.synthetic.roads.network import GRID, RING, RoadStyle
 from drivax.synthetic.traffic.placement import Density
 
 

@@ -20,9 +20,17 @@ import numpy as np
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
-from drivax.datasets.womd import records as womd
 from drivax.datasets.womd.messages import SKIP, ExampleFeatures, features_of
-from drivax.datasets.womd.tfrecord import count_records
+from drivax.datasets.womd.tfrecord import (
+    DATASET,
+    EXAMPLE_FORMAT,
+    FULL_NAME,
+    SCENARIOMAX_FORMAT,
+    TfRecordReader,
+    agent_kind,
+    count_records,
+    notes_of,
+)
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks, differentiate
@@ -37,24 +45,24 @@ Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
-class WomdExample(womd.TfRecordReader):
+class WomdExample(TfRecordReader):
     """Reader of WOMD's tf.Examples: tracks, map points grouped into features, lights by lane."""
 
-    name: str = womd.EXAMPLE_FORMAT
+    name: str = EXAMPLE_FORMAT
     companions: tuple[str, ...] = ("export.json",)
 
     def decode(self, payload: bytes) -> Recording:
         """Return the recording in a serialised tf.Example; rows without an id are padding."""
         table = features_of(payload)
         rows = np.flatnonzero(table.numbers("state/id") != -1)
-        return _recording(table, payload, rows, womd.DATASET, self.name)
+        return _recording(table, payload, rows, DATASET, self.name)
 
     def describe(self, path: Path) -> Description:
         """Describe the first record: version by the spacing of map points, truncated map, paths."""
         recording = self.first(path)
         has_limits = any(feature.limit_mps is not None for feature in recording.features)
         limits = "" if has_limits else " and no speed limits"
-        notes = [*womd.notes_of(recording), f"no lane graph{limits}: lanes are chained by geometry"]
+        notes = [*notes_of(recording), f"no lane graph{limits}: lanes are chained by geometry"]
         if Flag.TRUNCATED_MAP in recording.flags:
             notes.append(
                 "the list of map points is full, so the map is cut off; the Scenario protos hold all of it"
@@ -63,14 +71,14 @@ class WomdExample(womd.TfRecordReader):
             notes.append("path_samples are not used: routes are computed again")
         has_spacing = parsing.spacing_m(recording.features) is not None
         version = "1.2 or later" if _is_coarse(recording.features) else "1.0 or 1.1" if has_spacing else None
-        return Description(womd.FULL_NAME, _FLAVOUR, version, count_records(path), tuple(notes))
+        return Description(FULL_NAME, _FLAVOUR, version, count_records(path), tuple(notes))
 
 
 @dataclass(frozen=True)
-class ScenarioMax(womd.TfRecordReader):
+class ScenarioMax(TfRecordReader):
     """Reader of ScenarioMax's tf.Examples: tracks, map with limits, lights by lane."""
 
-    name: str = womd.SCENARIOMAX_FORMAT
+    name: str = SCENARIOMAX_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
         """Return the recording in a serialised tf.Example of ScenarioMax.
@@ -96,7 +104,7 @@ class ScenarioMax(womd.TfRecordReader):
         recording = self.first(path)
         limits = sum(feature.limit_mps is not None for feature in recording.features)
         notes = [
-            *womd.notes_of(recording),
+            *notes_of(recording),
             "the file does not say which data set its scenarios come from",
             f"{limits} lanes have a speed limit; no lane graph: lanes are chained by geometry",
         ]
@@ -176,7 +184,7 @@ def _tracks(features: ExampleFeatures, rows: Array) -> Tracks:
         heading=np.where(valid, wrap(read("bbox_yaw")), 0.0),
         velocity=read("velocity_x", "velocity_y"),
         valid=valid,
-        kind=np.array([womd.agent_kind(int(kind)) for kind in kinds], np.int8),
+        kind=np.array([agent_kind(int(kind)) for kind in kinds], np.int8),
         track_id=track_id,
     )
 

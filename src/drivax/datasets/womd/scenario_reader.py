@@ -12,9 +12,16 @@ from jaxtyping import Float64
 
 from drivax.datasets import parsing
 from drivax.datasets.reader import Description
-from drivax.datasets.womd import records as womd
 from drivax.datasets.womd.messages import POINTS, SKIP, STATES, parse, read_table, unknown_fields
-from drivax.datasets.womd.tfrecord import count_records
+from drivax.datasets.womd.tfrecord import (
+    DATASET,
+    FULL_NAME,
+    SCENARIO_FORMAT,
+    TfRecordReader,
+    agent_kind,
+    count_records,
+    notes_of,
+)
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
@@ -27,10 +34,10 @@ _Points = Float64[np.ndarray, "point 3"]
 
 
 @dataclass(frozen=True)
-class WomdScenario(womd.TfRecordReader):
+class WomdScenario(TfRecordReader):
     """Reader of Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
 
-    name: str = womd.SCENARIO_FORMAT
+    name: str = SCENARIO_FORMAT
 
     def decode(self, payload: bytes) -> Recording:
         """Return the recording in a serialised ``Scenario``.
@@ -49,7 +56,7 @@ class WomdScenario(womd.TfRecordReader):
         rows = {track.id: row for row, track in enumerate(message.tracks)}
         return Recording(
             scenario_id=message.scenario_id,
-            dataset=womd.DATASET,
+            dataset=DATASET,
             segment=message.scenario_id,
             timestamps_s=np.array(message.timestamps_seconds, np.float64),
             current_step=message.current_time_index,
@@ -74,13 +81,13 @@ class WomdScenario(womd.TfRecordReader):
         recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         has_links = any(lane.successors or lane.predecessors for lane in lanes)
-        notes = list(womd.notes_of(recording))
+        notes = list(notes_of(recording))
         if not has_links:
             notes.append("no lane graph in the first record: lanes are chained by geometry")
         has_driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
         version = "1.2 or later" if has_driveways else "1.1 or later" if has_links else None
         flavour = "Scenario protos in TFRecord"
-        return Description(womd.FULL_NAME, flavour, version, count_records(path), tuple(notes))
+        return Description(FULL_NAME, flavour, version, count_records(path), tuple(notes))
 
 
 def _unknown_fields(message: Any, payload: bytes) -> int:
@@ -125,7 +132,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
         heading=np.where(valid, wrap(table[..., 6]), 0.0),
         velocity=table[..., 7:9].copy(),
         valid=valid,
-        kind=np.array([womd.agent_kind(track.object_type) for track in tracks], np.int8),
+        kind=np.array([agent_kind(track.object_type) for track in tracks], np.int8),
         track_id=np.array([track.id for track in tracks], np.int64),
     )
 

@@ -13,7 +13,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.advantage_weighted import AdvantageWeighted, AdvantageWeightedConfig
+from drivax.learning.algorithms.awac import AdvantageWeighted, AdvantageWeightedConfig
 from drivax.learning.algorithms.off_policy import Trained, q_logs
 from drivax.learning.algorithms.offline import PolicyBatch
 from drivax.learning.environment import Environment

@@ -26,8 +26,7 @@ from drivax.learning.experience import Experience, LoggedEnvironment, sample_ste
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
 from drivax.networks.encoders import Statistics, set_statistics
-from drivax.rl.equations import polyak, td_target
-from drivax.rl.off_policy_evaluation import Estimate, doubly_robust, weighted_importance_sampling
+from drivax.rl.equations import Estimate, doubly_robust, polyak, td_target, weighted_importance_sampling
 
 Observation = dict[str, Array]
 #: Maps a batch of observations to actions.
@@ -145,8 +144,7 @@ def estimate_return(
         gamma: Discount.
 
     Returns:
-        ``weighted_importance_sampling`` and ``doubly_robust``
-        (:mod:`drivax.rl.off_policy_evaluation`).
+        ``weighted_importance_sampling`` and ``doubly_robust`` (:mod:`drivax.rl.equations`).
     """
     expert = data.expert
     count, times = expert.usable.shape

@@ -21,8 +21,7 @@ from drivax.geometry.vectors import norm
 from drivax.planners.pdm import scoring
 from drivax.planners.pdm.brake import BrakeConfig, braking_acceleration, is_emergency, stop
 from drivax.planners.pdm.forecast import Contacts, Forecast
-from drivax.planners.pdm.ground import ground_along
-from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig
+from drivax.planners.pdm.scoring import ProposalMetrics, ScoringConfig, ground_along
 from drivax.planners.pdm.tracking import Car, Reference, track
 from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from drivax import settings
 from drivax.escaping import escape_controls
-from drivax.evaluation.comparison import Comparison
-from drivax.evaluation.plan import MetricComparison
+from drivax.evaluation.comparison import Comparison, MetricComparison
 from drivax.evaluation.result_tables import MetricLabel, metric_label
 from drivax.files import check_output, write_text
 from drivax.report.pages.page import asset, facts_html, page, section

@@ -1,10 +1,10 @@
 from .drawing import Drawing as Drawing
 from .drawing import Rollout as Rollout
+from .drawing import draw_on as draw_on
+from .drawing import draw_pixels as draw_pixels
+from .drawing import draw_scenario as draw_scenario
 from .drawing import road_lines as road_lines
 from .observation import draw_log_observation as draw_log_observation
 from .observation import draw_observation as draw_observation
 from .player_data import pack_episode as pack_episode
-from .still import draw_on as draw_on
-from .still import draw_pixels as draw_pixels
-from .still import draw_scenario as draw_scenario
 from .video import write_videos as write_videos

@@ -537,7 +537,7 @@ def lane_passage(
 ) -> Passage:
     """Return the passage of a car from the strand ``before`` (-1 without one); ``z`` is the height of the ground.
 
-    A car stays on a strand of lanes (``scenario.bank.strands``) until its centre is 0.3 m beyond the line between the
+    A car stays on a strand of lanes (``routes_and_strands``) until its centre is 0.3 m beyond the line between the
     strand and another, so that a car that drives along the line does not change lanes at every step.
     """
     rows, inside = lanes_around(bank, index, xy)

@@ -21,9 +21,16 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt, UInt32
 
 from drivax.errors import DataError, UsageError
 from drivax.scenario.bank.columns import AgentColumn, RoadLayer, SizeColumn
-from drivax.scenario.bank.route_arrays import interleave, most_egos, of_ego, stack_lights, stack_routes
+from drivax.scenario.bank.routes_and_strands import (
+    corridor_lanes,
+    interleave,
+    lane_strands,
+    most_egos,
+    of_ego,
+    stack_lights,
+    stack_routes,
+)
 from drivax.scenario.bank.sizes import BATCH, Sizes, last_used
-from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
     EDGE_KINDS,

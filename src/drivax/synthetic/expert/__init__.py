@@ -1,6 +1,6 @@
-"""The expert that drives ego: candidate paths, speed search, smoothing and checks.
+"""The expert that drives ego: candidate paths, speed plans and checks.
 
-``plan`` chooses the path and its speeds (``speed_search``), which ``smoothing`` makes comfortable; ``driver`` drives.
+``plan`` chooses the path and its speeds, which ``speed_plan`` searches and smooths; ``driver`` drives.
 """
 
 import lazy_loader

@@ -23,8 +23,15 @@ from drivax.synthetic.expert.candidates import (
     shift_path,
     stop_lines,
 )
-from drivax.synthetic.expert.smoothing import Bounds, SpeedProfile, smooth_speeds
-from drivax.synthetic.expert.speed_search import TOUCH, Occupancy, SpeedPlan, search
+from drivax.synthetic.expert.speed_plan import (
+    TOUCH,
+    Bounds,
+    Occupancy,
+    SpeedPlan,
+    SpeedProfile,
+    search,
+    smooth_speeds,
+)
 from drivax.synthetic.expert.violations import against_traffic, inside, user_boxes
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.traffic.lateral import project_on_path

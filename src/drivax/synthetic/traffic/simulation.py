@@ -32,11 +32,11 @@ from drivax.synthetic.traffic.lateral import (
     lane_change_path,
     positions_along,
 )
-from drivax.synthetic.traffic.leaders import LeaderSearch
 from drivax.synthetic.traffic.obstacles import (
     NO_EXTENTS,
     Boxes,
     Extents,
+    LeaderSearch,
     StaticObstacles,
     extents,
     nearest_obstacles,

@@ -22,8 +22,7 @@ from drivax.synthetic.roads.families.streets import (
     MidblockCrosswalk,
     ParkedStreet,
 )
-from drivax.synthetic.roads.network import RoadNetwork
-from drivax.synthetic.roads.style import GRID, RoadStyle
+from drivax.synthetic.roads.network import GRID, RoadNetwork, RoadStyle
 
 
 @runtime_checkable

@@ -28,8 +28,7 @@ from drivax.synthetic.roads.curves import (
     straight,
     tangent_lengths,
 )
-from drivax.synthetic.roads.network import Crossing, Draft, Line, Start, points, ring
-from drivax.synthetic.roads.style import RoadStyle
+from drivax.synthetic.roads.network import Crossing, Draft, Line, RoadStyle, Start, points, ring
 
 #: Distances from the mouth of the crossing's two sides and of the stop line, with a crosswalk and without, m.
 _CROSSING_M = ((0.8, 4.0), (0.2, 3.0))

@@ -33,9 +33,17 @@ from drivax.synthetic.roads.families.junction_layout import (
     open_site,
     starts,
 )
-from drivax.synthetic.roads.network import Control, Draft, RoadNetwork, conflict_matrix
+from drivax.synthetic.roads.network import (
+    GRID,
+    Control,
+    Draft,
+    Layouts,
+    RoadNetwork,
+    RoadStyle,
+    conflict_matrix,
+    draw_layout,
+)
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan, combine_plans, yellow_time_s
-from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
 
 #: Layouts of streets at lights; an extra lane inward is for turning left.
 _SIGNAL_LAYOUTS: Layouts = ((1, 1, 0.35), (2, 1, 0.15), (2, 2, 0.38), (3, 2, 0.12))

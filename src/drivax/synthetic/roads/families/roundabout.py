@@ -26,17 +26,18 @@ from drivax.synthetic.roads.curves import (
 from drivax.synthetic.roads.families.junction_layout import Reach
 from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
 from drivax.synthetic.roads.network import (
+    GRID,
     Control,
     Crossing,
     Draft,
     Line,
     RoadNetwork,
+    RoadStyle,
     Start,
     conflict_matrix,
     points,
     ring,
 )
-from drivax.synthetic.roads.style import GRID, RoadStyle
 
 #: Least radius of the fillets of entries and exits, m, where the arc between them leaves room.
 _FILLET_M = 11.5

@@ -11,8 +11,16 @@ from jaxtyping import Float64
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import STEP_M, Curve, from_curvature
 from drivax.synthetic.roads.families.street_layout import Street, StreetFamily, Strip, strips
-from drivax.synthetic.roads.network import Line, RoadNetwork, Start, ring
-from drivax.synthetic.roads.style import GRID, Layouts, RoadStyle, draw_layout
+from drivax.synthetic.roads.network import (
+    GRID,
+    Layouts,
+    Line,
+    RoadNetwork,
+    RoadStyle,
+    Start,
+    draw_layout,
+    ring,
+)
 
 #: Limits below which curved and straight roads may have bays, and streets crossings away from junctions, m/s.
 _PARKING_LIMIT_MPS, _CROSSING_LIMIT_MPS = 14.0, 17.0
