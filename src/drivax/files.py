@@ -123,7 +123,7 @@ def parse_bytes(text: str) -> int:
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMGT])B\s*", text)
     if match is None:
-        raise UsageError(f"{text!r} is no size", cure="use a number and a unit: 800MB, 2GB")
+        raise UsageError(f"invalid size {text!r}", cure="use a number and a unit: 800MB, 2GB")
     return int(float(match[1]) * {"k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}[match[2]])
 
 

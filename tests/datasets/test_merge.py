@@ -53,9 +53,9 @@ def test_a_filter_selects_from_every_set(sets, tmp_path):
 
 def test_sets_that_cannot_be_merged_are_refused(sets, tmp_path, capsys):
     out = tmp_path / "out"
-    with pytest.raises(UsageError, match="one set to merge; name two or more"):
+    with pytest.raises(UsageError, match="merge needs at least two sets; name two or more"):
         merge(sets[:1], out)
-    with pytest.raises(DataError, match="is in the set already"):
+    with pytest.raises(DataError, match=r"scenario .* of .* is also in .*default; name each set once"):
         merge([sets[0], sets[0]], out)
     with pytest.raises(UsageError, match="is the input set"):
         merge(sets, sets[1], overwrite=True)

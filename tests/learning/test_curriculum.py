@@ -53,7 +53,7 @@ def config_of(stages, iterations=8, **changes):
 
 
 def of_stages(*stages, steps=10):
-    return Curriculum(stages, ENTRIES, {"collision", "progress"}, steps)
+    return Curriculum(stages, ENTRIES, {"collision", "progress"}, {"success"}, steps)
 
 
 def test_a_stage_has_the_scenarios_of_its_filters():
@@ -120,6 +120,8 @@ def test_metrics_of_seeds_are_means_over_all_episodes():
         {"rollout/success": 0.5, "rollout/episodes": 30.0, "loss/x": 1.0},
         {"rollout/success": 1.0, "rollout/episodes": 10.0},
         {"rollout/episodes": 0.0},
+        # As in the log of a seed that diverged.
+        {"rollout/success": None, "rollout/episodes": None},
     ]
     assert mean_rollout(rows) == {"rollout/success": 0.625, "rollout/episodes": 40.0}
     assert mean_rollout([]) == {"rollout/episodes": 0}
@@ -134,6 +136,16 @@ def test_impossible_stages_are_refused(scenarios, tmp_path):
         DataError, match="stage 's': no scenario to train on meets type=u_turn; use fewer or weaker"
     ):
         of_stages(Stage("s", 1, ("type=u_turn",)))
+    with pytest.raises(
+        UsageError, match=r"stage 's': unknown metric of rollouts 'sucess'; did you mean .?success"
+    ):
+        of_stages(Stage("s", 1, advance=Advance("sucess")))
+    with pytest.raises(UsageError, match="stage 's': a factor of the reward is nan; use a finite number"):
+        Stage("s", 1, rewards={"collision": float("nan")})
+    with pytest.raises(UsageError, match="stage 'all' begins after 48 of 48 steps; raise total_steps"):
+        config_of(STAGES, 3)
+    with pytest.raises(UsageError, match="duplicate stage 'few'"):
+        config_of((STAGES[0], STAGES[0]))
     with pytest.raises(UsageError, match="is not a filter"):
         Stage("s", 1, ("type",))
     with pytest.raises(UsageError, match="a curriculum needs an algorithm that drives"):

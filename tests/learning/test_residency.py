@@ -55,7 +55,7 @@ def prepare(config, scenarios, weights=None):
     bank = residents.load(0)
     learner = config.algorithm.build(source.environment, bank, config.iterations)
     program = Program(Seeds(learner, (config.seed,)), residents.complete(bank, 0))
-    return residents, program, program.initial_state()
+    return residents, program, residents.resume(program, program.initial_state(), 0, ())
 
 
 def run(residents, program, state, iterations):
@@ -240,5 +240,12 @@ def test_memory_is_refused_where_it_cannot_work(scenarios, tmp_path):
     config = replace(config_of(PPO), residency=None)
     with pytest.raises(UsageError, match=r"resident scenarios are too few.*raise --memory"):
         train(config, scenarios, tmp_path / "few", validation=None, memory=600_000)
+    with pytest.raises(UsageError, match=r"1 kB hold 0 scenarios of .*; raise --memory"):
+        train(config, scenarios, tmp_path / "few", validation=None, memory=1_000)
+    with pytest.raises(UsageError, match="both --memory and residency; leave out one of them"):
+        train(config_of(PPO), scenarios, tmp_path / "few", validation=None, memory=10**6)
+    with pytest.raises(UsageError, match="trained policies in the traffic need all scenarios on the device"):
+        train(replace(config, traffic="zoo:bc"), scenarios, tmp_path / "few", validation=None, memory=10**6)
+    assert not (tmp_path / "few").exists()
     with pytest.raises(UsageError, match=r"residency.scenarios is 5, residency.block 2; use a multiple of 2"):
         Residency(5, 2)

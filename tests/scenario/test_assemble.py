@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.build.assemble import MISSING, assemble, blank, count_source
+from drivax.scenario.build.assemble import assemble, count_source
 from drivax.scenario.recording import Event, MapFeature, windows, with_ego
-from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag, LightState, RoadKind, record_dtype
+from drivax.scenario.schema import (
+    CAPACITIES,
+    MISSING,
+    AgentKind,
+    Capacity,
+    Flag,
+    LightState,
+    RoadKind,
+    blank,
+    record_dtype,
+)
 
 from .recordings import (
     FAR,

@@ -110,7 +110,9 @@ def test_a_tenth_is_held_out_in_the_order_of_the_digests():
     assert split.recordings == sorted(["womd", segment] for segment in first)
     assert split.validation == [i for i, row in enumerate(rows) if row["segment"] in first]
     assert split.training == [i for i, row in enumerate(rows) if row["segment"] not in first]
-    assert split.text().startswith("trains on 108 scenarios, validates on 12 (held-out recordings: 4);")
+    assert split.text(108, 12).startswith(
+        "trains on 108 scenarios, validates on 12 (held-out recordings: 4);"
+    )
     assert split.note() == {"recordings": split.recordings, "scenarios": 12}
     assert hold_out(rows, split.recordings) == split, "recordings of run.json give the same split"
     same = hold_out(rows[::-1])
@@ -147,4 +149,6 @@ def test_single_recording_is_trained_on():
     split = hold_out(entries(1))
     assert (split.recordings, split.training, split.validation) == ([], [0, 1, 2], [])
     assert split.note() is None
-    assert split.text().startswith("no validation: all scenarios are of one recording; pass --validation SET")
+    assert split.text(108, 12).startswith(
+        "no validation: all scenarios are of one recording; pass --validation SET"
+    )

@@ -113,6 +113,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         config = replace(config, begin_from=args.begin_from)
     if args.filters:
         config = replace(config, filters=(*config.filters, *args.filters))
+    memory = None if args.memory is None else parse_bytes(args.memory)
     folder = train(
         config,
         _data(args, config),
@@ -121,7 +122,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
-        memory=None if args.memory is None else parse_bytes(args.memory),
+        memory=memory,
         log=lambda line: show(line, sys.stderr),
         trust=args.trust_code,
     )

@@ -128,10 +128,16 @@ class TrainConfig:
         names = [stage.name for stage in self.curriculum]
         if duplicates := [name for name in names if names.count(name) > 1]:
             raise UsageError(f"duplicate stage {duplicates[0]!r}", cure="give each stage its own name")
-        if self.curriculum and isinstance(self.algorithm, OfflineConfig):
+        if self.curriculum and isinstance(self.algorithm, OfflineConfig | BcConfig):
             raise UsageError(
-                "a curriculum needs an algorithm that drives", cure="use ppo, sac, a warm start or bc"
+                "a curriculum needs an algorithm that drives", cure="use ppo, sac or a warm start"
             )
+        if (
+            self.curriculum
+            and (before := sum(stage.steps for stage in self.curriculum[:-1])) >= self.total_steps
+        ):
+            problem = f"stage {names[-1]!r} begins after {before:,} of {self.total_steps:,} steps"
+            raise UsageError(problem, cure="raise total_steps, or shorten the stages")
         if self.curriculum and self.residency is not None:
             raise UsageError("a curriculum needs all scenarios on the device", cure="leave out residency")
         if self.patience and not self.evaluate_every:

@@ -6,6 +6,7 @@ of reward terms. The stage follows from the logged rows, so a resumed run contin
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,8 +19,8 @@ from drivax.checks import check_at_least
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.scenario.select.selection import Selection
 
-#: Logged values of an iteration by name.
-Row = Mapping[str, float]
+#: Logged values of an iteration by name; None where they were not finite.
+LoggedValues = Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class Stage:
     def __post_init__(self) -> None:
         check_at_least(self, 1, "steps")
         Selection.parse(self.filters)
+        for value in (self.reward_scale, *self.rewards.values(), *self.rewards_at_end.values()):
+            if not math.isfinite(value):
+                problem = f"stage {self.name!r}: a factor of the reward is {value}"
+                raise UsageError(problem, cure="use a finite number")
 
     def factors(self, share: float, terms: Iterable[str]) -> dict[str, float]:
         """Return the factor of each reward term when a share of the budget is done."""
@@ -79,12 +84,18 @@ class Stage:
         return result
 
 
-def mean_rollout(rows: Sequence[Row]) -> dict[str, float]:
+def mean_rollout(rows: Sequence[LoggedValues]) -> dict[str, float]:
     """Return the metrics of rollouts of several seeds as those of all their episodes together."""
-    counts = [row.get("rollout/episodes", 0.0) for row in rows]
+    counts = [row.get("rollout/episodes") or 0.0 for row in rows]
     result = {"rollout/episodes": sum(counts)}
     for name in {name for row in rows for name in row if name.startswith("rollout/")} - {*result}:
-        pairs = [(row[name], count) for row, count in zip(rows, counts, strict=True) if name in row]
+        # Values that are not finite are None in the log.
+        values = [row.get(name) for row in rows]
+        pairs = [
+            (value, count)
+            for value, count in zip(values, counts, strict=True)
+            if value is not None and math.isfinite(value)
+        ]
         if (total := sum(count for _, count in pairs)) > 0:
             result[name] = sum(value * count for value, count in pairs) / total
     return result
@@ -97,26 +108,30 @@ class Curriculum:
         stages: The stages in order.
         entries: Manifest entries of the scenarios to train on.
         terms: Names of the reward terms.
+        metrics: Names of the metrics of rollouts.
         steps_per_iteration: Environment steps of an iteration.
 
     Raises:
-        UsageError: A stage names an unknown reward term.
+        UsageError: A stage names an unknown reward term or metric.
         DataError: No scenario meets the filters of a stage.
     """
 
     def __init__(
         self, stages: Sequence[Stage], entries: Sequence[Mapping[str, Any]], terms: Collection[str],
-        steps_per_iteration: int,
+        metrics: Collection[str], steps_per_iteration: int,
     ) -> None:  # fmt: skip
         self.stages, self.terms, self._steps_per_iteration = stages, sorted(terms), steps_per_iteration
         self.number, self._done = 0, 0
         self._newest: deque[tuple[float, float]] = deque()
         self._shares = []
         for stage in stages:
-            for term in (*stage.rewards, *stage.rewards_at_end):
-                if term not in terms:
-                    problem = f"stage {stage.name!r}: unknown reward term {term!r}"
-                    raise UsageError(problem, cure=did_you_mean(term, self.terms))
+            names = [("reward term", term, self.terms) for term in (*stage.rewards, *stage.rewards_at_end)]
+            if stage.advance is not None:
+                names.append(("metric of rollouts", stage.advance.metric, sorted(metrics)))
+            for kind, name, known in names:
+                if name not in known:
+                    problem = f"stage {stage.name!r}: unknown {kind} {name!r}"
+                    raise UsageError(problem, cure=did_you_mean(name, known))
             mask = np.zeros(len(entries))
             mask[Selection.parse(stage.filters).rows(entries)] = 1.0
             if not mask.any():
@@ -144,19 +159,19 @@ class Curriculum:
         count = int(self.scenarios.sum())
         return f"stage {self.number + 1} of {len(self.stages)}, {self.stage.name}: {count:,} scenarios"
 
-    def log(self, row: Row) -> None:
+    def log(self, row: LoggedValues) -> None:
         """Move on by an iteration, given its log."""
         self._done += self._steps_per_iteration
         if self.number + 1 < len(self.stages) and (self._done >= self.stage.steps or self._passes(row)):
             self.number, self._done = self.number + 1, 0
             self._newest.clear()
 
-    def _passes(self, row: Row) -> bool:
+    def _passes(self, row: LoggedValues) -> bool:
         """Return whether the metric passes over the newest iterations with enough episodes."""
         advance = self.stage.advance
         if advance is None:
             return False
-        value, episodes = row.get(f"rollout/{advance.metric}"), row.get("rollout/episodes", 0.0)
+        value, episodes = row.get(f"rollout/{advance.metric}"), row.get("rollout/episodes") or 0.0
         if value is not None and episodes > 0:
             self._newest.append((value, episodes))
         total = sum(count for _, count in self._newest)

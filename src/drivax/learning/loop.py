@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from drivax.learning.algorithm import Agent, HasCritics, HeldOutMetrics, Learner
 from drivax.learning.config import TrainConfig
 from drivax.learning.curriculum import mean_rollout
 from drivax.learning.driving import Driving, count_egos
-from drivax.learning.experience import Experience, check_weights
+from drivax.learning.experience import check_weights
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.policies import PretrainedRun, find_traffic, initial_state, pretrained_networks
 from drivax.learning.program import Program, Seeds, former_devices, warn_of_other_bits
@@ -120,7 +121,7 @@ def train(
         validation: Scenarios that rank checkpoints. By default, whole recordings of ``data`` are held out: at most a
             tenth of its scenarios and at most 256, or the smallest recording if none fits; nothing if there is only one
             recording. None trains on all scenarios without validation.
-        options: ``resume``, ``overwrite``, ``seeds``, ``log`` and ``trust`` of :class:`TrainOptions`.
+        options: ``resume``, ``overwrite``, ``seeds``, ``memory``, ``log`` and ``trust`` of :class:`TrainOptions`.
 
     Raises:
         UsageError: ``out`` exists, inputs of a resumed run differ, weights do not fit, or memory is too small.
@@ -145,14 +146,14 @@ def train(
     scenarios, weights, validation_scenarios = _divide(config, data, training.weights, validation_set)
     source = Source.of(config, scenarios, weights, episodes, trust)
     residents = Residents.of(source, opts.memory)
-    config, bank = residents.config, residents.load()
-    learner = config.algorithm.build(source.environment, bank, config.iterations)
-    held_out = _held_out(config, source.environment, learner, validation_scenarios, episodes)
+    config = residents.config
     seeds = range(config.seed, config.seed + (len(folders) or opts.seeds))
-    program = Program(Seeds(learner, tuple(seeds)), residents.complete(bank), config.devices)
+    program = _program(residents, tuple(seeds))
+    held_out = _held_out(config, source.environment, program.seeds.learner, validation_scenarios, episodes)
     warn_of_other_bits([folder.info for folder in folders], len(program.devices), opts.log)
     (memory := program.account(None if held_out is None else held_out.bank)).check()
-    held_out_notice = [validation_set.text()] if isinstance(validation_set, HoldOut) else []
+    divided = len(scenarios), len(validation_scenarios or ())
+    held_out_notice = [validation_set.text(*divided)] if isinstance(validation_set, HoldOut) else []
     for line in (*held_out_notice, *residents.notices(program.data), memory.text()):
         opts.log(line)
     # Read before folders are created, because an error must leave none.
@@ -166,6 +167,13 @@ def train(
         stack.callback(residents.close)
         _Training(config, program, logs, held_out, networks, opts.log, trust, residents).run()
     return RunFolder.open(out)
+
+
+def _program(residents: Residents, seeds: tuple[int, ...]) -> Program:
+    """Return the program of a run, which alone keeps its data in memory."""
+    config, source, data = residents.config, residents.source, residents.load()
+    learner = config.algorithm.build(source.environment, data, config.iterations)
+    return Program(Seeds(learner, seeds), residents.complete(data), config.devices)
 
 
 def _validation_set(
@@ -209,13 +217,11 @@ def _divide(
         scenarios = validation
     elif config.patience:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if len(training) == len(data):
-        return data, weights, scenarios
     if weights is not None:
         egos = count_egos(config.egos, data.capacity.egos)
         weights = check_weights(weights, len(data), data.capacity.steps, egos)[list(training)]
         weights = weights.reshape(-1, data.capacity.steps)
-    return Subset(data, training), weights, scenarios
+    return data if len(training) == len(data) else Subset(data, training), weights, scenarios
 
 
 def usable_steps(
@@ -230,9 +236,9 @@ def usable_steps(
     scenarios, steps = training.scenarios, training.scenarios.capacity.steps
     uniform = np.ones((len(scenarios), steps))
     source = Source.of(config, scenarios, uniform, training.episodes, trust)
-    experience = source.complete(source.load())
-    if not isinstance(experience, Experience):
+    if not source.draws_steps():
         return uniform > 0
+    experience = source.complete(source.load())
     usable, scenario = np.asarray(experience.usable), experience.expert.scenario
     if scenario is None:
         return usable
@@ -367,7 +373,8 @@ class _Training:
         """
         config, program = self.config, self.program
         done, state = self._start()
-        self.residents.resume(program, done, self._logged(done) if config.curriculum else ())
+        state = self.residents.resume(program, state, done, self._logged(done) if config.curriculum else ())
+        exchanged: dict[str, float] = {}
         total_steps, done_steps = self._steps(config.iterations), self._steps(done)
         with Progress("training", "steps", total_steps, done=done_steps) as progress, StopSignal() as stop:
             for iteration in range(done + 1, config.iterations + 1):
@@ -376,7 +383,6 @@ class _Training:
                 started = time.perf_counter()
                 state, values, finite = program.step(state)
                 values, finite = jax.device_get((values, finite))
-                state, exchanged = self.residents.exchange(program, state, iteration)
                 rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
                 # Read once, so that all seeds write a checkpoint of the same iteration.
                 preempted = stop.received and iteration < config.iterations
@@ -384,7 +390,8 @@ class _Training:
                 stage = self.residents.note()
                 rows = [row | exchanged | stage | {"steps_per_second": rate} for row in means]
                 self._check(iteration, state, rows, np.atleast_1d(finite))
-                if line := self.residents.follow(program, mean_rollout(rows)):
+                driven = [row for row, log in zip(rows, self.logs, strict=True) if not log.stopped]
+                if line := self.residents.follow(program, mean_rollout(driven)):
                     self.log(f"{line}, from step {self._steps(iteration):,}")
                 self._record(iteration, state, rows, preempted)
                 success = [row["rollout/success"] for row in rows if "rollout/success" in row]
@@ -393,6 +400,9 @@ class _Training:
                 if preempted:
                     problem = f"SIGTERM stopped the training after {self._steps(iteration):,} steps"
                     raise Preempted(problem, cure="continue it with --resume")
+                # After the iteration is recorded, because a file may be damaged. Its times are logged with the next.
+                if iteration < config.iterations:
+                    state, exchanged = self.residents.exchange(program, state, iteration)
         self._check_critics()
         for log in self.logs:
             if log.divergence is not None:
@@ -415,8 +425,15 @@ class _Training:
                 self.log(f"warning: seed {seed}: unhealthy critics: {problem}")
 
     def _logged(self, done: int) -> list[dict[str, float]]:
-        """Return the mean over seeds of what each finished iteration logged about rollouts."""
+        """Return the mean over seeds of what each finished iteration logged about rollouts.
+
+        A seed that diverged or ran out of patience did not count from that step on.
+        """
         tables = [{row["step"]: row for row in log.folder.metric_rows()} for log in self.logs]
+        for log, table in zip(self.logs, tables, strict=True):
+            end = (log.folder.info.get("divergence") or {}).get("step", math.inf)
+            for step in [step for step in table if step >= end]:
+                del table[step]
         steps = map(self._steps, range(1, done + 1))
         return [mean_rollout([table[step] for table in tables if step in table]) for step in steps]
 

@@ -170,7 +170,10 @@ class Program:
 
     def state_of(self, states: Sequence[Any]) -> Any:
         """Return the state of all seeds, laid out over the devices, given that of each."""
-        state = self.seeds.stack(states)
+        return self.arrange(self.seeds.stack(states))
+
+    def arrange(self, state: Any) -> Any:
+        """Return a changed state in the layout of the program."""
         return state if self._layout is None else jax.device_put(state, self._layout)
 
     def step(self, state: Any) -> tuple[Any, Any, Bool[Array, "*seeds"]]:

@@ -20,16 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt
 
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.files import format_bytes
-from drivax.learning.config import Residency, TrainConfig
-from drivax.learning.curriculum import Curriculum, Row
+from drivax.learning.config import SELF, Residency, TrainConfig, split_traffic
+from drivax.learning.curriculum import Curriculum, LoggedValues
 from drivax.learning.driving import with_expert_steps
 from drivax.learning.environment import Environments, cumulative_probability
 from drivax.learning.experience import Experience, environment_data
 from drivax.learning.program import Program
 from drivax.learning.replay import Replay
-from drivax.learning.training_set import Rows, Source
+from drivax.learning.training_set import Indices, Source
+from drivax.metrics.catalogue import select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.stats.intervals import effective_size
 
@@ -40,7 +41,7 @@ _MOST_LEAVING = 0.125
 #: Most scenarios of a block: their arrays are stacked together.
 _MOST_BLOCK = 64
 #: Loads scenarios by their numbers.
-_Load = Callable[[Rows], ScenarioBank]
+_Load = Callable[[Indices], ScenarioBank]
 #: Scenarios whose bytes stand for those of all.
 _SAMPLE = 32
 
@@ -121,7 +122,7 @@ def _shuffled(total: int, seed: int, number: int) -> Int[np.ndarray, " total"]:
     return np.random.default_rng([seed, number]).permutation(total)
 
 
-def _within(scenarios: int, steps_per_iteration: int, lead: int) -> Residency:
+def _choose_residency(scenarios: int, steps_per_iteration: int, lead: int) -> Residency:
     """Return the exchange of this many resident scenarios or a few less, given the iterations of an episode.
 
     A scenario stays for about eight episodes, or longer if more than an eighth would be about to leave.
@@ -146,7 +147,9 @@ class Residents:
         if config.curriculum:
             terms = config.task.rewards.weights()
             steps = config.algorithm.steps_per_iteration
-            self.curriculum = Curriculum(config.curriculum, source.scenarios.entries, terms, steps)
+            metrics = select_metrics(config.task.metrics).names
+            entries = source.scenarios.entries
+            self.curriculum = Curriculum(config.curriculum, entries, terms, metrics, steps)
 
     @classmethod
     def of(cls, source: Source, memory: int | None) -> Residents:
@@ -158,6 +161,11 @@ class Residents:
         config, total = source.config, len(source.scenarios)
         if memory is None and config.residency is None:
             return cls(source)
+        if memory is not None and config.residency is not None:
+            raise UsageError("both --memory and residency", cure="leave out one of them")
+        if any(split_traffic(name)[0] is not None for name in config.shares if name != SELF):
+            problem = "trained policies in the traffic need all scenarios on the device"
+            raise UsageError(problem, cure="leave out --memory and residency")
         if config.curriculum:
             raise UsageError("a curriculum needs all scenarios on the device", cure="leave out --memory")
         if source.episodes:
@@ -167,7 +175,9 @@ class Residents:
         rows = np.arange(min(total, _SAMPLE))
         sample = load(rows)
         learner = config.algorithm.build(source.environment, sample, config.iterations)
-        experience = source.complete(sample, rows)
+        # Weights may be 0 in the sample.
+        unweighted = None if source.weights is None else np.ones_like(source.weights)
+        experience = replace(source, weights=unweighted).complete(sample, rows)
         if isinstance(experience, Experience):
             load = partial(_load, source, True)
             sample = load(rows)
@@ -183,7 +193,10 @@ class Residents:
             scenarios = int((memory or 0) / (scenario_bytes * copies))
             if scenarios >= total:
                 return cls(source)
-            residency = _within(scenarios, steps, lead)
+            if scenarios < 2:
+                problem = f"{format_bytes(memory or 0)} hold {scenarios} scenarios of {format_bytes(scenario_bytes)}"
+                raise UsageError(problem, cure="raise --memory")
+            residency = _choose_residency(scenarios, steps, lead)
         return cls(source, Rotation(residency, total, config.seed, lead), load)
 
     @property
@@ -193,42 +206,66 @@ class Residents:
         return config if self.rotation is None else replace(config, residency=self.rotation.residency)
 
     def load(self, iteration: int = 0) -> Any:
-        """Return the environment's data in an iteration, given the number of finished ones; begin to read a block."""
+        """Return the environment's data in an iteration, given the number of finished ones."""
         if self.rotation is None or self._load is None:
             return self._with_stage(self.source.load())
         exchanges = self.rotation.exchanges(iteration)
         blocks = np.split(self.rotation.resident(exchanges), self.rotation.blocks)
         # Block by block as in training, because batches of other sizes may round otherwise.
         bank = jax.tree.map(_join, *(jax.tree.map(np.asarray, self._load(rows)) for rows in blocks))
-        if self._next is not None:
-            self._next.cancel()
-        self._next = self._thread.submit(self._load, self.rotation.entering(exchanges))
         return replace(bank, chances=jnp.asarray(self.rotation.chances(exchanges)))
 
     def complete(self, data: Any, iteration: int = 0) -> Any:
-        """Return the data of the algorithm in an iteration, given those of the environment."""
-        if self.rotation is None:
-            return self.source.complete(data)
-        return self.source.complete(data, self.rotation.resident(self.rotation.exchanges(iteration)))
+        """Return the data of the algorithm in an iteration, given those of the environment.
 
-    def resume(self, program: Program, iteration: int, rows: Sequence[Row]) -> None:
-        """Load the data of a run that continues after some iterations, given their logs."""
-        if self.curriculum is not None:
+        Raises:
+            UsageError: There is a curriculum, but the algorithm draws logged steps.
+        """
+        rotation, source = self.rotation, self.source
+        if rotation is not None:
+            indices = rotation.resident(rotation.exchanges(iteration))
+            try:
+                return source.complete(data, indices)
+            except DataError:
+                if source.weights is None or not iteration:
+                    raise
+                # All weights of the scenarios that are resident now are 0.
+                return replace(source, weights=np.ones_like(source.weights)).complete(data, indices)
+        result = source.complete(data)
+        if self.curriculum is not None and isinstance(result, Experience):
+            cure = "leave out the curriculum, or demonstrations and weights"
+            raise UsageError("a curriculum does not apply to logged steps", cure=cure)
+        return result
+
+    def resume(self, program: Program, state: Any, iteration: int, rows: Sequence[LoggedValues]) -> Any:
+        """Load the data of a run that begins, or continues after some iterations with these logs; return its state."""
+        rotation = self.rotation
+        if self.curriculum is not None and iteration:
             for row in rows:
                 self.curriculum.log(row)
-        if iteration and (self.rotation is not None or self.curriculum):
+            program.data = program.place(self.complete(self._with_stage(environment_data(program.data))))
+        if rotation is None or self._load is None:
+            return state
+        exchanges = rotation.exchanges(iteration)
+        if exchanges:
+            program.data = None  # so that memory holds the scenarios once
             program.data = program.place(self.complete(self.load(iteration), iteration))
+            if iteration % rotation.residency.every == 0:  # the state was saved before this exchange
+                state = _drop_stale(state, rotation.first_row(exchanges - 1), rotation.residency.block)
+        self._next = self._thread.submit(self._load, rotation.entering(exchanges))
+        return program.arrange(state)
 
-    def follow(self, program: Program, row: Row) -> str | None:
+    def follow(self, program: Program, row: LoggedValues) -> str | None:
         """Move on in the curriculum by an iteration, given its log; return a line for the log if a stage begins."""
         if not self.curriculum:
             return None
         stage, factors = self.curriculum.number, self.curriculum.factors
         self.curriculum.log(row)
         begins = self.curriculum.number > stage
-        if begins or self.curriculum.factors != factors:
-            bank = self._with_stage(environment_data(program.data))
-            program.data = program.place(self.complete(bank))
+        if begins:
+            program.data = program.place(self.complete(self._with_stage(program.data)))
+        elif self.curriculum.factors != factors:
+            program.data = replace(program.data, reward_factors=program.place(self._reward_factors()))
         return self.curriculum.text() if begins else None
 
     def note(self) -> dict[str, float]:
@@ -240,8 +277,11 @@ class Residents:
         if not self.curriculum:
             return bank
         chances = jnp.asarray(cumulative_probability(self.curriculum.scenarios))
-        factors = {name: jnp.asarray(value, jnp.float32) for name, value in self.curriculum.factors.items()}
-        return replace(bank, chances=chances, reward_factors=factors)
+        return replace(bank, chances=chances, reward_factors=self._reward_factors())
+
+    def _reward_factors(self) -> dict[str, Array]:
+        factors = {} if self.curriculum is None else self.curriculum.factors
+        return {name: jnp.asarray(value, jnp.float32) for name, value in factors.items()}
 
     def exchange(self, program: Program, state: Any, iteration: int) -> tuple[Any, dict[str, float]]:
         """Exchange a block if one is due after an iteration; return the state, and values to log.
@@ -267,7 +307,7 @@ class Residents:
         bank = _replace_rows(bank, program.place(block), first, rotation.residency)
         bank = replace(bank, chances=program.place(jnp.asarray(rotation.chances(exchanges))))
         program.data = program.place(self.complete(bank, iteration))
-        state = _leave(state, first, rotation.residency.block)
+        state = program.arrange(_drop_stale(state, first, rotation.residency.block))
         taken = time.perf_counter() - started
         return state, {"residency/waited_s": waited, "residency/exchange_s": taken}
 
@@ -299,7 +339,7 @@ class Residents:
         self._thread.shutdown(cancel_futures=True)
 
 
-def _load(source: Source, replays_log: bool, rows: Rows) -> ScenarioBank:
+def _load(source: Source, replays_log: bool, rows: Indices) -> ScenarioBank:
     """Return the bank of some scenarios, with the expert's steps if the algorithm learns from them."""
     bank = source.bank(source.scenarios.take(rows.tolist()), source.scenarios.sizes)
     source.scenarios.release()
@@ -321,7 +361,7 @@ def _replace_rows(bank: Any, block: Any, first: Int[Array, ""], residency: Resid
     return jax.tree.map(update, bank, block)
 
 
-def _leave(state: Any, first: int, count: int) -> Any:
+def _drop_stale(state: Any, first: int, count: int) -> Any:
     """Return the state with episodes over, and stored states forgotten, that are in rows to be replaced."""
 
     def is_stale(index: Int[Array, "..."]) -> Bool[Array, "..."]:

@@ -23,6 +23,7 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.offline import OfflineConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving, count_egos
+from drivax.learning.experience import Experience
 from drivax.learning.mixture import Mixture, training_environment
 from drivax.learning.recorded_episodes import (
     RecordedDriving,
@@ -41,7 +42,7 @@ from drivax.tasks.task import Task
 from drivax.tracking.run_folder import RunFolder
 
 #: Numbers of scenarios in a set.
-Rows = Int[np.ndarray, " n"]
+Indices = Int[np.ndarray, " n"]
 
 _RECORD = "record them again: drivax record"
 
@@ -132,7 +133,17 @@ class Source:
             raise DataError("no recorded episode is in the scenarios to train on", cure=cure)
         return recorded
 
-    def complete(self, data: Any, rows: Rows | None = None) -> Any:
+    def draws_steps(self) -> bool:
+        """Return whether the algorithm draws logged steps by weight; one scenario is loaded to find out."""
+        if self.episodes:
+            return True
+        bank = self.bank(self.scenarios.take([0]))
+        try:
+            return isinstance(self.complete(bank, np.arange(1)), Experience)
+        except DataError:  # no step of this scenario is usable
+            return True
+
+    def complete(self, data: Any, rows: Indices | None = None) -> Any:
         """Return the data of the algorithm's iterations, given those of the environment (:func:`training_data`).
 
         ``rows`` are the numbers of the scenarios that these contain; None: all.

@@ -312,7 +312,7 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
 
 
 #: Fields in which unused slots and unknown values are -1; they are 0 in all others.
-_MISSING = (
+MISSING = (
     "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
     "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
     "lane_successor", "lane_predecessor", "lane_left", "lane_right", "lane_light", "route_lane", "route_limit",
@@ -324,7 +324,7 @@ _MISSING = (
 def blank(capacity: Capacity) -> np.ndarray[Any, Any]:
     """Return a record without valid entries: zeros, and -1 for missing indices and values."""
     record = np.zeros((), record_dtype(capacity))
-    for name in set(_MISSING) & set(record.dtype.names or ()):
+    for name in set(MISSING) & set(record.dtype.names or ()):
         record[name] = -1
     return record
 

@@ -28,7 +28,7 @@ from importlib import metadata
 from io import BufferedIOBase
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any, Self, cast
+from typing import IO, Any, Self
 
 import numpy as np
 
@@ -195,8 +195,10 @@ class ScenarioWriter:
         for name in self._buffer.dtype.names or ():
             self._buffer[name][0] = scenario.record[name]
         data = self._buffer.tobytes()
-        sizes = Sizes.of_record(self.capacity, self._buffer.reshape(()))
-        self._sizes = sizes if self._sizes is None else self._sizes.join(sizes)
+        record = self._buffer.reshape(())
+        if find_impossible(record) is None:  # others are refused when they are read
+            sizes = Sizes.of_record(self.capacity, record)
+            self._sizes = sizes if self._sizes is None else self._sizes.join(sizes)
         if self._file is None:
             self._file = (self._partial.content / shard_name(len(self._shards))).open("wb")
             write_header(self._file, self._buffer.dtype, 0)
@@ -217,7 +219,8 @@ class ScenarioWriter:
             sync_and_close(file)
         shard = {"file": name, "count": count, "sha256": file_digest(folder / name)}
         shard["crc_sha256"] = file_digest(folder / crc_name(name))
-        shard["sizes"] = dataclasses.asdict(cast(Sizes, self._sizes))
+        if self._sizes is not None:
+            shard["sizes"] = dataclasses.asdict(self._sizes)
         summary = {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
         self._partial.note(len(self._shards), summary)
         self._shards.append(shard)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.gpudrive import file_name, gpudrive_content
 from drivax.datasets.womd.tfrecord import example, shard_name, write_record
-from drivax.errors import UsageError, did_you_mean
+from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.files import PartialFolder, check_output, explain_full_disk, sync_and_close, write_json
 from drivax.scenario.schema import common_capacity
 from drivax.scenario.select.selection import select_scenarios
@@ -162,10 +162,18 @@ def merge(
     """
     out, sets = Path(out), [ScenarioSet.open(path) for path in paths]
     if len(sets) < 2:
-        raise UsageError("one set to merge", cure="name two or more")
+        raise UsageError("merge needs at least two sets", cure="name two or more")
     capacity = common_capacity(scenarios.capacity for scenarios in sets)
     rows = [select_scenarios(scenarios, filters) for scenarios in sets]
-    total = sum(map(len, rows))
+    total, first_set = sum(map(len, rows)), dict[tuple[str, str], int]()
+    for number, (scenarios, numbers) in enumerate(zip(sets, rows, strict=True)):
+        for entry in map(scenarios.entries.__getitem__, numbers):
+            name = entry["dataset"], entry["scenario_id"]
+            if (other := first_set.setdefault(name, number)) != number:
+                problem = f"scenario {name[1]!r} of {name[0]!r} is also in {sets[other].path}"
+                raise DataError(
+                    problem, file=scenarios.path, cure="name each set once, or leave it out: --filter"
+                )
     for scenarios in sets:
         refuse_part(scenarios, out)
     source = {"merged": [{"set": s.path.name, "hash": s.hash, "source": s.manifest["source"]} for s in sets]}

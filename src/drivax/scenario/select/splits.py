@@ -73,12 +73,12 @@ class HoldOut:
         """Return the entry of ``run.json``."""
         return {"recordings": self.recordings, "scenarios": len(self.validation)} if self.recordings else None
 
-    def text(self) -> str:
-        """Return a line for the log."""
+    def text(self, training: int, validation: int) -> str:
+        """Return a line for the log, given the numbers of scenarios after filters."""
         if not self.recordings:
             return "no validation: all scenarios are of one recording; pass --validation SET to validate"
         return (
-            f"trains on {len(self.training)} scenarios, validates on {len(self.validation)} "
+            f"trains on {training} scenarios, validates on {validation} "
             f"(held-out recordings: {len(self.recordings)}); --validation none trains on all"
         )
 
