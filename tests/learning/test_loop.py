@@ -326,10 +326,13 @@ def test_a_resumed_run_keeps_its_devices_where_there_are_as_many(data, config, t
     assert requested == [1, 2, None, 1]
 
 
-def test_filters_select_scenarios_and_their_weights(data, config, tmp_path, monkeypatch):
-    class Stop(Exception):
-        pass
+class Stop(Exception):
+    """Stops a training before its first iteration."""
 
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Banks and weights of trainings that stop when these are complete."""
     calls = []
 
     def note(algorithm, environment, bank, weights=None):
@@ -337,6 +340,10 @@ def test_filters_select_scenarios_and_their_weights(data, config, tmp_path, monk
         raise Stop
 
     monkeypatch.setattr(training_set, "training_data", note)
+    return calls
+
+
+def test_filters_select_scenarios_and_their_weights(data, config, tmp_path, calls):
     tracks = [entry["source"]["tracks"] for entry in data.entries]
     filtered = replace(config, filters=(f"tracks>={sorted(tracks)[1]}",))
     rows = [row for row, count in enumerate(tracks) if count >= sorted(tracks)[1]]
@@ -359,17 +366,7 @@ def test_filters_select_scenarios_and_their_weights(data, config, tmp_path, monk
     assert not (tmp_path / "run").exists()
 
 
-def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, monkeypatch):
-    class Stop(Exception):
-        pass
-
-    calls = []
-
-    def note(algorithm, environment, bank, weights=None):
-        calls.append((bank, weights))
-        raise Stop
-
-    monkeypatch.setattr(training_set, "training_data", note)
+def test_weights_are_divided_with_the_scenarios(data, config, tmp_path, calls):
     weights = np.arange(3 * 91, dtype=float).reshape(3, 91)
     with pytest.raises(Stop):
         train(config, TrainingSet(data, weights), tmp_path / "run")
