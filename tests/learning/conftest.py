@@ -14,6 +14,14 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def scenarios(tmp_path_factory):
+    """Enough scenarios that some can be resident, or belong to a stage."""
+    path = tmp_path_factory.mktemp("scenarios") / "set"
+    generate(path, 8, 5, Generation(workers=0))
+    return ScenarioSet.open(path)
+
+
+@pytest.fixture(scope="session")
 def data_of_egos(tmp_path_factory):
     """The scenarios of ``data``, with routes of further egos."""
     path = tmp_path_factory.mktemp("egos") / "set"

@@ -16,11 +16,10 @@ from drivax.learning.loop import train
 from drivax.learning.program import Program, Seeds
 from drivax.learning.residency import Residents
 from drivax.learning.training_set import Source
-from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.run_folder import seed_folders
 from drivax.tracking.sinks import read_rows
 from tiny_algorithms import PPO
 
@@ -30,13 +29,6 @@ STAGES = (
     Stage("all", 1000, reward_scale=2.0),
 )
 ENTRIES = [{"tags": {"type": kind}} for kind in ("turn_left", "straight", "turn_left", "turn_right")]
-
-
-@pytest.fixture(scope="module")
-def scenarios(tmp_path_factory):
-    path = tmp_path_factory.mktemp("curriculum") / "set"
-    generate(path, 6, 5, Generation(workers=0))
-    return ScenarioSet.open(path)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +179,7 @@ def test_episodes_and_rewards_follow_the_stage(scenarios, stages):
     assert factors["collision"] == 0.5 and residents.note() == {"curriculum/stage": 1.0}
     # Three iterations of 16 steps are the budget of the first stage.
     lines = [residents.follow(program, {}) for _ in range(3)]
-    assert lines[:2] == [None, None] and lines[2] == "stage 2 of 2, all: 6 scenarios"
+    assert lines[:2] == [None, None] and lines[2] == "stage 2 of 2, all: 8 scenarios"
     assert float(program.data.reward_factors["progress"]) == 2.0
     chances = np.diff(np.asarray(program.data.chances, np.int64), prepend=0)
     assert (chances > 0).all()
@@ -195,23 +187,31 @@ def test_episodes_and_rewards_follow_the_stage(scenarios, stages):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_continues_in_its_stage(scenarios, stages, tmp_path):
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_resumed_run_continues_in_its_stage(scenarios, stages, seeds, tmp_path):
     lines = []
     config = config_of(stages)
-    whole = train(config, scenarios, tmp_path / "whole", validation=None, log=lines.append)
+    whole = train(config, scenarios, tmp_path / "whole", validation=None, seeds=seeds, log=lines.append)
     assert "stage 1 of 2, few: 3 scenarios" in lines
-    assert "stage 2 of 2, all: 6 scenarios, from step 48" in lines
-    rows = list(read_rows(whole.metrics))
-    assert [row["curriculum/stage"] for row in rows] == [1.0] * 3 + [2.0] * 5
+    assert "stage 2 of 2, all: 8 scenarios, from step 48" in lines
+
+    def logged(path):
+        """Return what each seed logged, without times."""
+        folders = [path] if seeds == 1 else seed_folders(path)
+        tables = [read_rows(folder / "metrics.jsonl") for folder in folders]
+        return [
+            [{n: v for n, v in row.items() if n != "steps_per_second"} for row in rows] for rows in tables
+        ]
+
+    expected = logged(whole.path)
+    assert [[row["curriculum/stage"] for row in rows] for rows in expected] == [[1.0] * 3 + [2.0] * 5] * seeds
     for iterations in (2, 4):
         killed = tmp_path / f"killed-{iterations}"
         shutil.copytree(whole.path, killed)
-        Checkpoints(killed / "checkpoints").drop_after(iterations * PPO.steps_per_iteration)
-        again = read_rows(train(config, scenarios, killed, validation=None, resume=True).metrics)
-        for one, other in zip(rows, again, strict=True):
-            assert {n: v for n, v in one.items() if n != "steps_per_second"} == {
-                n: v for n, v in other.items() if n != "steps_per_second"
-            }
+        for folder in [killed] if seeds == 1 else seed_folders(killed):
+            Checkpoints(folder / "checkpoints").drop_after(iterations * PPO.steps_per_iteration)
+        train(config, scenarios, killed, validation=None, resume=True)
+        assert logged(killed) == expected
 
 
 def test_stages_are_read_from_yaml(tmp_path):

@@ -18,8 +18,7 @@ from drivax.learning.loop import train
 from drivax.learning.program import Program, Seeds
 from drivax.learning.residency import Residents, Rotation
 from drivax.learning.training_set import Source
-from drivax.scenario.store import ScenarioSet, Subset
-from drivax.synthetic.generate import Generation, generate
+from drivax.scenario.store import Subset
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
@@ -33,13 +32,6 @@ ITERATIONS = 100
 WARM = WarmStart(iterations=97, cloning=Cloning(batch=4, updates=1))
 BC = BcConfig(batch=8, updates=1, network=TINY)
 OFFLINE = CqlConfig(network=TINY, batch=8, updates=2)
-
-
-@pytest.fixture(scope="module")
-def scenarios(tmp_path_factory):
-    path = tmp_path_factory.mktemp("residency") / "set"
-    generate(path, 8, 5, Generation(workers=0))
-    return ScenarioSet.open(path)
 
 
 def config_of(algorithm, **changes):

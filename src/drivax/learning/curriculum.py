@@ -7,7 +7,7 @@ of reward terms. The stage follows from the logged rows, so a resumed run contin
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -86,19 +86,18 @@ class Stage:
 
 def mean_rollout(rows: Sequence[LoggedValues]) -> dict[str, float]:
     """Return the metrics of rollouts of several seeds as those of all their episodes together."""
-    counts = [row.get("rollout/episodes") or 0.0 for row in rows]
-    result = {"rollout/episodes": sum(counts)}
-    for name in {name for row in rows for name in row if name.startswith("rollout/")} - {*result}:
+    sums, totals = defaultdict[str, float](float), defaultdict[str, float](float)
+    for row in rows:
         # Values that are not finite are None in the log.
-        values = [row.get(name) for row in rows]
-        pairs = [
-            (value, count)
-            for value, count in zip(values, counts, strict=True)
-            if value is not None and math.isfinite(value)
-        ]
-        if (total := sum(count for _, count in pairs)) > 0:
-            result[name] = sum(value * count for value, count in pairs) / total
-    return result
+        finite = {name: value for name, value in row.items() if value is not None and math.isfinite(value)}
+        count = finite.pop("rollout/episodes", 0.0)
+        totals["rollout/episodes"] += count
+        for name, value in finite.items():
+            if name.startswith("rollout/"):
+                sums[name] += value * count
+                totals[name] += count
+    means = {name: value / totals[name] for name, value in sums.items() if totals[name] > 0}
+    return {"rollout/episodes": totals["rollout/episodes"], **means}
 
 
 class Curriculum:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -389,8 +388,9 @@ class _Training:
                 means = (mean_logs(program.seeds.member(values, number)) for number in range(len(self.logs)))
                 stage = self.residents.note()
                 rows = [row | exchanged | stage | {"steps_per_second": rate} for row in means]
-                self._check(iteration, state, rows, np.atleast_1d(finite))
+                # Seeds that log this iteration: a resumed run reads the same rows.
                 driven = [row for row, log in zip(rows, self.logs, strict=True) if not log.stopped]
+                self._check(iteration, state, rows, np.atleast_1d(finite))
                 if line := self.residents.follow(program, mean_rollout(driven)):
                     self.log(f"{line}, from step {self._steps(iteration):,}")
                 self._record(iteration, state, rows, preempted)
@@ -425,15 +425,8 @@ class _Training:
                 self.log(f"warning: seed {seed}: unhealthy critics: {problem}")
 
     def _logged(self, done: int) -> list[dict[str, float]]:
-        """Return the mean over seeds of what each finished iteration logged about rollouts.
-
-        A seed that diverged or ran out of patience did not count from that step on.
-        """
+        """Return the mean over seeds of what each finished iteration logged about rollouts."""
         tables = [{row["step"]: row for row in log.folder.metric_rows()} for log in self.logs]
-        for log, table in zip(self.logs, tables, strict=True):
-            end = (log.folder.info.get("divergence") or {}).get("step", math.inf)
-            for step in [step for step in table if step >= end]:
-                del table[step]
         steps = map(self._steps, range(1, done + 1))
         return [mean_rollout([table[step] for table in tables if step in table]) for step in steps]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -40,8 +40,6 @@ _EPISODES, _EPISODE_STEPS = 8, 40
 _MOST_LEAVING = 0.125
 #: Most scenarios of a block: their arrays are stacked together.
 _MOST_BLOCK = 64
-#: Loads scenarios by their numbers.
-_Load = Callable[[Indices], ScenarioBank]
 #: Scenarios whose bytes stand for those of all.
 _SAMPLE = 32
 
@@ -137,9 +135,9 @@ def _choose_residency(scenarios: int, steps_per_iteration: int, lead: int) -> Re
 class Residents:
     """The scenarios on the device in a training run: all of them, or some that a thread reads and exchanges."""
 
-    def __init__(self, source: Source, rotation: Rotation | None = None, load: _Load | None = None) -> None:
+    def __init__(self, source: Source, rotation: Rotation | None = None, replays_log: bool = False) -> None:
         self.source, self.rotation = source, rotation
-        self._load = load
+        self._replays_log = replays_log
         self._thread = ThreadPoolExecutor(1, "residents")
         self._next: Future[ScenarioBank] | None = None
         config = source.config
@@ -171,16 +169,15 @@ class Residents:
         if source.episodes:
             cure = "leave out --memory and residency, or the episodes"
             raise UsageError("recorded episodes need all of their scenarios on the device", cure=cure)
-        load = partial(_load, source, False)
         rows = np.arange(min(total, _SAMPLE))
-        sample = load(rows)
+        sample = _load(source, False, rows)
         learner = config.algorithm.build(source.environment, sample, config.iterations)
         # Weights may be 0 in the sample.
         unweighted = None if source.weights is None else np.ones_like(source.weights)
         experience = replace(source, weights=unweighted).complete(sample, rows)
-        if isinstance(experience, Experience):
-            load = partial(_load, source, True)
-            sample = load(rows)
+        replays_log = isinstance(experience, Experience)
+        if replays_log:
+            sample = with_expert_steps(source.environment, sample)
         scenario_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(sample)) / len(rows)
         state = jax.eval_shape(learner.init, experience, jax.random.key(0))
         environments = sum(node.over.shape[0] for node in _nodes(state) if isinstance(node, Environments))
@@ -197,7 +194,7 @@ class Residents:
                 problem = f"{format_bytes(memory or 0)} hold {scenarios} scenarios of {format_bytes(scenario_bytes)}"
                 raise UsageError(problem, cure="raise --memory")
             residency = _choose_residency(scenarios, steps, lead)
-        return cls(source, Rotation(residency, total, config.seed, lead), load)
+        return cls(source, Rotation(residency, total, config.seed, lead), replays_log)
 
     @property
     def config(self) -> TrainConfig:
@@ -207,12 +204,12 @@ class Residents:
 
     def load(self, iteration: int = 0) -> Any:
         """Return the environment's data in an iteration, given the number of finished ones."""
-        if self.rotation is None or self._load is None:
+        if self.rotation is None:
             return self._with_stage(self.source.load())
         exchanges = self.rotation.exchanges(iteration)
         blocks = np.split(self.rotation.resident(exchanges), self.rotation.blocks)
         # Block by block as in training, because batches of other sizes may round otherwise.
-        bank = jax.tree.map(_join, *(jax.tree.map(np.asarray, self._load(rows)) for rows in blocks))
+        bank = jax.tree.map(_join, *(jax.tree.map(np.asarray, self._load(block)) for block in blocks))
         return replace(bank, chances=jnp.asarray(self.rotation.chances(exchanges)))
 
     def complete(self, data: Any, iteration: int = 0) -> Any:
@@ -244,7 +241,7 @@ class Residents:
             for row in rows:
                 self.curriculum.log(row)
             program.data = program.place(self.complete(self._with_stage(environment_data(program.data))))
-        if rotation is None or self._load is None:
+        if rotation is None:
             return state
         exchanges = rotation.exchanges(iteration)
         if exchanges:
@@ -290,13 +287,10 @@ class Residents:
             DataError: A scenario is damaged, or its file has vanished.
         """
         rotation = self.rotation
-        if (
-            rotation is None
-            or self._next is None
-            or self._load is None
-            or iteration % rotation.residency.every
-        ):
+        if rotation is None or iteration % rotation.residency.every:
             return state, {}
+        if self._next is None:
+            raise RuntimeError("call resume first")
         started = time.perf_counter()
         exchanges = rotation.exchanges(iteration)
         block, first = self._next.result(), rotation.first_row(exchanges - 1)
@@ -333,6 +327,9 @@ class Residents:
                 f"episodes begin by weight: effective sample of {effective:,.0f} of {total:,} scenarios"
             )
         return lines
+
+    def _load(self, scenarios: Indices) -> ScenarioBank:
+        return _load(self.source, self._replays_log, scenarios)
 
     def close(self) -> None:
         """Stop the thread."""
